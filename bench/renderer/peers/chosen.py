@@ -61,18 +61,16 @@ def pilot_spp(known: Calibration) -> int:
     return max(1, round((max(2 * known.fixed_s, LEAST_IMAGE_S) - known.fixed_s) / known.sample_s))
 
 
-def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int, image_s: float) -> Chosen:
-    """What the pilot of `photonfarm scene plan` finds for this one view, for images that take `image_s`.
+def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
+    """What the pilot of `photonfarm scene plan` finds for this one view.
 
-    It takes about `seconds` of CPU time, and more to time images, and where its first round and the kernels of all
-    candidates need more.
+    It takes about `seconds` of CPU time, and more where its first round and the kernels of all candidates need more.
     """
     import time
 
     import mitsuba as mi
 
-    from photonfarm.renderer.scene import backend
-    from photonfarm.renderer.strategy import content, image_cost, measurement, pilot
+    from photonfarm.renderer.strategy import content, measurement, pilot
 
     plugins: dict[Any, Any] = {}
 
@@ -86,9 +84,7 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int, image_s: floa
     start = time.perf_counter()
     found = content.read(scene, scene.sensors()[0])
     candidates, _ = content.restrict(found, max_depth, 1.0, measurement.GRID)
-    costs = image_cost.time_images(render, candidates, spp, measurement.TIMING * seconds, backend.work_s)
-    later = {c: spp / cost.bought(image_s) * image_s / cost.time_s(spp) for c, cost in costs.items()}
-    choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED, later=later)
+    choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED)
     best = choice.candidate
     spent_s = time.perf_counter() - start
     return Chosen(

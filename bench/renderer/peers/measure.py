@@ -107,8 +107,7 @@ def _settle(line: SceneToMeasure, calibrations: Mapping[str, Calibration]) -> ch
     if settings.chosen:
         return chosen.given(settings.chosen)
     known = calibrations.get("bdpt") or calibrate(line.method("bdpt"), settings.budgets_s, settings.clock)
-    spp = chosen.pilot_spp(known)
-    found = chosen.by_pilot(line.scene, line.plan.max_depth, settings.pilot_seconds, spp, settings.seconds)
+    found = chosen.by_pilot(line.scene, line.plan.max_depth, settings.pilot_seconds, chosen.pilot_spp(known))
     say(f"  pilot: connections {found.connections}, light_ratio {found.light_ratio:g} in {found.pilot_wall_s:.0f} s")
     return found
 

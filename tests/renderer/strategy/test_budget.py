@@ -41,6 +41,10 @@ def test_with_less_time_fewer_are_and_the_required_ones_are_among_them() -> None
     assert {PLAIN, CANDIDATES[2]} <= set(found) < set(CANDIDATES)
 
 
+def test_the_last_settings_are_left_out_first() -> None:
+    assert chosen(30) == [PLAIN, CANDIDATES[2], CANDIDATES[0]]
+
+
 def test_with_too_little_time_it_is_said_how_much_would_do() -> None:
     with pytest.raises(IncompleteError, match=r"attic does not fit in --seconds 5: .* give it 20, or 40 for all") as no:
         chosen(5)

@@ -74,6 +74,15 @@ def test_from_three_edges_on_light_paths_and_connections_have_a_place() -> None:
     assert content.restrict(found, -1, 1.0, GRID) == (list(GRID), [])
 
 
+def test_each_kind_of_settings_is_among_the_first_that_are_compared() -> None:
+    """In little time only the first are."""
+    first = GRID[:5]
+    assert first[0] == PLAIN
+    assert any(c.guided_light and c.connections for c in first)
+    assert any(c.guided_light and not c.connections for c in first)
+    assert any(c.light_samples > 1 for c in first)
+
+
 # ----------------------------------------------------------------------------------------------------------- photons
 
 AROUND = ViewSpec(origin=Box(min=(-0.5, -0.5, -0.5), max=(0.5, 0.5, 0.5)), look_at=Box(min=(0, 0, 0), max=(0, 0, 0)))

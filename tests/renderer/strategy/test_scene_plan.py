@@ -233,6 +233,13 @@ def test_what_was_not_shown_is_not_claimed() -> None:
         assert claim not in text
 
 
+def test_a_plan_says_the_same_in_whatever_order_settings_were_measured() -> None:
+    found = measurement()
+    reversed_rows = measurement(*reversed(found.rows))
+    said = [lines(plan_of(spec_with(), each, cached=False)) for each in (found, reversed_rows)]
+    assert said[0] == said[1]
+
+
 def test_the_table_is_aligned_and_says_what_its_columns_are() -> None:
     text = lines(plan_of(spec_with(), measurement(), cached=False))
     first = next(i for i, line in enumerate(text) if line.startswith("connections  light ratio"))

@@ -40,8 +40,8 @@ GRID = (
 )
 """The candidates of every pilot, except those that a scene's content makes pointless.
 
-The first are compared where there is no time for all, so they stand in the order in which they gain most: guided light
-paths with connections for indirect light, several light samples for evenly lit rooms, splats alone for caustics.
+Where there is no time for all, only the first are compared. So the most useful come first: guided light paths with
+connections for indirect light, several light samples for evenly lit rooms, guided splats alone for caustics.
 
 A light ratio above 1 helps only with light that splats alone find. Connections need few light paths, as several eye
 paths may be joined to the same one. Several light samples pay where direct light at the first eye vertex has much of

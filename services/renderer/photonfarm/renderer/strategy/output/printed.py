@@ -104,7 +104,7 @@ def _not_better(plan: TransportPlan, has: Callable[[Candidate], bool]) -> str:
 def _why(plan: TransportPlan) -> list[str]:
     if not plan.at_equal_cost:
         return [BLACK]
-    rows = list(plan.at_equal_cost.values())
+    rows = _sorted(plan)
     reasons = [*reasons_for(plan.at_equal_cost[plan.candidate], rows, plan.measurement.shared), *_not_taken(plan)]
     now, half_spp = present(plan.spec), plan.spec.transport.half_spp
     if plan.half_spp != half_spp:
@@ -149,5 +149,9 @@ def _measured(plan: TransportPlan) -> list[str]:
     if not plan.at_equal_cost:
         return []
     purpose = plan.measurement.purpose
-    rows = sorted(plan.at_equal_cost.values(), key=lambda measured: measured.candidate)
-    return [*table(rows, plan.candidate, purpose), "", *legend(plan.spec, purpose), ""]
+    return [*table(_sorted(plan), plan.candidate, purpose), "", *legend(plan.spec, purpose), ""]
+
+
+def _sorted(plan: TransportPlan) -> list[CandidateAtCost]:
+    """The measured settings, in their own order instead of that of the pilot."""
+    return sorted(plan.at_equal_cost.values(), key=lambda measured: measured.candidate)

@@ -58,8 +58,8 @@ def legend(spec: SceneSpec, purpose: Purpose) -> list[str]:
         f"half_spp: samples per pixel, 1 at least, for the time that {now} of the spec's settings take now, "
         f"{present(spec)}; {error} and ms: {_MEANING[purpose]} and CPU milliseconds of such a half-estimate, "
         f"{film.width} × {film.height} pixels",
-        f"error × time: {error} × {_TIME[purpose]}, relative to plain path tracing on the same images, ± one standard "
-        "error: the time to the same error; too costly: the time does not pay for one sample per pixel",
+        f"error × time: {error} × {_TIME[purpose]}, relative to plain path tracing over the same views and seeds, ± "
+        "one standard error: the time to the same error; too costly: the time does not pay for one sample per pixel",
     ]
 
 

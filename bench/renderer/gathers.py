@@ -78,7 +78,7 @@ def rendered(integrator: Any, scene: Any, seed: int, spp: int, features: str) ->
 
 
 def page(rows: list[GatherTimes], options: argparse.Namespace, cpu: str) -> str:
-    header = ["scene", "method", "without, ms", "with, ms", "with over without", "quartiles", "same bits"]
+    header = ["scene", "method", "without, ms", "with, ms", "with ÷ without", "its quartiles", "same bits"]
     lines = [
         [
             row.scene,
@@ -94,12 +94,15 @@ def page(rows: list[GatherTimes], options: argparse.Namespace, cpu: str) -> str:
     return f"""# Gather instructions
 
 Time in which kernels ran, of images of {options.size}² pixels and {options.spp} spp on one thread, with and without
-gather instructions, on a processor that LLVM calls `{cpu}`. Images of equal seeds are rendered in turn; medians of
-{options.repetitions}. Without: as LLVM decides. The farm uses them on the processors that `scene/gathers` names.
+gather instructions, which load a vector from scattered addresses at once, on a processor that LLVM calls `{cpu}`
+(`znver3` is AMD's Zen 3). `bdpt` is given with its connections and light ratio. Images of equal seeds are rendered in
+turn. All columns are medians of {options.repetitions}: with ÷ without is that of the ratios of equal seeds, not the
+ratio of the two columns before it. Below 1 the instructions are faster. "Without" is LLVM's own choice. The farm uses
+the instructions on the processors in `FASTER_ON` of `services/renderer/photonfarm/renderer/scene/gathers.py`.
 
 {results.table(header, lines)}
 
-Geometric mean of with over without: **{statistics.geometric_mean(row.ratio for row in rows):.2f}**."""
+Geometric mean of with ÷ without: **{statistics.geometric_mean(row.ratio for row in rows):.2f}**."""
 
 
 def main() -> int:

@@ -65,7 +65,7 @@ def test_a_spec_is_measured_once_written_and_then_known(
 
     code, out, _ = run("box.toml", "--seconds", "1")
     assert code == 0
-    assert "kept from an earlier pilot" in out
+    assert "kept from an earlier measurement" in out
 
     code, out, _ = run("box.toml", "--seconds", "4", "--json", "--again")
     assert (code, json.loads(out)["cached"]) == (0, False)

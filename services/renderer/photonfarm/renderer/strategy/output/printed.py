@@ -17,7 +17,7 @@ from photonfarm.renderer.strategy.reasons import BLACK, plus_minus, reasons_for
 def lines(plan: TransportPlan) -> list[str]:
     """The settings, the verdict, the modelled content, what is left out, the reasons, the saving, the measurement."""
     m = plan.measurement
-    origin = "kept from an earlier pilot (--again measures anew)" if plan.cached else "measured now"
+    origin = "kept from an earlier measurement (--again measures anew)" if plan.cached else "measured now"
     return [
         f"{plan.spec.name}: connections {plan.candidate.connections}, light_ratio {plan.candidate.light_ratio:g}, "
         f"{'guided_light true, ' * plan.candidate.guided_light}"
@@ -36,7 +36,7 @@ def lines(plan: TransportPlan) -> list[str]:
         "",
         *_measured(plan),
         f"{origin}: {m.views} views of {m.film.width} × {m.film.height} pixels, {m.spp} spp; {m.spent_s:.0f} s of CPU, "
-        f"{m.compiling_s:.0f} of them to load, to compile, to time images and to weight them",
+        f"{m.compiling_s:.0f} of them to load, to compile, to time images and to find the weights of pixels",
     ]
 
 

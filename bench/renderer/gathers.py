@@ -1,4 +1,4 @@
-"""Whether kernels are faster with gather instructions, on a processor for which LLVM avoids them (`scene/gathers`).
+"""Whether kernels are faster with gather instructions, on a processor for which LLVM avoids them (`native/gathers`).
 
     python -m bench.renderer.gathers [--scene cornell room ...] [--size 128] [--spp 8] [--repetitions 9] [--out DIR]
 
@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from bench.harness import results
 from bench.renderer import scene_loading
 from bench.renderer.rays import seconds
-from photonfarm.renderer.scene import backend, gathers
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.native import gathers
 
 SCENES = ("cornell", "room", "kitchen", "veach-ajar", "cove")
 METHODS: dict[str, dict[str, Any]] = {
@@ -98,7 +99,7 @@ gather instructions, which load a vector from scattered addresses at once, on a 
 (`znver3` is AMD's Zen 3). `bdpt` is given with its connections and light ratio. Images of equal seeds are rendered in
 turn. All columns are medians of {options.repetitions}: with ÷ without is that of the ratios of equal seeds, not the
 ratio of the two columns before it. Below 1 the instructions are faster. "Without" is LLVM's own choice. The farm uses
-the instructions on the processors in `FASTER_ON` of `services/renderer/photonfarm/renderer/scene/gathers.py`.
+the instructions on the processors in `FASTER_ON` of `services/renderer/photonfarm/renderer/scene/native/gathers.py`.
 
 {results.table(header, lines)}
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import nvidia_driver
 import pytest
 
-from photonfarm.renderer.scene import backend, gathers
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.native import gathers
 from photonfarm.shared.core.errors import BackendError
 
 LOAD = "from photonfarm.renderer.scene import backend; print(backend.load(1).variant())"
@@ -38,7 +39,8 @@ def test_a_kernel_with_gather_instructions_has_the_same_bits() -> None:
     """On any processor, as if it were one on which they are faster."""
     code = """
 import drjit as dr
-from photonfarm.renderer.scene import backend, gathers
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.native import gathers
 
 mi = backend.load(1)
 

@@ -5,9 +5,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from photonfarm.renderer.scene import acceleration, backend
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import view_buffers
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.native import acceleration
 from photonfarm.shared.scene.modification import Modification, rest, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec

@@ -48,9 +48,12 @@ def test_a_spec_is_measured_once_written_and_then_known(
     assert code == 0
     assert f"measuring {len(few)} settings" in err
     first = json.loads(out)
-    assert {(r["connections"], r["light_ratio"]) for r in first["measurement"]["rows"]} == {
+    measured = first["measurement"]
+    assert {(r["connections"], r["light_ratio"]) for r in measured["rows"]} == {
         (c.connections, c.light_ratio) for c in few
     }
+    assert measured["left_out"] == []
+    assert not any("settings compared" in line for line in measured["modelled"])
     assert (tmp_path / "box.toml").read_text() == SPEC
 
     code, out, err = run("box.toml", "--seconds", "20", "--json", "--write")

@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from photonfarm.renderer.scene import gathers
+from photonfarm.renderer.scene.native import gathers
 from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.farm import devices
 from photonfarm.shared.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card

@@ -73,8 +73,8 @@ class LoadedScene:
         movable group has been parked and brought back once, so that the kernels for this are compiled.
         """
         backend.load()
-        from photonfarm.renderer.scene.acceleration import expect_changes
         from photonfarm.renderer.scene.loading import load_scene
+        from photonfarm.renderer.scene.native.acceleration import expect_changes
 
         loaded = cls(spec, load_scene(spec, beside), **options)
         if spec.groups:

@@ -16,11 +16,12 @@ from __future__ import annotations
 import ctypes
 import re
 from collections import defaultdict
-from pathlib import Path
 from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+
+from photonfarm.renderer.scene.native.libraries import library_of
 
 _LOW = 0  # RTC_BUILD_QUALITY_LOW
 _SET_QUALITY = "_ZN7mitsuba23rtcSetSceneBuildQualityEPNS_10RTCSceneTyENS_15RTCBuildQualityE"
@@ -53,11 +54,7 @@ def expect_changes(scene: Any) -> bool:
 
 def _embree() -> Any:
     """The library libembree3 that Mitsuba has loaded, with the functions needed; None if it is not loaded."""
-    path = Path(mi.__file__).parent / "libembree3.so"
-    if not mi.variant().startswith("llvm") or not path.is_file():
-        return None
-    library = ctypes.CDLL(str(path))
-    return library if hasattr(library, _SET_QUALITY) else None
+    return library_of(mi, "libembree3.so", (_SET_QUALITY,)) if mi.variant().startswith("llvm") else None
 
 
 def _entry_points(library: Any) -> set[int]:

@@ -9,7 +9,8 @@ bits. No other processor has been measured, so all others keep LLVM's choice.
 from __future__ import annotations
 
 import ctypes
-from pathlib import Path
+
+from photonfarm.renderer.scene.native.libraries import library_of
 
 FASTER_ON = frozenset({"znver3"})
 """Processors, by LLVM's names, on which kernels are faster with gather instructions."""
@@ -54,11 +55,6 @@ def _text(library: ctypes.CDLL, name: str) -> str:
 
 
 def _dr_jit() -> ctypes.CDLL | None:
-    """The library that `import drjit` has loaded; None if it is not there or lacks a function."""
     import drjit
 
-    path = next(Path(drjit.__file__).parent.glob("libdrjit-core.*"), None)
-    if path is None:
-        return None
-    library = ctypes.CDLL(str(path))
-    return library if all(hasattr(library, name) for name in (_CPU, _FEATURES, _WIDTH, _SET)) else None
+    return library_of(drjit, "libdrjit-core.*", (_CPU, _FEATURES, _WIDTH, _SET))

@@ -20,24 +20,30 @@ from photonfarm.shared.core.waiting import waiting
               help="The spec to write; the scene goes into a folder beside it.  [default: as PATH]")  # fmt: skip
 @click.option("--up", type=click.Choice(["x", "y", "z"]),
               help="The axis that points up.  [default: as the file says, or else y]")  # fmt: skip
+@click.option("--accept", multiple=True, metavar="NAME",
+              help="A change of the picture that may be made: by its name, as the refusal gives it; geometry, light or "
+                   "colour for all of a kind. May be given several times.")  # fmt: skip
 @json_option
-def scene_import(path: Path, out: Path | None, up: str | None, as_json: bool) -> None:
+def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str, ...], as_json: bool) -> None:
     """Make a spec of a scene of another program, and a copy of the scene that photonfarm can render.
 
     PATH is a scene of Mitsuba (.xml, of versions 0.6 to 3), glTF (.gltf, .glb) or OBJ (.obj, with its .mtl), or what
     Blender reads (.blend, .usd, .fbx), where there is one: docs/own-scene.md says how. Furniture, lights, views and the
     exposure are proposed; all of it can be changed in the spec.
+
+    What the file says and photonfarm cannot render is said. Where the picture would differ for it, nothing is written,
+    unless --accept names it.
     """
     from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
     from photonfarm.renderer.importing.importer import AXES, import_scene
 
-    made = import_scene(path, out, None if up is None else AXES[up], partial(click.echo, err=True))
+    made = import_scene(path, out, None if up is None else AXES[up], partial(click.echo, err=True), accept)
     if as_json:
         click.echo(json.dumps(made.document(), indent=1))
         return
-    for line in (*made.notes, *made.found):
+    for line in (*map(str, made.changes), *made.found):
         click.echo(line)
     command = f"photonfarm up {quote(str(made.spec))} --modifications 64"
     click.echo(f"{made.spec} and {made.folder} are written; see it by: {command}")

@@ -56,9 +56,11 @@ def mesh_shape(parent: Element, shape_id: str, file: Path, *, faceted: bool) -> 
     return shape
 
 
-def put_area_light(shape: Element, radiance: Sequence[float]) -> None:
-    """Let a shape emit a colour."""
-    put_value(SubElement(shape, "emitter", type="area"), "radiance", radiance)
+def area_light(radiance: Sequence[float]) -> Element:
+    """An emitter that lets a shape emit a colour."""
+    emitter = Element("emitter", type="area")
+    put_value(emitter, "radiance", radiance)
+    return emitter
 
 
 def put_sky(scene: Element) -> None:

@@ -3,32 +3,74 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from xml.etree.ElementTree import Element
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement
+
+from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.changes import Changes
+from photonfarm.renderer.importing.meshes import Mesh, write_ply
 
 Vector = tuple[float, float, float]
 
-_NOT_OF_AN_ID = re.compile(r"[^0-9A-Za-z_-]+")
+_NOT_OF_AN_ID = re.compile(r"[\s.:/\\\"'<>&$]+")
+"""What Mitsuba or a path gives a meaning of its own."""
 
-ID_LENGTH = 48
+ID_LENGTH = 64
 
 
 @dataclass(slots=True)
 class ImportedScene:
     """A scene as Mitsuba 3 reads it, with what the source says of it beyond that."""
 
-    root: Element  # <scene>: materials first, then shapes with ids, and lights; files by their absolute names
+    root: Element = field(default_factory=elements.scene)  # materials first, then shapes with ids, and lights
+    meshes: dict[str, Mesh] = field(default_factory=dict)  # in world coordinates, of the shapes that name no file yet
     objects: dict[str, str] = field(default_factory=dict)  # the object that a shape id belongs to, where the file says
-    notes: list[str] = field(default_factory=list)  # sentences: what was changed, or is not carried over
+    changes: Changes = field(default_factory=Changes)
     up: Vector = (0.0, 1.0, 0.0)
     camera: Vector | None = None  # the position of the source's camera, which is inside the room, most likely
 
+    def put_shape(
+        self,
+        made: str,
+        mesh: Mesh,
+        material: str,
+        owner: str,
+        light: Element | None = None,
+        *,
+        both_sides: bool = False,
+    ) -> None:
+        """Add a mesh with a material id, and an `<emitter>` if it shines, from `both_sides` or from its front alone.
 
-def listed(names: Sequence[str], most: int = 4) -> str:
-    """The first names of some, and how many more there are."""
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more
+        A mesh without a usable face is left out. Lights are flat, as smooth ones cannot be sampled without bias.
+        Mitsuba's shine from the front alone, so a second sheet behind the first shines from the back.
+        """
+        mesh, faults = mesh.usable(smooth=light is None)
+        for fault in faults:
+            self.changes.note(fault, made)
+        sheets = {made: mesh}
+        if light is not None and both_sides and not mesh.encloses():
+            sheets[f"{made}_back"] = mesh.back()
+        for shape_id, sheet in sheets.items():
+            if not len(sheet.faces):
+                continue
+            shape = SubElement(self.root, "shape", type="ply", id=shape_id)
+            elements.put_value(shape, "filename", "")
+            if sheet.normals is None:
+                elements.put_value(shape, "face_normals", True)
+            SubElement(shape, "ref", id=material)
+            if light is not None:
+                shape.append(elements.copied(light))
+            self.meshes[shape_id] = sheet
+            self.objects[shape_id] = owner
+
+    def write_meshes(self, folder: Path) -> None:
+        """Write the meshes into a folder, and let their shapes name the files."""
+        for shape in self.root.findall("shape"):
+            mesh = self.meshes.get(shape.get("id", ""))
+            name = elements.child(shape, "filename")
+            if mesh is not None and name is not None:
+                name.set("value", str(write_ply(mesh, folder / f"{shape.get('id')}.ply")))
 
 
 class Ids:
@@ -39,7 +81,7 @@ class Ids:
 
     def make(self, name: str, otherwise: str = "shape") -> str:
         """An id like `name`, with a number behind it if the name itself is taken."""
-        stem = _NOT_OF_AN_ID.sub("_", name).strip("_-")[:ID_LENGTH] or otherwise
+        stem = _NOT_OF_AN_ID.sub("_", name).strip("_")[:ID_LENGTH] or otherwise
         made, number = stem, 1
         while made in self._taken:
             number += 1

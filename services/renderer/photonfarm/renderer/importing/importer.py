@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from photonfarm.renderer.importing import elements, readers, splitting
+from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
 from photonfarm.renderer.importing.loading import load
 from photonfarm.renderer.importing.proposal.groups import CELL, Thing, faces_of, find_things
@@ -44,19 +46,23 @@ class Imported:
 
     spec: Path
     folder: Path  # of the scene's files
-    notes: list[str]  # what was changed, or is not carried over
+    changes: Changes  # from what the file says
     found: list[str]  # what is proposed, a line each
 
     def document(self) -> dict[str, Any]:
         """All of it, for JSON."""
-        return {"spec": str(self.spec), "folder": str(self.folder), "notes": self.notes, "found": self.found}
+        changes = [asdict(change) for change in self.changes]
+        return {"spec": str(self.spec), "folder": str(self.folder), "changes": changes, "found": self.found}
 
 
-def import_scene(path: Path, out: Path | None, up: Vector | None, log: Log) -> Imported:
+def import_scene(
+    path: Path, out: Path | None, up: Vector | None, log: Log, accept: Collection[str] = ()
+) -> Imported:  # fmt: skip
     """Import a file: write a spec and, beside it, a folder with the scene.
 
-    Mitsuba must have been loaded. Raises SpecError for a file that cannot be imported and for results that are there
-    already, BackendError without Blender where it is needed. Then nothing is written.
+    `accept` names changes of the picture that may be made, or their effects. Mitsuba must have been loaded. Raises
+    SpecError for a file that cannot be imported, for changes that are not accepted, and for results that are there
+    already; BackendError without Blender where it is needed. Then nothing is written.
     """
     read = readers.reader_of(path)
     spec = _place(path, out)
@@ -68,7 +74,9 @@ def import_scene(path: Path, out: Path | None, up: Vector | None, log: Log) -> I
         spec.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=spec.parent, prefix=".import-") as scratch, WorkLog(log) as work:
             scene = read(path, Path(scratch), work.begin)
-            return _import(scene, path, spec, folder, Path(scratch), up, work)
+            loaded = load(scene, Path(scratch), work.begin)
+            scene.changes.refuse_unless(accept, str(path))
+            return _import(scene, loaded, path, spec, folder, Path(scratch), up, work)
 
 
 def _place(path: Path, out: Path | None) -> Path:
@@ -81,20 +89,20 @@ def _place(path: Path, out: Path | None) -> Path:
 
 
 def _import(
-    scene: ImportedScene, path: Path, spec: Path, folder: Path, scratch: Path, up: Vector | None, work: WorkLog
-) -> Imported:
-    loaded = load(scene, scratch, work.begin)
+    scene: ImportedScene, loaded: Any, path: Path, spec: Path, folder: Path, scratch: Path, up: Vector | None,
+    work: WorkLog,
+) -> Imported:  # fmt: skip
     frame = Frame(up or scene.up)
     proposal, things, belonging = _proposal(scene, loaded, frame, work.begin)
     if not loaded.emitters() and not proposal.room.has_ceiling:
         elements.put_sky(scene.root)
-        scene.notes.append("the scene has no light and no ceiling; it got a white sky")
+        scene.changes.note("the scene has no light and no ceiling; it got a white sky")
     shapes = splitting.shapes_of_things(scene, loaded, belonging, len(things), scratch)
     written = scratch / "written"
     written.mkdir()
     work.begin("writing the scene")
     write_scene(scene, written)
-    text = SpecText(_name(spec.stem), f"{folder.name}/scene.xml", path.name, frame, proposal, shapes, scene.notes)
+    text = SpecText(_name(spec.stem), f"{folder.name}/scene.xml", path.name, frame, proposal, shapes, scene.changes)
     if not loaded.emitters() and proposal.room.has_ceiling:
         text.ceiling = proposal.ceiling_light()
     (scratch / folder.name).symlink_to(written.resolve(), target_is_directory=True)
@@ -103,7 +111,7 @@ def _import(
     shutil.move(str(written), folder)
     write_whole(spec, text.text())
     load_spec(spec)
-    return Imported(spec, folder, scene.notes, _found(text))
+    return Imported(spec, folder, scene.changes, _found(text))
 
 
 def _proposal(scene: ImportedScene, loaded: Any, frame: Frame, log: Log) -> tuple[Proposal, list[Thing], Any]:
@@ -132,7 +140,7 @@ def _keep_in_the_open(text: SpecText, draft: Path, log: Log) -> None:
     try:
         text.free_space = free_space.measure(load_spec(draft), draft.parent, log).entry()
     except SpecError as error:
-        text.notes.append(f"cameras are not kept out of solids: {error}")
+        text.changes.note(f"cameras are not kept out of solids: {error}")
 
 
 def _expose(text: SpecText, draft: Path, work: WorkLog) -> None:

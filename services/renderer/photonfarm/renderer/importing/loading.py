@@ -10,7 +10,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import ImportedScene, listed
+from photonfarm.renderer.importing.changes import Effect, listed
+from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.importing.mending import make_normals_usable, move_to_origin
 from photonfarm.renderer.importing.readers.mitsuba_parts import make_diffuse
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
@@ -23,14 +25,19 @@ _UNKNOWN_PLUGIN = re.compile(r'Plugin "(.+?)" not found')
 
 
 def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
-    """The Mitsuba scene of what was imported; adds notes to `scene` for all that had to be changed.
+    """The Mitsuba scene of what was imported; adds to its changes all that had to be changed.
 
     Materials and lights are tried first, as that takes no time, and then with the shapes. Raises SpecError with
     Mitsuba's own words where no change helps.
     """
     _try(_without_shapes(scene.root), scene, folder)
     log(f"loading {len(scene.root.findall('shape'))} shapes")
+    scene.write_meshes(folder / "meshes")
     loaded = _try(scene.root, scene, folder)
+    for mended in (move_to_origin, make_normals_usable):
+        if mended(scene, loaded):
+            scene.write_meshes(folder / "meshes")
+            loaded = _try(scene.root, scene, folder)
     _flatten_lights(scene, loaded)
     return loaded
 
@@ -48,7 +55,7 @@ def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
         if element.get("id") in smooth:
             elements.put_value(element, "face_normals", True)
     if smooth:
-        scene.notes.append(f"{listed(sorted(smooth))}: emits light, and so got the normals of its faces")
+        scene.changes.note(f"{listed(sorted(smooth))}: emits light, and so got the normals of its faces")
 
 
 def _without_shapes(root: Element) -> Element:
@@ -73,12 +80,12 @@ def _try(root: Element, scene: ImportedScene, folder: Path) -> Any:
             with threads_to_read_with():
                 return mi.load_file(str(file), optimize=False)
         except (RuntimeError, ValueError) as error:
-            scene.notes.append(_mended(root, scene.root, str(error)))
+            _mend(root, scene, str(error))
     raise SpecError(f"more than {MOST_FAULTS} parts are not known to Mitsuba 3; export the scene for Mitsuba 3 instead")
 
 
-def _mended(tried: Element, root: Element, message: str) -> str:
-    """Change what Mitsuba refuses; the sentence about it. Raises SpecError where there is nothing to change."""
+def _mend(tried: Element, scene: ImportedScene, message: str) -> None:
+    """Change what Mitsuba refuses. Raises SpecError where there is nothing to change."""
     found = _LINE.search(message)
     node = _at_line(tried, int(found[1])) if found else None
     plugin = _UNKNOWN_PLUGIN.search(message)
@@ -88,16 +95,20 @@ def _mended(tried: Element, root: Element, message: str) -> str:
     place = elements.place(node)
     if properties:
         _drop(node, properties, message)
-        return f"{place}: {', '.join(map(repr, properties))} is not known to Mitsuba 3, and is left out"
-    kind = node.get("type")
+        for name in properties:
+            scene.changes.lose("colour", name, "is not known to Mitsuba 3, and is left out", place)
+        return
+    kind = node.get("type", "")
     if node.tag == "bsdf":
         make_diffuse(node)
-        return f"{place} of type {kind!r}, which Mitsuba 3 does not have, became diffuse"
-    for tree in (tried, root):
+        scene.changes.lose("colour", kind, "is not in Mitsuba 3, and became diffuse", place)
+        return
+    for tree in (tried, scene.root):
         above = elements.parents(tree).get(node)
         if above is not None:
             above.remove(node)
-    return f"{place} of type {kind!r}, which Mitsuba 3 does not have, is left out"
+    effect: Effect = "light" if node.tag == "emitter" else "geometry" if node.tag == "shape" else "colour"
+    scene.changes.lose(effect, kind, "is not in Mitsuba 3, and is left out", place)
 
 
 def _drop(node: Element, properties: list[str], message: str) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.proposal.proposed import RADIANCE, Box, Ceiling, Movable, Proposal
 from photonfarm.renderer.importing.proposal.surfaces import Frame
 from photonfarm.renderer.strategy.output.spec_file import put
@@ -33,7 +34,7 @@ class SpecText:
     frame: Frame
     proposal: Proposal
     shapes: list[list[str]]  # the ids of each movable's shapes
-    notes: list[str]
+    changes: Changes
     ceiling: Ceiling | None = None
     free_space: dict[str, Any] | None = None
     exposure: float = 1.0
@@ -65,8 +66,8 @@ class SpecText:
             )
         lengths = [self._number(length) for length in size]
         self._say(f"The room is about {lengths[0]} × {lengths[1]}, and {lengths[2]} high.")
-        for note in self.notes[:MOST_NOTES]:
-            self._say(note)
+        for change in list(self.changes)[:MOST_NOTES]:
+            self._say(str(change))
         self._lines += [
             f"name = {json.dumps(self.name)}",
             f"scene.file = {json.dumps(self.file, ensure_ascii=False)}",

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import Ids, ImportedScene, listed
+from photonfarm.renderer.importing.changes import listed
+from photonfarm.renderer.importing.imported import Ids, ImportedScene
 from photonfarm.renderer.importing.meshes import of_shape, write_ply
 
 REST = -1
@@ -48,7 +49,7 @@ def shapes_of_things(
                 found[part.thing].append(part.shape_id)
         split.append(shape.id())
     if split:
-        scene.notes.append(f"{listed(split)}: held separate things in one mesh, and became a shape for each")
+        scene.changes.note(f"{listed(split)}: held separate things in one mesh, and became a shape for each")
     return found
 
 

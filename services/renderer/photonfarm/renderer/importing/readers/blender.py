@@ -38,7 +38,9 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     if process.returncode or not out.is_file():
         raise SpecError(f"{path}: Blender cannot read it: {_last_words(text)}")
     scene = gltf.read(out, scratch, log)
-    scene.notes[:0] = [line.removeprefix("note: ") for line in text.splitlines() if line.startswith("note: ")]
+    for line in text.splitlines():
+        if line.startswith("note: "):
+            scene.changes.note(line.removeprefix("note: "))
     return scene
 
 

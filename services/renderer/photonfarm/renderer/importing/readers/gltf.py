@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.imported import Ids, ImportedScene
-from photonfarm.renderer.importing.meshes import Mesh, write_ply
+from photonfarm.renderer.importing.meshes import Mesh
 from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node
 from photonfarm.renderer.importing.readers.gltf_materials import Materials
 from photonfarm.shared.core.errors import SpecError
@@ -34,9 +34,9 @@ _READ = ("KHR_lights_punctual", "KHR_texture_transform", "KHR_mesh_quantization"
 def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file; meshes and images are put into the folder `scratch`. Raises SpecError for what cannot be read."""
     file = GltfFile(path)
-    scene = ImportedScene(elements.scene())
+    scene = ImportedScene()
     ids = Ids()
-    reader = _Reader(file, scene, scratch, Materials(file, scene.root, scratch, scene.notes, ids), log, ids)
+    reader = _Reader(file, scene, scratch, Materials(file, scene.root, scratch, scene.changes, ids), log, ids)
     try:
         reader.read()
     except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
@@ -73,7 +73,7 @@ class _Reader:
                 self.left_out[extension] = 1
         if self.left_out:
             listed = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in self.left_out.items())
-            self.scene.notes.append(f"not carried over: {listed}")
+            self.scene.changes.note(f"not carried over: {listed}")
 
     def _roots(self) -> list[int]:
         scenes = self.file.all("scenes")
@@ -115,26 +115,18 @@ class _Reader:
                 self._lose("morph targets")
             if "COLOR_0" in primitive["attributes"]:
                 self._lose("colours of vertices")
-            mesh = self._mesh(primitive).moved(matrix).usable()
-            if len(mesh.faces):
-                self._put_shape(mesh, f"{name}_{place}" if len(primitives) > 1 else name, primitive, owner)
+            mesh = self._mesh(primitive).moved(matrix)
+            self._put_shape(mesh, f"{name}_{place}" if len(primitives) > 1 else name, primitive, owner)
 
     def _put_shape(self, mesh: Mesh, name: str, primitive: Node, owner: str) -> None:
-        made = self.ids.make(name)
         material = primitive.get("material")
-        element = Element("shape", type="ply", id=made)
-        shines = self.materials.light(element, material)
-        if shines or mesh.normals is None:
-            mesh = Mesh(mesh.vertices, mesh.faces, None, mesh.uv)
-        file = write_ply(mesh, self.scratch / "meshes" / f"{made}.ply")
-        shape = elements.mesh_shape(self.scene.root, made, file, faceted=mesh.normals is None)
-        SubElement(shape, "ref", id=self.materials.material_id(material))
-        shape.extend(element)
-        self.scene.objects[made] = owner
+        both = bool(self.file.all("materials")[material].get("doubleSided")) if material is not None else False
+        light, made = self.materials.light(material), self.ids.make(name)
+        self.scene.put_shape(made, mesh, self.materials.material_id(material), owner, light, both_sides=both)
 
     def _mesh(self, primitive: Node) -> Mesh:
         attributes = primitive["attributes"]
-        vertices = self.file.array(attributes["POSITION"]).astype(np.float32)
+        vertices = self.file.array(attributes["POSITION"]).astype(np.float64)
         order = np.arange(len(vertices)) if "indices" not in primitive else self.file.array(primitive["indices"])[:, 0]
         if order.size and order.max() >= len(vertices):
             raise SpecError(f"{self.file.path}: a mesh names vertex {order.max()}, and has {len(vertices)}")
@@ -144,8 +136,8 @@ class _Reader:
         return Mesh(
             vertices,
             _triangles(order.astype(np.uint32), primitive.get("mode", _LISTS)),
-            None if normals is None else normals.astype(np.float32),
-            None if uv is None else uv.astype(np.float32),
+            None if normals is None else normals.astype(np.float64),
+            None if uv is None else uv.astype(np.float64),
         )
 
     def _lose(self, what: str) -> None:

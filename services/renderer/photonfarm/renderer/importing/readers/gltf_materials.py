@@ -15,6 +15,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.imported import Ids
 from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node
@@ -47,7 +48,7 @@ class Materials:
     file: GltfFile
     root: Element  # gets the materials
     scratch: Path  # gets the images
-    notes: list[str]
+    changes: Changes
     ids: Ids
     _made: dict[int | None, str] = field(default_factory=dict)
     _images: dict[int, images.Image] = field(default_factory=dict)
@@ -63,25 +64,24 @@ class Materials:
         used = [_uv_set(found) for found in self._textures(number)]
         return used[0] if used else 0
 
-    def light(self, shape: Element, number: int | None) -> bool:
-        """Let a shape emit what its material emits; whether it does."""
+    def light(self, number: int | None) -> Element | None:
+        """The emitter of what shines with a material; None if it does not."""
         if number is None:
-            return False
+            return None
         entry = self.file.all("materials")[number]
         strength = _extension(entry, "KHR_materials_emissive_strength").get("emissiveStrength", 1.0)
         radiance = [strength * part for part in entry.get("emissiveFactor", (0, 0, 0))]
         if max(radiance) <= 0:
-            return False
+            return None
         if "emissiveTexture" not in entry:
-            elements.put_area_light(shape, radiance)
-            return True
+            return elements.area_light(radiance)
         values = images.linear(self._image(entry["emissiveTexture"])[..., :3]) * np.array(radiance, np.float32)
         if values.max() <= 0:
-            return False
-        emitter = SubElement(shape, "emitter", type="area")
+            return None
+        emitter = Element("emitter", type="area")
         file = images.save_radiance(values, self.scratch / f"emission_{number}.exr")
         self._finish(elements.put_bitmap(emitter, "radiance", file, raw=True), entry["emissiveTexture"])
-        return True
+        return emitter
 
     # ----------------------------------------------------------------------------------------------- one material
 
@@ -131,7 +131,9 @@ class Materials:
         if found is None:
             return place
         if found.get("scale", 1.0) != 1.0:
-            self.notes.append(f"material {made!r}: its normal map has its full strength, and not {found['scale']:g}")
+            self.changes.lose(
+                "colour", "normalTexture.scale", "normal maps have their full strength", f"material {made!r}"
+            )
         place.set("type", "normalmap")
         file = images.save(self._image(found)[..., :3], self.scratch / f"{made}_normal.png")
         self._finish(elements.put_bitmap(place, "normalmap", file, raw=True), found)
@@ -222,11 +224,15 @@ class Materials:
         if "transmissionTexture" in _extension(entry, "KHR_materials_transmission"):
             lost.append("the map of its transmission")
         if lost:
-            self.notes.append(f"material {made!r}: not carried over: {', '.join(lost)}")
+            for name in lost:
+                self.changes.lose("colour", name, "is not carried over", f"material {made!r}")
         sets = {_uv_set(found) for found in self._textures(number)}
         if len(sets) > 1:
-            self.notes.append(
-                f"material {made!r}: all its images use one set of texture coordinates, that of its colour"
+            self.changes.lose(
+                "colour",
+                "texCoord",
+                "all images use one set of texture coordinates, that of the colour",
+                f"material {made!r}",
             )
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector, listed
+from photonfarm.renderer.importing.changes import listed
+from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
 from photonfarm.renderer.importing.readers import mitsuba_instances, mitsuba_old, mitsuba_parts
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
@@ -46,7 +47,10 @@ def read(path: Path, _: Path, log: Log) -> ImportedScene:
     notes += _name_shapes(root)
     if root.find("shape") is None:
         raise SpecError(f"{path}: has no shape that photonfarm can render")
-    return ImportedScene(root, notes=notes, up=up, camera=camera)
+    scene = ImportedScene(root, up=up, camera=camera)
+    for note in notes:
+        scene.changes.note(note)
+    return scene
 
 
 def _parsed(path: Path) -> Located:

@@ -9,6 +9,7 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.readers import images
 from photonfarm.shared.core.errors import SpecError
 
@@ -90,7 +91,7 @@ def read_materials(file: Path) -> dict[str, Material]:
     return found
 
 
-def put_material(root: Element, made: str, material: Material | None, scratch: Path, notes: list[str]) -> None:
+def put_material(root: Element, made: str, material: Material | None, scratch: Path, changes: Changes) -> None:
     """Add a material to a scene; None is a grey one."""
     top = SubElement(root, "bsdf", id=made)
     if material is None:
@@ -98,7 +99,8 @@ def put_material(root: Element, made: str, material: Material | None, scratch: P
         elements.put_value(SubElement(top, "bsdf", type="diffuse"), "reflectance", (0.7, 0.7, 0.7))
         return
     if lost := sorted({_LOST[key] for key in material.lines if key in _LOST}):
-        notes.append(f"material {material.name!r}: not carried over: {', '.join(lost)}")
+        for name in lost:
+            changes.lose("colour", name, "is not carried over", f"material {material.name!r}")
     if _put_glass(top, material):
         return
     top = _put_mask(top, material, made, scratch)

@@ -6,14 +6,14 @@ import io
 import re
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import SubElement
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.imported import Ids, ImportedScene
-from photonfarm.renderer.importing.meshes import Mesh, write_ply
+from photonfarm.renderer.importing.meshes import Mesh
 from photonfarm.renderer.importing.readers.mtl import Material, put_material, read_materials
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
@@ -33,17 +33,17 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror or error}") from error
     materials = _materials(path, text)
-    scene, ids = ImportedScene(elements.scene()), Ids()
+    scene, ids = ImportedScene(), Ids()
     known = {name: ids.make(name, "material") for name in ["", *materials]}
     geometry = _geometry(path, text, materials)
     used = {_material_of(part) for part in geometry.values()} & set(materials)
     for name in ("", *(name for name in materials if name in used)):
-        put_material(scene.root, known[name], materials.get(name), scratch, scene.notes)
+        put_material(scene.root, known[name], materials.get(name), scratch, scene.changes)
     for name, part in geometry.items():
         material = _material_of(part)
         made = ids.make(name)
-        _put_shape(scene, made, part, known.get(material, known[""]), materials.get(material), scratch)
-        scene.objects[made] = name.removesuffix(f"_{material}") if material else name
+        owner = name.removesuffix(f"_{material}") if material else name
+        _put_shape(scene, made, part, known.get(material, known[""]), materials.get(material), owner)
     if scene.root.find("shape") is None:
         raise SpecError(f"{path}: has no faces with an area; nothing can be rendered")
     return scene
@@ -98,27 +98,23 @@ def _material_of(part: dict[str, Any]) -> str:
 
 
 def _put_shape(
-    scene: ImportedScene, made: str, part: dict[str, Any], material_id: str, material: Material | None, scratch: Path
+    scene: ImportedScene, made: str, part: dict[str, Any], material_id: str, material: Material | None, owner: str
 ) -> None:
     if not all(np.ndim(part[key]) == 2 and np.shape(part[key])[1] >= CORNERS for key in ("vertices", "faces")):
         return  # points, lines, and what is no surface
     uv, normals = getattr(part.get("visual"), "uv", None), part.get("vertex_normals")
     if uv is not None and len(uv) != len(part["vertices"]):
         uv = None
-    emits = material is not None and material.emits
     mesh = Mesh(
-        np.asarray(part["vertices"], np.float32)[:, :3],
+        np.asarray(part["vertices"], np.float64)[:, :3],
         _triangles(np.asarray(part["faces"], np.uint32)),
-        None if normals is None or emits else np.asarray(normals, np.float32),
-        None if uv is None else (np.asarray(uv) * (1, -1) + (0, 1)).astype(np.float32),
-    ).usable()
-    if not len(mesh.faces):
-        return
-    file = write_ply(mesh, scratch / "meshes" / f"{made}.ply")
-    shape = elements.mesh_shape(scene.root, made, file, faceted=mesh.normals is None)
-    SubElement(shape, "ref", id=material_id)
-    if material is not None and emits:
-        elements.put_area_light(shape, material.colour("ke", (0, 0, 0)))
+        None if normals is None else np.asarray(normals, np.float64),
+        None if uv is None else np.asarray(uv) * (1, -1) + (0, 1),
+    )
+    light: Element | None = None
+    if material is not None and material.emits:
+        light = elements.area_light(material.colour("ke", (0, 0, 0)))
+    scene.put_shape(made, mesh, material_id, owner, light, both_sides=True)
 
 
 def _triangles(polygons: NDArray[np.uint32]) -> NDArray[np.uint32]:

@@ -12,7 +12,7 @@ from photonfarm.trainer import service
 from photonfarm.trainer.cli import train_verb as cli
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, held
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, held
 from photonfarm.trainer.runs.settings import NetworkSettings
 from photonfarm.trainer.runs.stored_settings import read_settings
 from photonfarm.trainer.training.loop import train
@@ -166,8 +166,23 @@ def test_a_checkpoint_whose_numbers_are_not_those_written_is_refused(make_source
     whole[-400] ^= 1
     (run / CHECKPOINT).write_bytes(whole)
     for use in (lambda: train(make_source(24), tiny(), run), lambda: TrainedRun.load(run)):
-        with pytest.raises(StoreError, match="remove it"):
+        with pytest.raises(StoreError, match="do not match its checksum"):
             use()
+
+
+def test_a_damaged_checkpoint_offers_the_good_one_beside_it_from_which_the_run_goes_on(make_source, tiny, run) -> None:
+    settings = {"validate_every": 2, "checkpoint_every": 1}
+    train(make_source(24), tiny(max_steps=3, **settings), run)
+    step = checkpoint.load(run / GOOD)["step"]
+    (run / CHECKPOINT).write_bytes((run / CHECKPOINT).read_bytes()[:-2000])
+    with pytest.raises(StoreError, match=f"of step {step}: `mv {run / GOOD} {run / CHECKPOINT}`"):
+        train(make_source(24), tiny(max_steps=5, **settings), run)
+    (run / GOOD).replace(run / CHECKPOINT)
+    assert train(make_source(24), tiny(max_steps=5, **settings), run).step == 5
+    for name in (CHECKPOINT, GOOD):
+        (run / name).write_bytes((run / name).read_bytes()[:-2000])
+    with pytest.raises(StoreError, match="remove it"):
+        train(make_source(24), tiny(max_steps=5), run)
 
 
 def test_a_checkpoint_of_an_older_format_is_named_as_that(make_source, tiny, run, monkeypatch) -> None:

@@ -18,11 +18,11 @@ from photonfarm.trainer.cli import show
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, METRICS
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.recovery import GOOD, NEXT
+from photonfarm.trainer.training.recovery import NEXT
 from photonfarm.trainer.training.validation import UP_TO_WHITE, BestValidation, Validation, compared, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}

@@ -24,10 +24,10 @@ from photonfarm.trainer.data.growth import Growth
 from photonfarm.trainer.data.sampler import RoundSampler
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.runs import checkpoint, metrics_log
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.recovery import GOOD, NEXT
+from photonfarm.trainer.training.recovery import NEXT
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 

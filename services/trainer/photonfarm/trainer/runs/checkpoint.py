@@ -26,6 +26,7 @@ from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
 from photonfarm.shared.core.models import Changes, differing
 from photonfarm.shared.farm.training import METADATA
 from photonfarm.shared.store.io.local import sync
+from photonfarm.trainer.runs.run_folder import GOOD
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 FORMAT = 3
@@ -61,28 +62,47 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
         sync(path.parent)
 
 
-def load(path: Path, *, without: str = ANEW) -> dict[str, Any]:
+def load(path: Path, *, without: str = "") -> dict[str, Any]:
     """A checkpoint's content, on the CPU; nothing in it is executed.
 
-    Raises StoreError if it cannot be read; the message ends with `without`, which states what removing the file does.
+    Raises StoreError if it cannot be read; the message ends with `without`, which states what removing the file does,
+    or else with where a good one lies.
     """
-    document, tensors = _read(path, without)
+    try:
+        document, tensors = _read(path)
+    except _DamagedError as error:
+        raise StoreError(f"{path}: {error}; {without or _remedy(path)}") from error.__cause__
     if (found := document.get("format")) != FORMAT:
         raise StoreError(
             f"{path}: has format {found!r}, but this version reads format {FORMAT}; train anew in another folder"
         )
-    if document.get("sha256") != _digest(tensors):
-        raise StoreError(f"{path}: is damaged, as its numbers do not match its checksum; {without}")
     state: dict[str, Any] = _together(document, tensors)
     return state
 
 
-def _read(path: Path, without: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The JSON document, and the tensors by their names."""
+class _DamagedError(Exception):
+    """What is wrong with a checkpoint's bytes."""
+
+
+def _remedy(path: Path) -> str:
+    """What to do about a damaged checkpoint: go on from the good one beside it, if there is one, or begin anew."""
+    good = path.with_name(GOOD)
+    try:
+        document, _ = _read(good)
+        step = document["step"] if document["format"] == FORMAT and "store" in document else None
+    except (_DamagedError, StoreError, KeyError):
+        step = None
+    if step is None or good == path:
+        return ANEW
+    return f"{GOOD} beside it is whole, of step {step}: `mv {good} {path}`, and the run goes on from there"
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """The JSON document, and the tensors by their names; _DamagedError for bytes that were not written so."""
     try:
         with safe_open(path, framework="pt") as file:
             document = dict(json.loads((file.metadata() or {}).get(METADATA, "{}")))
-            return document, {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except FileNotFoundError as error:
         raise StoreError(
             f"{path}: there is no checkpoint yet; a run leaves one every 500 steps (--set checkpoint_every=N), and at "
@@ -90,7 +110,10 @@ def _read(path: Path, without: str) -> tuple[dict[str, Any], dict[str, Tensor]]:
         ) from error
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
-        raise StoreError(f"{path}: is not a readable checkpoint: {reason}; {without}") from error
+        raise _DamagedError(f"is not a readable checkpoint: {reason}") from error
+    if document.get("format") == FORMAT and document.get("sha256") != _digest(tensors):
+        raise _DamagedError("is damaged, as its numbers do not match its checksum")
+    return document, tensors
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:

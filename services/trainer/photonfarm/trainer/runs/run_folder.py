@@ -15,6 +15,7 @@ from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 __all__ = ["CHECKPOINT", "INITIAL", "METRICS", "SETTINGS", "held", "note_scene_folder", "with_scenes"]
 
 LOCK = "lock"
+GOOD = "good.safetensors"  # a checkpoint of the last good validation, which a run that diverges goes back to
 SCENE_FOLDER = "scene-folder.txt"
 
 

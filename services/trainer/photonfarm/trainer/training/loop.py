@@ -188,20 +188,28 @@ class Session:
 
     def _save(self) -> None:
         with self._watch.on("save"):
-            samples = len(self._stream.growth.rows)
-            state = {
-                **self._learner.state(),
-                **self._identity(),
-                "step": self._step,
-                "seconds": self._watch.seconds,
-                "last_error": self._last_error,
-                "following": self._stream.state(),
-                "recovery": {**self._good.state(), "best": self._best.state() if self._best else None},
-                "store": checkpoint.snapshot(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
-                "versions": checkpoint.versions(),
-            }
-            with self._good.saved_with(self._run, self._identity()):
+            recovery = {**self._good.state(), "best": self._best.state() if self._best else None}
+            state = {**self._learner.state(), **self._state(), "recovery": recovery}
+            with self._good.saved_with(self._run):
                 checkpoint.save(self._run / CHECKPOINT, state)
+
+    def _keep(self) -> None:
+        """Keep this state as the good one; without one to go back to before it, it is a checkpoint of its own."""
+        recovery = {**self._good.state(), "good": None, "best": None}
+        self._good.keep(self._step, {**self._state(), "recovery": recovery})
+
+    def _state(self) -> dict[str, Any]:
+        """What a checkpoint says beyond the learner and what it may go back to."""
+        samples = len(self._stream.growth.rows)
+        return {
+            **self._identity(),
+            "step": self._step,
+            "seconds": self._watch.seconds,
+            "last_error": self._last_error,
+            "following": self._stream.state(),
+            "store": checkpoint.snapshot(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
+            "versions": checkpoint.versions(),
+        }
 
     def _ended(self) -> str | None:
         if self._stop.is_set():
@@ -304,7 +312,7 @@ class Session:
             self._log_recovered("held-out error", found)
         elif found is not None and not found.is_worse:
             self._hooks.group.send("keep", self._step)
-            self._good.keep(self._step)
+            self._keep()
 
     def _end_no_worse(self) -> None:
         """Validate the last step, and end with the last good state if the last one is worse than allowed."""
@@ -312,7 +320,7 @@ class Session:
             self._validate()
         found = self._compared
         if found is not None and not found.is_worse:
-            self._good.keep(self._step)
+            self._keep()
         elif found is not None:
             self._good.give(f"step {self._step}: {found.stated}")
             self._log_recovered("end", found)

@@ -13,9 +13,9 @@ from torch import Tensor
 from photonfarm.shared.core.errors import store_errors
 from photonfarm.trainer.data.dataset import TrainingBatch
 from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import GOOD
 from photonfarm.trainer.training.learner import DivergedError, Learner
 
-GOOD = "good.safetensors"
 NEXT = "good.next.safetensors"  # in the run's folder too, until the checkpoint that refers to it is written
 WITHOUT = "remove it, and the run goes on, with nothing to go back to before its next good validation"
 
@@ -36,9 +36,9 @@ class GoodState:
         self.step: int | None = None  # at which it was kept; None if nothing is
         self.recoveries = 0
 
-    def keep(self, step: int) -> None:
-        """Keep the learner's state at a step."""
-        self._kept, self.step, self._is_new = _copied(self._learner.state()), step, True
+    def keep(self, step: int, rest: Mapping[str, Any] | None = None) -> None:
+        """Keep the learner's state at a step, and the rest of a checkpoint, which makes its file one."""
+        self._kept, self.step, self._is_new = _copied({**self._learner.state(), **(rest or {})}), step, True
 
     def step_or_go_back(self, number: int, batch: TrainingBatch) -> float | None:
         """Take a step; returns the loss, or None if it was not finite and the learner went back.
@@ -85,13 +85,13 @@ class GoodState:
             self._kept, self.step = kept, own["good"]
 
     @contextmanager
-    def saved_with(self, run: Path, identity: Mapping[str, Any]) -> Iterator[None]:
+    def saved_with(self, run: Path) -> Iterator[None]:
         """Write the kept state; inside, the checkpoint that refers to it is written; then it replaces the one before.
 
         So a run that is killed at any moment finds the state that its last checkpoint refers to, by `settle`.
         """
         if self._is_new:
-            checkpoint.save(run / NEXT, {**self._kept, "step": self.step, **identity})
+            checkpoint.save(run / NEXT, self._kept)
         yield
         if self._is_new:
             with store_errors("keep the last good state", run):

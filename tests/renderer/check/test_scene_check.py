@@ -105,6 +105,18 @@ def test_each_fault_has_its_own_finding_and_no_other(
     assert [finding.key for finding in found if not finding.serious] == notes
 
 
+def test_a_scene_far_from_the_origin_is_found_before_all_else(write: Write, tmp_path: Path) -> None:
+    group = SPEC[SPEC.index("[[objects]]") : SPEC.index("[view]")]
+    ends = [(f"{end} = [{sign}{x}", f"{end} = [{10000 + float(f'{sign}{x}')}")
+            for x in ("1.8", "1.5") for end, sign in (("min", "-"), ("max", ""))]  # fmt: skip
+    spec = write((group, ""), *ends)
+    moved = ROOM.replace("</transform>", '<translate x="10000"/></transform>').replace('x="1.8"', 'x="10001.8"')
+    (tmp_path / "scene.xml").write_text(moved)
+    (found, *_) = checked(spec).findings
+    assert found.key == "scene.file"
+    assert "photonfarm scene import scene.xml" in found.sentence
+
+
 @pytest.mark.parametrize("static", [False, True])
 def test_the_pictures_are_the_samples_that_submit_plans_first(write: Write, static: bool) -> None:
     group = SPEC[SPEC.index("[[objects]]") : SPEC.index("[view]")]

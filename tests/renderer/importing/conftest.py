@@ -38,7 +38,7 @@ class Gltf:
 
     def array(self, values: np.ndarray, kind: str) -> int:
         """Add an accessor; its number."""
-        codes = {"<f4": 5126, "<u4": 5125, "<u2": 5123, "|u1": 5121}
+        codes = {"<f4": 5126, "<u4": 5125, "<u2": 5123, "|u1": 5121, "|i1": 5120}
         view = {"buffer": 0, "byteOffset": len(self.binary), "byteLength": values.nbytes}
         self.binary += values.tobytes()
         self.binary += bytes(-len(self.binary) % 4)
@@ -155,3 +155,16 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exposure, "PATHS", 1 << 13)
     monkeypatch.setattr(exposure, "SIDE", 32)
     monkeypatch.setattr(importer, "FRAMES", 4)
+
+
+@pytest.fixture
+def case() -> Callable[[str], Path]:
+    """Function (name, such as `obj-concave/it.obj`) → a file of the import cases, which lie beside the checkout."""
+
+    def make(name: str) -> Path:
+        file = Path(__file__).resolve().parents[3].parent / "shared/cases/import" / name
+        if not file.exists():
+            pytest.skip(f"{name} is not there")
+        return file
+
+    return make

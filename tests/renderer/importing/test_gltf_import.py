@@ -1,4 +1,4 @@
-"""glTF as it is imported: names, places, materials and lights as the specification has them."""
+"""glTF as it is imported: names, places, extensions and lights as the specification has them."""
 
 from __future__ import annotations
 
@@ -7,154 +7,13 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from imported_scenes import FOUR, Loaded, Read, colour_at, losses
 
-from photonfarm.renderer.importing.elements import child
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.readers import images
 from photonfarm.shared.core.errors import SpecError
-
-Read = Callable[[Path], ImportedScene]
-Loaded = Callable[[Path], tuple[ImportedScene, Any]]
-
-FOUR = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]])
-"""Red and green above blue and white."""
-
-
-def colour_at(scene: Any, x: float, y: float) -> list[float]:
-    """The diffuse reflectance of the unit square."""
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 1), mi.Vector3f(0, 0, -1)))
-    return [round(float(part), 2) for part in np.array(si.bsdf().eval_diffuse_reflectance(si)).ravel()]
-
-
-def of_type(root: Element, kind: str) -> Element:
-    return next(node for node in root.iter() if node.get("type") == kind)
-
-
-# ------------------------------------------------------------------------------------------------------- materials
-
-
-@pytest.mark.parametrize(
-    ("transform", "top_left", "top_right"),
-    [
-        ({}, [1, 0, 0], [0, 1, 0]),
-        ({"offset": [0.5, 0]}, [0, 1, 0], [1, 0, 0]),
-        ({"offset": [0, 0.5]}, [0, 0, 1], [1, 1, 1]),
-        ({"rotation": np.pi / 2}, [0, 0, 1], [1, 0, 0]),  # (u, v) → (v, −u)
-        ({"scale": [-1, 1]}, [0, 1, 0], [1, 0, 0]),
-    ],
-)
-def test_images_lie_on_surfaces_as_their_transforms_say(
-    gltf: Any, quad: Callable[..., Path], loaded: Loaded, transform: Any, top_left: Any, top_right: Any
-) -> None:
-    found = gltf.image(FOUR, "four.png") | {"extensions": {"KHR_texture_transform": transform}}
-    _, scene = loaded(quad(pbrMetallicRoughness={"baseColorTexture": found, "metallicFactor": 0}))
-    assert colour_at(scene, 0.25, 0.75) == top_left
-    assert colour_at(scene, 0.75, 0.75) == top_right
-
-
-def test_roughness_is_the_green_channel_and_metallic_the_blue_one_raw_and_times_their_factors(
-    gltf: Any, quad: Callable[..., Path], read: Read
-) -> None:
-    pixels = np.full((2, 2, 3), (9, 100, 200))
-    surface = {"metallicRoughnessTexture": gltf.image(pixels, "mr.png"), "roughnessFactor": 0.5, "metallicFactor": 1}
-    principled = of_type(read(quad(pbrMetallicRoughness=surface)).root, "principled")
-    for name, value in (("roughness", 50), ("metallic", 200)):
-        texture = child(principled, name)
-        assert texture is not None
-        raw, file = child(texture, "raw"), child(texture, "filename")
-        assert raw is not None
-        assert file is not None
-        assert raw.get("value") == "true"
-        stored = images.decoded(Path(file.get("value", "")).read_bytes(), "it")[0, 0, 0]
-        assert stored * 255 == pytest.approx(value, abs=0.6)
-
-
-def test_colours_are_multiplied_in_linear_light(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:
-    surface = {"baseColorTexture": gltf.image(FOUR, "four.png"), "baseColorFactor": [0.5, 1, 0.25, 1]}
-    _, scene = loaded(quad(pbrMetallicRoughness=surface | {"metallicFactor": 0}))
-    assert colour_at(scene, 0.75, 0.25) == pytest.approx([0.5, 1, 0.25], abs=0.01)
-
-
-def test_green_of_a_normal_map_tilts_upwards_in_the_image(
-    gltf: Any, quad: Callable[..., Path], loaded: Loaded
-) -> None:  # fmt: skip
-    tilted = gltf.image(np.full((2, 2, 3), (128, 218, 218)), "normal.png")
-    _, scene = loaded(quad(normalTexture=tilted, pbrMetallicRoughness={"metallicFactor": 0}))
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0.5, 0.5, 1), mi.Vector3f(0, 0, -1)))
-    up, down = (
-        np.array(si.bsdf().eval(mi.BSDFContext(), si, si.to_local(mi.Vector3f(0, y, 0.7)))).mean() for y in (0.7, -0.7)
-    )
-    assert up > 3 * down
-
-
-def test_emission_has_its_strength_and_its_mesh_the_normals_of_its_faces(quad: Callable[..., Path], read: Read) -> None:
-    strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 8}}
-    (shape,) = read(quad(emissiveFactor=[1, 0.5, 0], extensions=strength)).root.findall("shape")
-    emitter = shape.find("emitter")
-    assert emitter is not None
-    radiance, flat = child(emitter, "radiance"), child(shape, "face_normals")
-    assert radiance is not None
-    assert flat is not None
-    assert radiance.get("value") == "8, 4, 0"
-
-
-def test_an_image_of_emission_keeps_values_above_one(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:
-    strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 8}}
-    glow = gltf.image(FOUR, "glow.png")
-    _, scene = loaded(quad(emissiveFactor=[1, 1, 1], emissiveTexture=glow, extensions=strength))
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0.75, 0.25, 1), mi.Vector3f(0, 0, -1)))
-    assert np.array(scene.emitters()[0].eval(si)).max() == pytest.approx(8, rel=0.01)
-
-
-@pytest.mark.parametrize(
-    ("extensions", "roughness", "kind"),
-    [
-        ({"KHR_materials_transmission": {"transmissionFactor": 1}}, 0, "thindielectric"),
-        (
-            {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_volume": {"thicknessFactor": 1}},
-            0,
-            "dielectric",
-        ),
-        ({"KHR_materials_transmission": {"transmissionFactor": 0.7}}, 0.4, "principled"),
-    ],
-)
-def test_what_light_passes_is_glass_with_its_refractive_index(
-    quad: Callable[..., Path], loaded: Loaded, extensions: Any, roughness: float, kind: str
-) -> None:
-    surface = {"roughnessFactor": roughness, "metallicFactor": 0}
-    extensions = extensions | {"KHR_materials_ior": {"ior": 1.7}}
-    scene, made = loaded(quad(pbrMetallicRoughness=surface, extensions=extensions))
-    glass = of_type(scene.root, kind)
-    ior = child(glass, "eta" if kind == "principled" else "int_ior")
-    assert ior is not None
-    assert ior.get("value") == "1.7"
-    assert mi.has_flag(made.shapes()[0].bsdf().flags(), mi.BSDFFlags.Transmission)
-
-
-def test_what_is_masked_is_opaque_or_not(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:
-    pixels = np.dstack([FOUR, np.array([[0, 100], [200, 255]])])
-    surface = {"baseColorTexture": gltf.image(pixels, "leaf.png"), "metallicFactor": 0}
-    _, scene = loaded(quad(pbrMetallicRoughness=surface, alphaMode="MASK"))
-    x, y = mi.Float([0.25, 0.75, 0.25, 0.75]), mi.Float([0.75, 0.75, 0.25, 0.25])
-    si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, y, 1), mi.Vector3f(0, 0, -1)))
-    through = np.array(si.bsdf().eval_null_transmission(si))[0]
-    assert through.tolist() == pytest.approx([1, 1, 0, 0], abs=1e-6)
-
-
-def test_what_is_not_carried_over_is_listed(gltf: Any, quad: Callable[..., Path], read: Read) -> None:
-    gltf.document["animations"] = [{}, {}]
-    gltf.document["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
-    notes = " ".join(read(quad(extensions={"KHR_materials_sheen": {}}, occlusionTexture={"index": 0})).notes)
-    for lost in ("animations (2)", "EXT_mesh_gpu_instancing", "sheen", "baked occlusion"):
-        assert lost in notes
-
-
-# -------------------------------------------------------------------------------------------------- nodes and lights
 
 
 def test_nodes_are_placed_by_all_above_them_and_mirrored_ones_keep_their_fronts(gltf: Any, loaded: Loaded) -> None:
@@ -247,6 +106,175 @@ def test_a_glb_is_the_same_scene(gltf: Any, quad: Callable[..., Path], read: Rea
     assert text(read(tmp_path / "one.glb").root) == separate
 
 
+TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4"), np.array([[0, 1, 2]], "<u4")
+
+
+def test_morph_targets_have_the_weights_of_the_node_or_else_of_the_mesh(gltf: Any, loaded: Loaded) -> None:
+    mesh = gltf.mesh(*TRIANGLE)
+    target = {"POSITION": gltf.array(np.array([[0, 0, 0], [2, 0, 0], [0, 0, 0]], "<f4"), "VEC3")}
+    gltf.document["meshes"][mesh]["primitives"][0]["targets"] = [target, {}]
+    gltf.document["meshes"][mesh]["weights"] = [0.5, 0]
+    gltf.node("OfMesh", mesh)
+    gltf.node("OfNode", mesh, weights=[1, 0])
+    scene, made = loaded(gltf.write())
+    assert [float(shape.bbox().max.x) for shape in made.shapes()] == [2, 3]
+    assert losses(scene) == []
+
+
+def test_skins_stand_as_their_joints_place_them(gltf: Any, loaded: Loaded) -> None:
+    joints = gltf.array(np.array([[0, 1, 0, 0]] * 3, "|u1"), "VEC4")
+    weights = gltf.array(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0.5, 0.5, 0, 0]], "<f4"), "VEC4")
+    mesh = gltf.mesh(*TRIANGLE, JOINTS_0=joints, WEIGHTS_0=weights)
+    back = np.eye(4, dtype="<f4")
+    back[3, 0] = -1  # column-major: one to the left
+    inverse = gltf.array(np.stack([np.eye(4, dtype="<f4"), back]).reshape(2, 16), "MAT4")
+    gltf.node("Skinned", mesh, skin=0, translation=[100, 0, 0])  # which a skin ignores
+    gltf.node("Root", translation=[0, 0, 2])
+    gltf.node("Tip", translation=[4, 0, 0])
+    gltf.document["skins"] = [{"joints": [1, 2], "inverseBindMatrices": inverse}]
+    scene, _ = loaded(gltf.write())
+    assert np.allclose(scene.meshes["Skinned"].vertices, [[0, 0, 2], [4, 0, 0], [1.5, 1, 1]])
+    assert losses(scene) == []
+
+
+def test_nodes_that_are_not_visible_are_not_there_with_all_below_them(gltf: Any, read: Read) -> None:
+    lamp = {"KHR_lights_punctual": {"light": 0}}
+    gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+    gltf.node("Below", gltf.mesh(*TRIANGLE), extensions=lamp)
+    gltf.node("Hidden", extensions={"KHR_node_visibility": {"visible": False}}, children=[0])
+    gltf.node("Shown", 0)
+    gltf.document["scenes"][0]["nodes"] = [1, 2]
+    scene = read(gltf.write())
+    assert list(scene.meshes) == ["Shown"]
+    assert scene.root.find("emitter") is None
+
+
+def test_nodes_may_lie_deep_and_shapes_have_their_names(gltf: Any, read: Read) -> None:
+    gltf.node("Deep", gltf.mesh(*TRIANGLE, gltf.material("Deep")))
+    for number in range(1500):
+        gltf.node(f"N{number}", translation=[1, 0, 0], children=[number])
+    gltf.document["scenes"][0]["nodes"] = [1500]
+    assert read(gltf.write()).meshes["Deep"].vertices[0].tolist() == [1500, 0, 0]
+
+
+def test_instances_may_be_of_integers_and_in_a_turned_node(gltf: Any, read: Read) -> None:
+    turn = gltf.array(np.array([[0, 0, 0, 127], [0, 0, 127, 0]], "|i1"), "VEC4")
+    gltf.document["accessors"][turn]["normalized"] = True
+    size = gltf.array(np.array([[1, 1, 1], [2, 2, 2]], "<f4"), "VEC3")
+    instances = {"attributes": {"ROTATION": turn, "SCALE": size, "_ID": size}}
+    gltf.node("Many", gltf.mesh(*TRIANGLE), translation=[0, 0, 5], extensions={"EXT_mesh_gpu_instancing": instances})
+    scene = read(gltf.write())
+    assert scene.meshes["Many_0"].vertices[1].tolist() == [1, 0, 5]
+    assert np.allclose(scene.meshes["Many_1"].vertices[1], [-2, 0, 5])
+    assert scene.objects == {"Many_0": "Many_0", "Many_1": "Many_1"}
+
+
+def test_points_and_lines_are_losses_of_geometry(gltf: Any, read: Read) -> None:
+    for mode in (0, 1, 4):
+        gltf.document["meshes"][gltf.mesh(*TRIANGLE)]["primitives"][0]["mode"] = mode
+        gltf.node(f"Mode{mode}", mode if mode < 2 else 2)
+    scene = read(gltf.write())
+    assert losses(scene) == [("geometry", "POINTS"), ("geometry", "LINES")]
+    assert list(scene.meshes) == ["Mode4"]
+
+
+# ------------------------------------------------------------------------------------------------------- extensions
+
+
+def test_what_has_no_effect_on_a_still_picture_is_no_loss(gltf: Any, quad: Callable[..., Path], read: Read) -> None:
+    gltf.document |= {"animations": [{}, {}], "extensionsUsed": ["EXT_unused"]}
+    gltf.document["extensionsRequired"] = ["KHR_materials_variants"]
+    neutral = {"KHR_materials_sheen": {}, "KHR_materials_clearcoat": {"clearcoatFactor": 0}, "KHR_xmp_json_ld": {},
+               "KHR_materials_iridescence": {"iridescenceFactor": 0}, "KHR_materials_specular": {}}  # fmt: skip
+    changes = list(read(quad(extensions=neutral, occlusionTexture={"index": 0})).changes)
+    assert {change.effect for change in changes} == {None}
+    assert {change.name for change in changes} == {"animations", "KHR_xmp_json_ld", "occlusionTexture"}
+
+
+def test_extensions_that_are_not_read_are_named_by_what_they_sit_on(
+    gltf: Any, quad: Callable[..., Path], read: Read
+) -> None:
+    lights = [{"type": "point", "extensions": {"EXT_of_light": {}}}, {"type": "area"}]
+    gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": lights}}
+    for number in range(2):
+        gltf.node("L", extensions={"KHR_lights_punctual": {"light": number}})
+    path = quad(extensions={"KHR_materials_unlit": {}, "KHR_materials_sheen": {"sheenColorFactor": [0, 0, 0.1]}})
+    document = json.loads(path.read_text())
+    document["scenes"][0]["extensions"] = {"EXT_lights_image_based": {}}
+    document["nodes"][-1]["extensions"] = {"EXT_of_node": {}}
+    document["meshes"][0]["primitives"][0]["extensions"] = {"EXT_of_primitive": {}}
+    document["meshes"].append({"primitives": [], "extensions": {"EXT_of_nothing": {}}})
+    path.write_text(json.dumps(document))
+    assert set(losses(read(path))) == {
+        ("light", "EXT_lights_image_based"), ("light", "EXT_of_light"), ("light", "area"), ("geometry", "EXT_of_node"),
+        ("geometry", "EXT_of_primitive"), ("colour", "KHR_materials_unlit"), ("colour", "KHR_materials_sheen"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("fallback", [True, False])
+def test_what_is_compressed_is_read_only_where_it_has_its_data_beside_it(
+    gltf: Any, read: Read, fallback: bool
+) -> None:  # fmt: skip
+    primitive = gltf.document["meshes"][gltf.mesh(*TRIANGLE)]["primitives"][0]
+    primitive["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {}}}
+    gltf.node("It", 0)
+    if fallback:
+        assert losses(read(gltf.write())) == []
+        return
+    del gltf.document["accessors"][primitive["attributes"]["POSITION"]]["bufferView"]
+    with pytest.raises(SpecError, match="KHR_draco_mesh_compression"):
+        read(gltf.write())
+
+
+# ------------------------------------------------------------------------------------------------- cases of others
+
+
+def test_a_lamp_that_is_seen_from_both_sides_shines_from_both(case: Callable[[str], Path], loaded: Loaded) -> None:
+    _, scene = loaded(case("gltf-lamp-facing-up/scene.gltf"))
+    for origin, direction in (([2, 2, 1.5], [0, 1, 0]), ([2, 2.45, 1.5], [0, -1, 0])):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(origin), mi.Vector3f(direction)))
+        assert np.array(si.emitter(scene).eval(si)).ravel() == pytest.approx([10] * 3)
+
+
+def test_instances_stand_where_they_are(case: Callable[[str], Path], loaded: Loaded) -> None:
+    scene, made = loaded(case("gltf-gpu-instancing/inst.glb"))
+    assert sum(float(np.array(shape.surface_area())[0]) for shape in made.shapes()) == pytest.approx(70.96, rel=1e-3)
+    x, z = mi.Float([0.5, 3.4, 0.5, 3.4]), mi.Float([0.5, 0.5, 2.5, 2.5])
+    si = made.ray_intersect(mi.Ray3f(mi.Point3f(x, 2.4, z), mi.Vector3f(0, -1, 0)))
+    assert np.array(si.p)[1] == pytest.approx([0.9] * 4)
+    assert losses(scene) == []
+
+
+def test_meshes_that_are_compressed_are_refused_by_name(case: Callable[[str], Path], read: Read) -> None:
+    with pytest.raises(SpecError, match="KHR_meshopt_compression"):
+        read(case("gltf-khr-meshopt/textured-khr.glb"))
+    assert losses(read(case("gltf-khr-meshopt/textured-plain.glb"))) == []
+
+
+def test_normal_maps_keep_their_upper_side_where_images_are_mirrored(
+    case: Callable[[str], Path], loaded: Loaded
+) -> None:  # fmt: skip
+    _, scene = loaded(case("gltf-mirrored-uv-normal-map/scene.gltf"))
+    for x in (0.5, 2.5, 4.5):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.5, 5), mi.Vector3f(0, 0, -1)))
+        for y, value in ((0.5**0.5, 0.2515), (-(0.5**0.5), 0)):
+            lit = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(mi.Vector3f(0, y, 0.5**0.5)))
+            assert np.array(lit).ravel()[0] == pytest.approx(value, abs=3e-3)
+
+
+def test_grey_of_16_bits_has_its_value(case: Callable[[str], Path], loaded: Loaded) -> None:
+    _, scene = loaded(case("gltf-16-bit-grey/scene.gltf"))
+    assert colour_at(scene, 0.5, 0.5) == pytest.approx([0.214] * 3, abs=0.01)
+
+
+def test_images_wrap_differently_along_both_axes(case: Callable[[str], Path], loaded: Loaded) -> None:
+    _, scene = loaded(case("gltf-wrap/scene.gltf"))
+    blue, white, green, red = [0, 0, 1], [1, 1, 1], [0, 1, 0], [1, 0, 0]
+    for place, colour in (((0.1, 0.9), blue), ((0.9, 0.9), white), ((0.9, 0.1), green),
+                          ((2.1, 0.9), green), ((2.9, 0.9), red), ((2.1, 0.1), white)):  # fmt: skip
+        assert colour_at(scene, *place) == colour
+
+
 # ---------------------------------------------------------------------------------------------------- what is wrong
 
 
@@ -271,11 +299,15 @@ def changed(**entries: Any) -> Callable[[Path], None]:
         (lambda folder: (folder / "four.png").write_bytes(b"no image"), "image 0"),
         (lambda folder: (folder / "room.gltf").write_text("{"), "room.gltf"),
         (changed(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
+        (changed(extensionsRequired=["EXT_of_the_future"]), "EXT_of_the_future"),
+        (changed(buffers=[{"byteLength": 4, "extensions": {"KHR_meshopt_compression": {"fallback": True}}}]),
+         "KHR_meshopt_compression"),
+        (changed(nodes=[{"children": [1]}, {"children": [0]}], scenes=[{"nodes": [0]}]), "below itself"),
         (changed(asset={"version": "1.0"}), "1.0"),
         (changed(meshes=[]), "room.gltf"),
         (changed(nodes=[], scenes=[{"nodes": []}]), "room.gltf"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_read_is_named(
     gltf: Any, quad: Callable[..., Path], read: Read, tmp_path: Path, break_it: Callable[[Path], None], named: str
 ) -> None:

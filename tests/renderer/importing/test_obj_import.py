@@ -12,11 +12,70 @@ import pytest
 from PIL import Image
 
 from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.importing.readers import images
 from photonfarm.shared.core.errors import SpecError
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 
 SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+
+
+FOUR = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
+
+CORNERS = ((0.25, 0.75), (0.75, 0.75), (0.25, 0.25), (0.75, 0.25))
+"""Where four.png has the middles of its texels on the square."""
+
+WHOLE = "usemtl it\nf 1/1 2/2 3/3 4/4"
+
+
+def hit(made: Any, x: float, y: float, side: float = 5) -> Any:
+    """What a ray down at (x, y) meets, or up if it comes from below."""
+    return made.ray_intersect(mi.Ray3f(mi.Point3f(x, y, side), mi.Vector3f(0, 0, -1 if side > 0 else 1)))
+
+
+def meets(made: Any, x: float, y: float) -> bool:
+    """Whether a ray down at (x, y) meets anything."""
+    return bool(np.array(hit(made, x, y, 50).is_valid()).ravel()[0])
+
+
+def reflectance(made: Any, x: float, y: float) -> np.ndarray:
+    """The diffuse reflectance of what a ray down at (x, y) meets."""
+    si = hit(made, x, y)
+    return np.array(si.bsdf().eval_diffuse_reflectance(si)).ravel()
+
+
+def opacity(made: Any, x: float, y: float) -> float:
+    """The opacity of what a ray down at (x, y) meets."""
+    si = hit(made, x, y)
+    return 1 - float(np.array(si.bsdf().eval_null_transmission(si)).ravel()[0])
+
+
+def emission(made: Any, x: float, y: float, side: float = 5) -> np.ndarray:
+    """What is emitted towards a ray down at (x, y)."""
+    si = hit(made, x, y, side)
+    return np.array(si.emitter(made).eval(si)).ravel()
+
+
+def scattered(made: Any, *light: float) -> float:
+    """What of light from a direction the square at (0.4, 0.3) sends upwards."""
+    si = hit(made, 0.4, 0.3)
+    towards = si.to_local(mi.Vector3f(*(part / float(np.linalg.norm(light)) for part in light)))
+    return float(np.array(si.bsdf().eval(mi.BSDFContext(), si, towards)).ravel()[0])
+
+
+def area(made: Any) -> float:
+    """The area of all shapes."""
+    return sum(float(np.array(shape.surface_area()).ravel()[0]) for shape in made.shapes())
+
+
+def said(scene: ImportedScene) -> str:
+    """All changes."""
+    return "\n".join(map(str, scene.changes))
+
+
+def lost(scene: ImportedScene) -> dict[str, str]:
+    """The effects of all changes that are refused, by their names."""
+    return {change.name: change.effect for change in scene.changes if change.effect is not None}
 
 
 @pytest.fixture
@@ -70,9 +129,11 @@ def test_materials_become_what_is_nearest(
 
 def test_what_emits_is_a_light_with_flat_normals(write: Callable[[str, str], Path], loaded: Loaded) -> None:
     _, made = loaded(write("vn 0 1 1\nusemtl it\nf 1//1 2//1 3//1 4//1", "newmtl it\nKe 5 4 3"))
-    (shape,) = made.shapes()
-    assert shape.is_emitter()
-    assert not shape.has_vertex_normals()
+    for shape in made.shapes():
+        assert shape.is_emitter()
+        assert not shape.has_vertex_normals()
+    for side in (5, -5):
+        assert emission(made, 0.5, 0.4, side) == pytest.approx([5, 4, 3])
 
 
 def test_polygons_of_all_kinds_are_read(write: Callable[[str, str], Path], loaded: Loaded) -> None:
@@ -94,3 +155,440 @@ def test_what_is_missing_is_named(
 ) -> None:
     with pytest.raises(SpecError, match=named):
         loaded(write(faces, materials))
+
+
+# ------------------------------------------------------------------------------------------------------------- faces
+
+
+@pytest.fixture
+def obj(tmp_path: Path) -> Callable[[str | bytes], Path]:
+    """Function (text) → an OBJ file."""
+
+    def make(text: str | bytes) -> Path:
+        (tmp_path / "it.obj").write_bytes(text if isinstance(text, bytes) else text.encode())
+        return tmp_path / "it.obj"
+
+    return make
+
+
+Obj = Callable[[str | bytes], Path]
+Write = Callable[[str, str], Path]
+FOUR_V = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+
+
+def test_relative_indices_count_from_their_line(case: Callable[[str], Path], loaded: Loaded) -> None:
+    _, made = loaded(case("obj-negative-indices/two.obj"))
+    assert area(made) == pytest.approx(2)
+    assert np.ravel(made.bbox().max).tolist() == [4, 1, 0]
+    assert [meets(made, x, 0.5) for x in (0.5, 2.5, 3.5)] == [True, False, True]
+
+
+def test_relative_indices_of_texture_coordinates_and_normals_count_from_their_line(obj: Obj, loaded: Loaded) -> None:
+    first = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nvn 0 0 1\nf -3/-3/-1 -2/2/-1 3/-1/1\n"
+    _, made = loaded(obj(first + "v 9 9 9\nvt 0.5 0.5\nvn 1 0 0\n"))
+    si = hit(made, 0.25, 0.5)
+    assert np.ravel(si.uv) == pytest.approx([0.25, 0.5])  # v is downwards
+    assert np.ravel(si.sh_frame.n) == pytest.approx([0, 0, 1])
+
+
+def test_concave_polygons_keep_their_shape(case: Callable[[str], Path], loaded: Loaded) -> None:
+    _, made = loaded(case("obj-concave/it.obj"))
+    assert area(made) == pytest.approx(7)
+    assert [meets(made, *at) for at in ((1.5, 2), (0.5, 2), (1.5, 0.5))] == [False, True, True]
+
+
+@pytest.mark.parametrize("slope", [(0, 0), (1, 2), (-3, 0.1)])
+@pytest.mark.parametrize("turn", [1, -1])
+def test_a_wall_with_an_opening_keeps_it_and_its_side(
+    obj: Obj, loaded: Loaded, slope: tuple[float, float], turn: int
+) -> None:
+    corners = [(0, 0), (4, 0), (4, 3), (0, 3), (0, 0), (1, 1), (1, 2), (3, 2), (3, 1), (1, 1)][::turn]
+    points = "".join(f"v {x} {y} {x * slope[0] + y * slope[1]}\n" for x, y in corners)
+    _, made = loaded(obj(points + "f " + " ".join(str(k + 1) for k in range(len(corners)))))
+    assert area(made) == pytest.approx(10 * np.linalg.norm([*slope, 1]))
+    assert [meets(made, *at) for at in ((2, 1.5), (0.5, 0.5), (3.5, 2.5))] == [False, True, True]
+    assert np.sign(np.ravel(hit(made, 0.5, 0.6, 50).n)[2]) == turn
+
+
+@pytest.mark.parametrize("first", range(4))
+def test_quads_that_are_not_convex_keep_their_shape(obj: Obj, loaded: Loaded, first: int) -> None:
+    indices = " ".join(str((first + k) % 4 + 1) for k in range(4))
+    _, made = loaded(obj(f"v 0 0 0\nv 2 2 0\nv 0 1 0\nv -2 2 0\nf {indices}"))
+    assert area(made) == pytest.approx(2)
+    assert not meets(made, 0, 1.5)
+
+
+def test_faces_that_cross_themselves_or_are_none_are_said(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
+    scene = read(obj("v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 4\nf 1 2 3\nf 1 2\np 1\nl 1 2"))
+    for text in ("cross themselves", "(line 5)", "fewer than three corners", "(line 7)", "line 8", "line 9"):
+        assert text in said(scene)
+    assert not lost(scene)
+
+
+def test_normals_that_are_no_numbers_are_those_of_the_faces(case: Callable[[str], Path], loaded: Loaded) -> None:
+    _, made = loaded(case("obj-normals-nan/it.obj"))
+    assert np.abs(np.ravel(hit(made, 0.5, 0.4).sh_frame.n)).tolist() == [0, 0, 1]
+    assert reflectance(made, 0.5, 0.4) == pytest.approx([0.7] * 3)
+
+
+@pytest.mark.parametrize("normal", ["-nan(ind) 0 1", "-1.#IND 0 0", "1.#QNAN0 0 1", "0 0 0", "inf 0 0", "0 0"])
+def test_normals_in_every_form_that_cannot_be_used_are_those_of_the_faces(
+    obj: Obj, loaded: Loaded, normal: str
+) -> None:
+    _, made = loaded(obj(f"{FOUR_V}vn {normal}\nvn 0 0 1\nf 1//1 2//1 3//2 4//2"))
+    assert np.ravel(hit(made, 0.5, 0.4).sh_frame.n).tolist() == [0, 0, 1]
+
+
+def test_a_scene_in_national_coordinates_keeps_its_size(case: Callable[[str], Path], loaded: Loaded) -> None:
+    scene, made = loaded(case("obj-national-grid/it.obj"))
+    extent = np.array(made.bbox().max) - np.array(made.bbox().min)
+    assert np.ravel(extent) == pytest.approx([4, 3, 2.5], abs=1e-3)
+    assert "moved" in said(scene)
+
+
+@pytest.mark.parametrize(
+    ("state", "normal"), [("s 1", (0, 0.5**0.5, 0.5**0.5)), ("s off", (0, 0, 1)), ("s 0", (0, 0, 1)), ("", (0, 0, 1))]
+)
+def test_smoothing_groups_make_the_normals_that_are_missing(
+    obj: Obj, loaded: Loaded, state: str, normal: tuple[float, ...]
+) -> None:
+    _, made = loaded(obj(f"{FOUR_V}v 0 0 1\nv 1 0 1\n{state}\nf 1 2 3 4\nf 2 1 5 6"))
+    assert np.ravel(hit(made, 0.5, 1e-4).sh_frame.n) == pytest.approx(normal, abs=1e-3)
+
+
+def test_edges_between_smoothing_groups_are_sharp_and_normals_of_the_file_stay(obj: Obj, loaded: Loaded) -> None:
+    bent = f"{FOUR_V}v 0 0 1\nv 1 0 1\n"
+    _, made = loaded(obj(f"{bent}s 1\nf 1 2 3 4\ns 2\nf 2 1 5 6"))
+    assert np.ravel(hit(made, 0.5, 1e-4).sh_frame.n) == pytest.approx([0, 0, 1])
+    _, made = loaded(obj(f"{bent}vn 0 3 4\nf 1//1 2//1 3//1 4//1\nf 2 1 5 6"))
+    assert np.ravel(hit(made, 0.5, 0.5).sh_frame.n) == pytest.approx([0, 0.6, 0.8])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"\xef\xbb\xbf" + FOUR_V.replace("\n", "\r\n").encode() + b"o St\xc3\xbchl\r\nf 1 2 3 4\r\n",
+        (FOUR_V + "o Stühl\nf 1 2 3 4").encode("latin-1"),
+        (FOUR_V + "o Stühl\nf 1 2 3 4").encode("utf-16"),
+        (FOUR_V.replace(" ", "\t") + "# C:\\\no Stühl\nf\t1 2 \\\n 3/ 4// # four").encode(),
+    ],
+)
+def test_texts_of_all_kinds_are_read(obj: Obj, loaded: Loaded, text: bytes) -> None:
+    scene, made = loaded(obj(text))
+    assert area(made) == pytest.approx(1)
+    assert set(scene.objects.values()) == {"Stühl"}
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"),
+    [
+        (FOUR_V + "f 1 2 5", "line 5: f names v 5, and there are 4"),
+        (FOUR_V + "f 0 1 2", "line 5: f names v 0"),
+        ("f -1 1 2\n" + FOUR_V, "line 1: f names v -1"),
+        (FOUR_V + "vt 0 0\nf 1/1 2/2 3/1", "line 6: f names vt 2"),
+        (FOUR_V + "f 1//1 2//1 3//1", "line 5: f names vn 1, and there are 0"),
+        (FOUR_V + "f 1/1/1/1 2 3", "line 5: f has a corner"),
+        (FOUR_V + "f 1.5 2 3", "line 5: f has a corner"),
+        ("v 0 0 x\nf 1 1 1", "line 1: v has 'x'"),
+        ("v 0 0 0\nv nan 0 0\nf 1 1 2", "line 2: v has no three finite"),
+        ("v 0 0\nf 1 1 1", "line 1: v has no three finite"),
+        (b"v 0 0 0\0", "is no text"),
+    ],
+)
+def test_what_cannot_be_read_is_refused_with_its_line(
+    obj: Obj, read: Callable[[Path], ImportedScene], text: str | bytes, fault: str
+) -> None:
+    with pytest.raises(SpecError, match=fault):
+        read(obj(text))
+
+
+def test_statements_that_are_not_carried_over_are_said(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
+    others = "surf 0 1 0 1 1 2 3 4\nend\ncall x.obj\ntrace_obj y\nusemap z\nlod 1\nbogus 1\nusemtl gone\n"
+    scene = read(obj(f"{FOUR_V}{others}f 1 2 3 4"))
+    assert lost(scene) == {"surf": "geometry", "call": "geometry", "trace_obj": "light", "usemap": "colour",
+                           "bogus": "geometry", "usemtl": "colour"}  # fmt: skip
+    assert "'gone' is in no material file" in said(scene)
+
+
+def test_groups_are_owners_where_there_are_no_objects(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
+    assert set(read(obj(f"{FOUR_V}g a b\nf 1 2 3\ng c\nf 1 3 4")).objects.values()) == {"a b", "c"}
+    assert set(read(obj(f"{FOUR_V}o A B\ng c\nf 1 2 3\ng d\nf 1 3 4")).objects.values()) == {"A B"}
+
+
+# --------------------------------------------------------------------------------------------------- vertex colours
+
+
+@pytest.mark.parametrize(
+    ("colour", "material", "expected"),
+    [
+        ("0.5 0 0", "", (0.214, 0, 0)),  # colours are sRGB
+        ("255 0 0", "", (1, 0, 0)),
+        ("1 1 1", "newmtl it\nKd .5 .2 .1\nTr 1", (0.5, 0.2, 0.1)),
+        ("0.5 1 1", "newmtl it\nKd .5 .5 .5\nKs .5 .5 .5", (0.107, 0.5, 0.5)),
+        ("1 0 0", "newmtl it\nmap_Kd four.png", (0, 0, 1)),
+        ("1", "", (0.7, 0.7, 0.7)),  # a weight of free-form surfaces
+    ],
+)
+def test_colours_of_vertices_are_those_of_the_surface(
+    write: Write, obj: Obj, loaded: Loaded, colour: str, material: str, expected: tuple[float, ...]
+) -> None:
+    write("", material or "newmtl no")
+    points = "".join(f"v {x} {y} 0 {colour}\nvt {x} {y}\n" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    scene, made = loaded(obj(f"mtllib it.mtl\n{points}{'usemtl it' if material else ''}\nf 1/1 2/2 3/3 4/4"))
+    assert reflectance(made, 0.25, 0.25) == pytest.approx(expected, abs=1e-3)
+    assert not lost(scene)
+
+
+@pytest.mark.parametrize("colour", ["1 0", "1 0 0 0.5"])
+def test_numbers_of_vertices_without_a_meaning_are_said(
+    obj: Obj, read: Callable[[Path], ImportedScene], colour: str
+) -> None:
+    assert lost(read(obj(f"v 0 0 0 {colour}\nv 1 0 0\nv 0 1 0\nf 1 2 3"))) == {"v": "colour"}
+
+
+# ---------------------------------------------------------------------------------------------------------- materials
+
+
+def test_transparency_beside_an_image_is_not_meant(case: Callable[[str], Path], loaded: Loaded) -> None:
+    scene, made = loaded(case("mtl-tr-one/it.obj"))
+    assert reflectance(made, 0.5, 0.4) == pytest.approx([0.462, 0.1, 0.021], abs=0.01)
+    assert opacity(made, 0.5, 0.4) == 1
+    assert "Tr 1" in said(scene)
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("Tr 1\nillum 4\nmap_Kd four.png", 1),
+        ("d 0\nmap_Kd four.png", 1),
+        ("Tr 1", 1),
+        ("Tr 1\nd 1", 1),
+        ("Ke 1 1 1\nd 0", 1),
+        ("d 0", 0),
+        ("d 0.3", 0.3),
+        ("Tr 0.3", 0.7),
+        ("Tr 0.7\nillum 4\nmap_Kd four.png", 0.3),
+        ("map_d -imfchan r four.png", 1),
+        ("map_d -imfchan g four.png", 0),
+        ("map_Tr -imfchan g four.png", 1),
+        ("d 0.5\nmap_d -imfchan r four.png", 0.5),
+        ("map_d -mm 1 -1 -imfchan g four.png", 1),
+    ],
+)
+def test_opacity_is_that_of_the_file(write: Write, loaded: Loaded, lines: str, expected: float) -> None:
+    scene, made = loaded(write(WHOLE, f"newmtl it\nKd .5 .5 .5\n{lines}"))
+    assert opacity(made, 0.25, 0.75) == pytest.approx(expected, abs=1e-3)
+    assert not lost(scene)
+
+
+def test_a_halo_of_one_is_opaque_and_another_is_said(case: Callable[[str], Path], write: Write, loaded: Loaded) -> None:
+    _, made = loaded(case("mtl-halo/it.obj"))
+    assert reflectance(made, 0.5, 0.4) == pytest.approx([1, 0, 0])
+    assert opacity(made, 0.5, 0.4) == 1
+    scene, _ = loaded(write(WHOLE, "newmtl it\nKd 1 0 0\nd -halo 0.5"))
+    assert lost(scene) == {"d -halo": "colour"}
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("Kd .3", (0.3, 0.3, 0.3)),
+        ("Kd 1 0 0 # red", (1, 0, 0)),
+        ("Kd xyz 0.4124 0.2126 0.0193", (1, 0, 0)),  # the red of sRGB
+        ("Ka 1 1 1", (0.7, 0.7, 0.7)),
+    ],
+)
+def test_colours_in_each_form_are_read(write: Write, loaded: Loaded, line: str, expected: tuple[float, ...]) -> None:
+    scene, made = loaded(write(WHOLE, f"newmtl it\n{line}"))
+    assert reflectance(made, 0.5, 0.4) == pytest.approx(expected, abs=1e-3)
+    assert not lost(scene)
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("Kd spectral a.rfl 1", {"Kd spectral": "colour"}),
+        ("Kd 2 1 1", {"Kd": "colour"}),
+        ("map_Ks x.png\nmap_Ns x.png\ndecal x.png\nrefl -type sphere x.png",
+         {"map_Ks": "colour", "map_Ns": "colour", "decal": "colour", "refl": "colour"}),
+        ("disp x.png", {"disp": "geometry"}),
+        ("illum 10", {"illum 10": "colour"}),
+        ("map_Bump four.png", {"map_Bump": "colour"}),
+        ("Pr 1\naniso 1\nanisor .5", {"anisor": "colour"}),
+        ("bogus 1", {"bogus": "colour"}),
+        ("map_Kd -t 1 1 1 -cc on -foo 3 four.png", {f"map_Kd {name}": "colour" for name in ("-t", "-cc", "-foo")}),
+        ("map_d -imfchan z four.png", {"map_d -imfchan": "colour"}),
+        ("map_Ka x.png\nKs .5 .1 .1\nPr .3\nPm 1\nPs 1\nPc 1\nPcr .1\nmap_aat on\nsharpness 60\nmap_Kd", {}),
+    ],
+)  # fmt: skip
+def test_statements_of_materials_are_carried_over_or_said(
+    write: Write, loaded: Loaded, lines: str, expected: dict[str, str]
+) -> None:
+    scene, _ = loaded(write(WHOLE, f"newmtl it\n{lines}"))
+    assert lost(scene) == expected
+
+
+@pytest.mark.parametrize("line", ["Kd 1 0", "Kd nan 0 0", "d x"])
+def test_numbers_of_materials_that_are_none_are_refused_with_their_line(
+    write: Write, read: Callable[[Path], ImportedScene], line: str
+) -> None:
+    with pytest.raises(SpecError, match=r"it.mtl: line 2: material 'it': (Kd|d) = "):
+        read(write(WHOLE, f"newmtl it\n{line}"))
+
+
+def test_mirrors_reflect_as_much_as_the_file_says(write: Write, loaded: Loaded) -> None:
+    _, made = loaded(write(WHOLE, "newmtl it\nKd .5 .5 .5\nKs .4 .2 .1\nillum 3\nNs 100000"))
+    si = hit(made, 0.5, 0.4)
+    u, v, w = (mi.Float(values) for values in np.random.default_rng(1).random((3, 4000)).astype(np.float32))
+    weights = np.array(si.bsdf().sample(mi.BSDFContext(), si, u, mi.Point2f(v, w))[1]).mean(axis=1)
+    assert weights == pytest.approx(0.6 * 0.5 + np.array([0.4, 0.2, 0.1]), rel=0.05)
+
+
+def test_several_material_files_may_stand_on_a_line(case: Callable[[str], Path], loaded: Loaded) -> None:
+    _, made = loaded(case("mtllib-two-on-a-line/it.obj"))
+    assert reflectance(made, 0.7, 0.3) == pytest.approx([1, 0, 0])
+    assert reflectance(made, 0.3, 0.7) == pytest.approx([0, 1, 0])
+
+
+@pytest.mark.parametrize(
+    ("stated", "there"),
+    [
+        ("a b.mtl", ["a b.mtl"]),
+        ("x.mtl a b.mtl", ["x.mtl", "a b.mtl"]),
+        ("x.mtl\nmtllib y.mtl", ["x.mtl", "y.mtl"]),
+        ("SUB\\Y.MTL", ["sub/y.mtl"]),
+        ("C:\\my files\\y.mtl", ["y.mtl"]),
+    ],
+)
+def test_material_files_are_found_by_all_their_names(
+    tmp_path: Path, obj: Obj, loaded: Loaded, stated: str, there: list[str]
+) -> None:
+    for number, name in enumerate(there):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(f"newmtl paint{number}\nKd {number} .5 1")
+    last = len(there) - 1
+    _, made = loaded(obj(f"mtllib {stated}\n{FOUR_V}usemtl paint{last}\nf 1 2 3 4"))
+    assert reflectance(made, 0.5, 0.4) == pytest.approx([last, 0.5, 1])
+
+
+# ------------------------------------------------------------------------------------------------------------- images
+
+
+@pytest.mark.parametrize("name", ["mtl-texture-scale", "mtl-texture-scale-two-values"])
+def test_images_are_scaled(case: Callable[[str], Path], loaded: Loaded, name: str) -> None:
+    _, made = loaded(case(f"{name}/it.obj"))
+    expected = {(0.125, 0.875): "red", (0.375, 0.875): "green", (0.375, 0.625): "white", (0.875, 0.375): "green",
+                (0.125, 0.625): "blue"}  # fmt: skip
+    for at, colour in expected.items():
+        assert reflectance(made, *at) == pytest.approx(FOUR[colour], abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "colours"),
+    [
+        ("-o .5", "green red white blue"),
+        ("-o 0 .5 0 -s 1 1 1", "blue white red green"),
+        ("-s -1 1", "green red white blue"),
+        ("-clamp on -o 1 0", "green green white white"),
+        ("-imfchan r", "white black black white"),
+        ("-mm 1 -1", "cyan magenta yellow black"),
+        ("-blendu off -boost 1 -texres 512 -t 0 0 0 -cc off -clamp off -bm 1", "red green blue white"),
+    ],
+)
+def test_options_of_images_are_carried_over(write: Write, loaded: Loaded, options: str, colours: str) -> None:
+    known = FOUR | {"black": (0, 0, 0), "cyan": (0, 1, 1), "magenta": (1, 0, 1), "yellow": (1, 1, 0)}
+    scene, made = loaded(write(WHOLE, f"newmtl it\nKd 1 1 1\nmap_Kd {options} four.png"))
+    for at, colour in zip(CORNERS, colours.split(), strict=True):
+        assert reflectance(made, *at) == pytest.approx(known[colour], abs=0.01)
+    assert not lost(scene)
+
+
+@pytest.mark.parametrize(
+    ("stated", "there"),
+    [
+        ("my  tex.png", "my  tex.png"),
+        ('"my tex.png"', "my tex.png"),
+        ("Tex\\A.PNG", "tex/a.png"),
+        ("C:\\Users\\x y\\a b.png", "a b.png"),
+        ("/nowhere/a.png", "a.png"),
+        ("maps/a.png", "a.png"),
+        ("-s.png", "-s.png"),
+        ("-s 1 1 1 2.png", "2.png"),
+        ("a.tif", "a.tif"),
+    ],
+)
+def test_images_are_found_by_all_their_names(
+    tmp_path: Path, write: Write, loaded: Loaded, stated: str, there: str
+) -> None:
+    file = write(WHOLE, f"newmtl it\nmap_Kd {stated}")
+    (tmp_path / there).parent.mkdir(exist_ok=True)
+    Image.open(tmp_path / "four.png").save(tmp_path / there)
+    scene, made = loaded(file)
+    assert reflectance(made, 0.25, 0.75) == pytest.approx([1, 0, 0], abs=0.01)
+    assert ("beside the file" in said(scene)) == (("/" in stated or ":" in stated) and there == Path(there).name)
+
+
+def test_faces_without_texture_coordinates_are_said(write: Write, loaded: Loaded) -> None:
+    scene, made = loaded(write("usemtl it\nf 1 2 3\nf 1/1 3/3 4/4", "newmtl it\nKd 1 1 1\nmap_Kd four.png"))
+    assert reflectance(made, 0.25, 0.75) == pytest.approx([1, 0, 0], abs=0.01)
+    assert "some faces have none" in said(scene)
+    assert area(made) == pytest.approx(1)
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("Ke 2 3 4\nmap_Ke four.png", (2, 0, 0)),
+        ("Ke 0 0 0\nmap_Ke -o .5 0 four.png", (0, 1, 0)),
+        ("map_Ke -mm 0 5 four.png", (1, 0, 0)),
+    ],
+)
+def test_images_of_light_shine_to_both_sides(
+    write: Write, loaded: Loaded, lines: str, expected: tuple[float, ...]
+) -> None:
+    scene, made = loaded(write(WHOLE, f"newmtl it\n{lines}"))
+    if "-mm" in lines:
+        expected = tuple(images.linear(np.array(expected, np.float32) * 5).tolist())
+    for side in (5, -5):
+        assert emission(made, 0.25, 0.75, side) == pytest.approx(expected, rel=0.01)
+    assert not lost(scene)
+
+
+NORMALS = {"right": (0.5, 0, 0.75**0.5), "up": (0, 0.5, 0.75**0.5)}
+
+
+@pytest.mark.parametrize("lean", NORMALS)
+@pytest.mark.parametrize(
+    ("uv", "signs"),
+    [
+        ("vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n", (1, 1)),
+        ("vt 1 0\nvt 0 0\nvt 0 1\nvt 1 1\n", (-1, 1)),
+        ("vt 0 1\nvt 1 1\nvt 1 0\nvt 0 0\n", (1, -1)),
+    ],
+)
+def test_normal_maps_lean_as_they_lie_also_mirrored(
+    tmp_path: Path, write: Write, obj: Obj, loaded: Loaded, lean: str, uv: str, signs: tuple[int, int]
+) -> None:
+    values = np.round(np.array(NORMALS[lean]) * 127.5 + 127.5).astype(np.uint8)
+    Image.fromarray(np.tile(values, (4, 4, 1))).save(tmp_path / "n.png")
+    for line in ("norm n.png", "map_Bump -bm 1.0 n.png"):
+        write("", f"newmtl it\nKd 1 1 1\n{line}")
+        scene, made = loaded(obj(f"mtllib it.mtl\n{FOUR_V}{uv}usemtl it\nf 1/1 2/2 3/3 4/4"))
+        axis = np.array([1, 0]) if lean == "right" else np.array([0, 1])
+        towards = axis * np.array(signs)
+        assert scattered(made, *towards.tolist(), 1.0) == pytest.approx(0.304, abs=0.003)
+        assert scattered(made, *(-towards).tolist(), 1.0) == pytest.approx(0.081, abs=0.003)
+        assert not lost(scene)
+
+
+def test_bumps_are_as_high_as_their_multiplier_in_units_of_the_file(
+    tmp_path: Path, write: Write, loaded: Loaded
+) -> None:
+    ramp = np.tile(np.linspace(0, 255, 64).astype(np.uint8), (64, 1))
+    Image.fromarray(ramp).save(tmp_path / "ramp.png")
+    scene, made = loaded(write(WHOLE, "newmtl it\nKd 1 1 1\nbump -bm 0.5 ramp.png"))
+    normal = np.array([-0.5, 0, 1]) / np.linalg.norm([0.5, 0, 1])  # a slope of one half
+    for light in ([1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]):
+        expected = normal @ np.array(light) / np.linalg.norm(light) / np.pi
+        assert scattered(made, *light) == pytest.approx(expected, rel=0.03)
+    assert not lost(scene)

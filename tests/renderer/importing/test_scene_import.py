@@ -11,14 +11,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from click.testing import CliRunner, Result
 
 from photonfarm.renderer.cli.scene_verbs import scene_import
+from photonfarm.renderer.importing import importer
 from photonfarm.renderer.importing.readers import blender
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import BackendError, PhotonfarmError, SpecError
 from photonfarm.shared.core.pictures import display_values
-from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.modification import rest, sample_modification
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import sample_view
 
@@ -35,7 +37,7 @@ def test_a_room_becomes_a_spec_that_renders_at_once(quick: None, boxes: Path, ru
     result = run(boxes)
     assert result.exit_code == 0, result.output
     spec = load_spec("room.toml")
-    assert sorted(group.name for group in spec.groups) == ["ceiling-light", "chairs", "chairs-2", "table", "wardrobe"]
+    assert sorted(group.name for group in spec.groups) == ["Chairs", "Chairs-2", "Table", "Wardrobe", "ceiling-light"]
     assert sorted(path.name for path in Path().iterdir()) == ["room-scene", "room.toml"]
     scene = LoadedScene.load(spec, Path())
     shown = []
@@ -127,7 +129,72 @@ bpy.ops.wm.save_as_mainfile(filepath={str(tmp_path / "den.blend")!r})
     place = next(number for number, word in enumerate(command) if word.endswith("blender_export.py"))
     subprocess.run([*command[:place], str(tmp_path / "make.py")], check=True)
     assert run(tmp_path / "den.blend").exit_code == 0
-    assert "table" in [group.name for group in load_spec("den.toml").groups]
+    assert "Table" in [group.name for group in load_spec("den.toml").groups]
+
+
+def test_a_light_is_added_to_a_room_that_the_sun_does_not_reach(
+    quick: None, case: Callable[[str], Path], run: Callable[..., Result]
+) -> None:
+    result = run(case("gltf-sun-outside-closed-room/scene.gltf"), "--out", "dark")
+    assert result.exit_code == 0, result.output
+    assert "one is added under the ceiling" in result.stdout
+    spec = load_spec("dark.toml")
+    assert [light.name for light in spec.lights] == ["ceiling-light"]
+    assert spec.view.free_space is not None
+    assert spec.exposure == pytest.approx(0.26, rel=0.15)
+
+
+def test_no_camera_stands_in_a_cube_on_a_floor_which_gets_a_sky(
+    quick: None, case: Callable[[str], Path], run: Callable[..., Result]
+) -> None:
+    result = run(case("gltf-cube-on-floor/scene.gltf"), "--out", "cube")
+    assert result.exit_code == 0, result.output
+    assert "white sky" in result.stdout
+    spec, inside = load_spec("cube.toml"), np.array([[-0.5, 0, -0.5], [0.5, 1, 0.5]])
+    origin = np.array([spec.view.origin.min, spec.view.origin.max])
+    assert (origin[0] > inside[1]).any() or (origin[1] < inside[0]).any()
+    scene = LoadedScene.load(spec, Path())
+    view = sample_view(spec, rest(spec).key(spec.scene_id), 1, 0)
+    assert 0.2 < display_values(np.float32(spec.exposure) * scene.render_halves(view, (0,), 2)[0]).mean() < 0.8
+
+
+@pytest.mark.parametrize(
+    ("scale", "shift", "unit"), [(1000, 0, "millimetres"), (39.37, 0, "inches"), (1, 2000, None), (1, 45, None)]
+)
+def test_a_room_is_the_same_in_other_units_and_elsewhere(
+    quick: None, gltf: Any, run: Callable[..., Result], scale: float, shift: float, unit: str | None
+) -> None:
+    for name, low, high, light in (("Shell", (0, 0, 0), (5, 2.6, 4), 0), ("Table", (2, 0, 1.5), (3.2, 0.75, 2.2), 0),
+                                   ("Lamp", (2, 2.5, 1.6), (2.6, 2.58, 2.2), 1)):  # fmt: skip
+        mesh = trimesh.creation.box(bounds=[low, high])
+        if name == "Shell":
+            mesh.invert()
+        material = gltf.material(name, **({"emissiveFactor": [1, 1, 1]} if light else {}))
+        vertices = (np.add(mesh.vertices, (shift, 0, 0)) * scale).astype("<f4")
+        gltf.node(name, gltf.mesh(vertices, mesh.faces.astype("<u4"), material))
+    result = run(gltf.write(), "--out", "it")
+    assert result.exit_code == 0, result.output
+    assert unit is None or f"lengths look like {unit}" in result.stdout
+    spec = load_spec("it.toml")
+    groups = {group.name: np.array([group.at, group.box.min, group.box.max]) / scale for group in spec.groups}
+    moved = 2000 if shift == 2000 else 0
+    table = groups["Table"] - [shift - moved, 0, 0]
+    assert table[0] == pytest.approx([2.6, 0, 1.85], abs=2e-3)
+    assert (table[1:] > [0.6, -1e-3, 0.35]).all()
+    assert (table[1:] < [4.4, 1e-3, 3.65]).all()
+    assert groups["Lamp"][:, 1] == pytest.approx(2.58, abs=2e-3)
+    assert spec.exposure == pytest.approx(40.5, rel=0.15)
+    assert spec.view.near / scale == pytest.approx(0.0104, rel=0.05)
+
+
+def test_messages_name_no_file_that_is_gone(run: Callable[..., Result], monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*arguments: Any) -> None:
+        raise SpecError(f"{arguments[1]}/room-scene/scene.xml: line 3: is odd")
+
+    monkeypatch.setattr(importer, "load", fail)
+    Path("room.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert str(run("room.obj").exception) == "room-scene/scene.xml: line 3: is odd"
+    assert [path.name for path in Path().iterdir()] == ["room.obj"]
 
 
 SCENES = [Path(folder) for folder in os.environ.get("PHOTONFARM_SCENES", "").split(os.pathsep) if folder]
@@ -137,8 +204,8 @@ SCENES = [Path(folder) for folder in os.environ.get("PHOTONFARM_SCENES", "").spl
 @pytest.mark.parametrize(
     ("scene", "groups"),
     [
-        ("living-room-2", {"sofa-leather", "sofa-leather-2", "table"}),
-        ("cornell-box", {"tall-box", "short-box", "light"}),
+        ("living-room-2", {"SofaLeather_0009", "SofaLeather_0003", "Table_0002"}),
+        ("cornell-box", {"TallBox", "ShortBox", "Light"}),
     ],
 )
 def test_real_rooms_are_imported_without_their_ready_specs(

@@ -12,9 +12,8 @@ from click.testing import CliRunner, Result
 
 from photonfarm.renderer.cli.measuring_verbs import scene_exposure
 from photonfarm.renderer.measure import exposure
-from photonfarm.renderer.measure.exposure import Pictures, propose
+from photonfarm.renderer.measure.exposure import DarkError, Pictures, propose
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.core.waiting import Steps, WorkLog
 from photonfarm.shared.scene.spec import Film, SceneSpec
@@ -85,8 +84,19 @@ def test_where_too_much_is_black_it_is_said_how_bright_it_can_get(quick: None) -
     described = cornell()
     away = described.view.model_copy(update={"look_at": described.view.look_at.model_copy(
         update={"min": (0.0, 1.0, 9.0), "max": (0.0, 1.0, 9.0)})})  # fmt: skip
-    with pytest.raises(SpecError, match="stays below 0"):
+    with pytest.raises(DarkError, match="stays below 0"):
         propose(described.model_copy(update={"view": away}), None, WorkLog(lambda _: None), frames=2)
+
+
+def test_what_is_lit_gets_the_target_if_that_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    images = np.zeros((2, 2, 8, 8, 3), np.float32)
+    images[:, :, :2] = 0.5  # a quarter
+    monkeypatch.setattr(exposure, "_rendered", lambda *_: iter(images))
+    work = WorkLog(lambda _: None)
+    with pytest.raises(DarkError, match=r"stays below 0\.25"):
+        propose(cornell(), None, work, frames=2, least=0.3)
+    found = propose(cornell(), None, work, frames=2, least=0.2)
+    assert found.exposure == pytest.approx(0.45**2.2 / 0.5, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder
 from xml.parsers import expat
@@ -11,6 +12,7 @@ class Located(Element):
     """An element and the line of its file that it begins in."""
 
     line: int = 0
+    file: str = ""  # where a message has to say which
 
 
 def line_of(element: Element) -> int:
@@ -19,9 +21,15 @@ def line_of(element: Element) -> int:
 
 
 def parse(path: Path) -> Located:
-    """The root of an XML file; raises OSError, or ParseError for what is no XML."""
+    """The root of an XML file; raises OSError, or ParseError for what is no XML and for content that lies elsewhere."""
     builder = TreeBuilder(element_factory=Located)
     parser = expat.ParserCreate()
+
+    def refuse(name: str, *_: object) -> int:
+        raise ParseError(
+            f"line {parser.CurrentLineNumber}: entity {name!r} stands for content of another file, which is not read; "
+            'write <include filename="…"/> in its place, or the content itself'
+        )
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         element = builder.start(tag, attributes)
@@ -29,11 +37,13 @@ def parse(path: Path) -> Located:
             element.line = parser.CurrentLineNumber
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
-    with path.open("rb") as stream:
-        try:
-            parser.ParseFile(stream)
-        except expat.ExpatError as error:
-            raise ParseError(str(error)) from error
+    parser.ExternalEntityRefHandler = parser.SkippedEntityHandler = refuse
+    data = path.read_bytes()
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        named = re.match(rb"&([^;\s]+);", data[parser.ErrorByteIndex :])
+        raise ParseError(f"{error}{f' ({named[1].decode()})' if named else ''}") from error
     root = builder.close()
     assert isinstance(root, Located)  # noqa: S101 - the factory makes no others
     return root

@@ -33,6 +33,9 @@ LEAST_SEEN = 0.01
 SEES_LITTLE = 0.05
 """Something is said if such a share of the views sees less than such a share of the points."""
 
+FAR = 10.0
+"""A scene whose middle is farther from the origin than so many of its diagonals has rough coordinates."""
+
 OUTSIDE = 0.05
 CUT = 0.2
 CUT_AT_ALL = 0.05
@@ -93,8 +96,15 @@ def _add(found: dict[str, Finding], more: Iterable[Finding]) -> None:
 
 
 def _of_place(spec: SceneSpec, measured: Measured) -> Iterator[Finding]:
-    """Cameras and boxes far from the scene, or larger than it."""
+    """Scenes far from the origin; cameras and boxes far from the scene, or larger than it."""
     size = float(np.linalg.norm(measured.high - measured.low))
+    away = float(np.linalg.norm(measured.high + measured.low)) / 2
+    if away > FAR * size:
+        yield Finding(
+            "scene.file",
+            f"the scene is {size:.3g} across and {away:.4g} away from the origin, where coordinates are so rough that "
+            f"light leaks; `photonfarm scene import {spec.scene.file}` makes a copy near the origin",
+        )
     for name, box in (("origin", spec.view.origin), ("look_at", spec.view.look_at)):
         apart = np.maximum(np.maximum(measured.low - box.high, box.low - measured.high), 0)
         off = float(np.linalg.norm(apart))

@@ -36,13 +36,14 @@ class Changes:
 
     def note(self, meaning: str, place: str = "", *, name: str = "") -> None:
         """Say what does not change the picture."""
-        self._add(None, name, meaning, place)
+        self.say(None, name, meaning, place)
 
     def lose(self, effect: Effect, name: str, meaning: str, place: str = "") -> None:
         """Say what differs from the file: `lose("colour", "COLOR_0", "has no vertex colours", "node 'Sofa'")`."""
-        self._add(effect, name, meaning, place)
+        self.say(effect, name, meaning, place)
 
-    def _add(self, effect: Effect | None, name: str, meaning: str, place: str) -> None:
+    def say(self, effect: Effect | None, name: str, meaning: str, place: str = "") -> None:
+        """Say what differs from the file in its `effect`, or in nothing of the picture."""
         change = self._found.setdefault((effect, name, meaning), Change(effect, name, meaning))
         if place and place not in change.places:
             change.places.append(place)

@@ -95,9 +95,9 @@ def text(root: Element) -> str:
 
 def place(node: Element) -> str:
     """An element as a message names it, with its line where that is known."""
-    line = line_of(node)
+    line, file = line_of(node), getattr(node, "file", "")
     name = node.get("id") or node.get("name") or ""
-    where = f"line {line}: " if line else ""
+    where = f"{Path(file).name + ': ' if file else ''}line {line}: " if line else ""
     return f"{where}<{node.tag}>{f' {name!r}' if name else ''}"
 
 

@@ -27,6 +27,7 @@ class ImportedScene:
     meshes: dict[str, Mesh] = field(default_factory=dict)  # in world coordinates, of the shapes that name no file yet
     objects: dict[str, str] = field(default_factory=dict)  # the object that a shape id belongs to, where the file says
     changes: Changes = field(default_factory=Changes)
+    names: dict[str, str] = field(default_factory=dict)  # of properties as the file has them, by Mitsuba's
     up: Vector = (0.0, 1.0, 0.0)
     camera: Vector | None = None  # the position of the source's camera, which is inside the room, most likely
 
@@ -45,9 +46,7 @@ class ImportedScene:
         A mesh without a usable face is left out. Lights are flat, as smooth ones cannot be sampled without bias.
         Mitsuba's shine from the front alone, so a second sheet behind the first shines from the back.
         """
-        mesh, faults = mesh.usable(smooth=light is None)
-        for fault in faults:
-            self.changes.note(fault, made)
+        mesh = mesh.usable(made, self.changes, smooth=light is None)
         sheets = {made: mesh}
         if light is not None and both_sides and not mesh.encloses():
             sheets[f"{made}_back"] = mesh.back()

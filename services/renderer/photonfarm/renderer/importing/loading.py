@@ -1,4 +1,4 @@
-"""An imported scene loaded by Mitsuba, and mended where Mitsuba refuses it: its own message says which element."""
+"""An imported scene loaded by Mitsuba: what it does not know is taken out, and what it refuses is told."""
 
 from __future__ import annotations
 
@@ -10,36 +10,78 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.changes import Effect, listed
+from photonfarm.renderer.importing.changes import listed
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.mending import make_normals_usable, move_to_origin
-from photonfarm.renderer.importing.readers.mitsuba_parts import make_diffuse
+from photonfarm.renderer.importing.readers.mitsuba_parts import effect_of
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
-
-MOST_FAULTS = 200
-
-_LINE = re.compile(r"\(line (\d+), col \d+\)")
-_UNKNOWN_PROPERTY = re.compile(r'^\s+- .+? "(.+?)"', re.MULTILINE)
-_UNKNOWN_PLUGIN = re.compile(r'Plugin "(.+?)" not found')
 
 
 def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
     """The Mitsuba scene of what was imported; adds to its changes all that had to be changed.
 
-    Materials and lights are tried first, as that takes no time, and then with the shapes. Raises SpecError with
-    Mitsuba's own words where no change helps.
+    Raises SpecError with Mitsuba's own words, and the element, for what Mitsuba refuses.
     """
-    _try(_without_shapes(scene.root), scene, folder)
     log(f"loading {len(scene.root.findall('shape'))} shapes")
     scene.write_meshes(folder / "meshes")
-    loaded = _try(scene.root, scene, folder)
+    loaded = _loaded(scene)
     for mended in (move_to_origin, make_normals_usable):
         if mended(scene, loaded):
             scene.write_meshes(folder / "meshes")
-            loaded = _try(scene.root, scene, folder)
+            loaded = _loaded(scene)
     _flatten_lights(scene, loaded)
     return loaded
+
+
+def _loaded(scene: ImportedScene) -> Any:
+    import mitsuba as mi
+
+    from photonfarm.renderer.scene.loading import threads_to_read_with
+
+    config = mi.parser.ParserConfig(mi.variant())
+    config.unused_properties = mi.LogLevel.Debug  # they are looked for below
+    config.merge_equivalent = config.merge_meshes = False
+    objects = [node for node in scene.root.iter() if node.tag == "scene" or (node.get("type") and node.tag != "ref")]
+    state = mi.parser.ParserState()
+    try:
+        text = elements.text(scene.root).replace("$", r"\$")  # which begins no name of a value here
+        state = mi.parser.parse_string(config, text)
+        mi.parser.transform_all(config, state)
+        with threads_to_read_with():
+            loaded = mi.parser.instantiate(config, state)
+    except (RuntimeError, ValueError) as error:
+        raise SpecError(_told(str(error), state, objects)) from error
+    _drop_unknown(scene, objects, [node.props.unqueried() for node in state.nodes])
+    return loaded
+
+
+def _told(message: str, state: Any, objects: list[Element]) -> str:
+    """What Mitsuba refuses, by the element in place of its line in our document."""
+    import mitsuba as mi
+
+    said = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", message).split())
+    found = re.search(r"string \(line \d+, col \d+\)", said)
+    places = [mi.parser.file_location(state, node) for node in state.nodes]
+    if found is None or found[0] not in places:
+        return f"Mitsuba cannot load the scene: {said}"
+    place = elements.place(objects[places.index(found[0])])
+    return f"{place}: Mitsuba cannot load it: {said[found.end() :].lstrip(': ')}"
+
+
+def _drop_unknown(scene: ImportedScene, objects: list[Element], unknown: list[list[str]]) -> None:
+    """Take out the properties that no plugin asked for: they changed nothing, and are said."""
+    above = elements.parents(scene.root)
+    for node, names in zip(objects, unknown, strict=True):
+        unnamed = [part for part in node if part.get("name") is None]  # Mitsuba numbers these
+        parts = {f"_arg_{number}": part for number, part in enumerate(unnamed)}
+        parts |= {part.get("name", ""): part for part in node if part not in unnamed}
+        for name in names:
+            node.remove(parts[name])
+            said = scene.names.get(name, name) if parts[name] not in unnamed else parts[name].tag
+            scene.changes.lose(
+                effect_of(node, above), said, "is not known to Mitsuba 3, and is left out", elements.place(node)
+            )
 
 
 def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
@@ -56,88 +98,3 @@ def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
             elements.put_value(element, "face_normals", True)
     if smooth:
         scene.changes.note(f"{listed(sorted(smooth))}: emits light, and so got the normals of its faces")
-
-
-def _without_shapes(root: Element) -> Element:
-    """The definitions, with those inside shapes beside them; the elements are those of `root`."""
-    definitions = elements.scene()
-    for node in root:
-        if node.tag != "shape":
-            definitions.append(node)
-    definitions.extend(part for shape in root.findall("shape") for part in shape.findall("bsdf"))
-    return definitions
-
-
-def _try(root: Element, scene: ImportedScene, folder: Path) -> Any:
-    import mitsuba as mi
-
-    from photonfarm.renderer.scene.loading import threads_to_read_with
-
-    file = folder / "try.xml"
-    for _ in range(MOST_FAULTS):
-        elements.write(root, file)
-        try:
-            with threads_to_read_with():
-                return mi.load_file(str(file), optimize=False)
-        except (RuntimeError, ValueError) as error:
-            _mend(root, scene, str(error))
-    raise SpecError(f"more than {MOST_FAULTS} parts are not known to Mitsuba 3; export the scene for Mitsuba 3 instead")
-
-
-def _mend(tried: Element, scene: ImportedScene, message: str) -> None:
-    """Change what Mitsuba refuses. Raises SpecError where there is nothing to change."""
-    found = _LINE.search(message)
-    node = _at_line(tried, int(found[1])) if found else None
-    plugin = _UNKNOWN_PLUGIN.search(message)
-    properties = _UNKNOWN_PROPERTY.findall(message) if "unreferenced" in message else []
-    if node is None or not (plugin or properties):
-        raise SpecError(f"Mitsuba cannot load the scene: {' '.join(message.split())}")
-    place = elements.place(node)
-    if properties:
-        _drop(node, properties, message)
-        for name in properties:
-            scene.changes.lose("colour", name, "is not known to Mitsuba 3, and is left out", place)
-        return
-    kind = node.get("type", "")
-    if node.tag == "bsdf":
-        make_diffuse(node)
-        scene.changes.lose("colour", kind, "is not in Mitsuba 3, and became diffuse", place)
-        return
-    for tree in (tried, scene.root):
-        above = elements.parents(tree).get(node)
-        if above is not None:
-            above.remove(node)
-    effect: Effect = "light" if node.tag == "emitter" else "geometry" if node.tag == "shape" else "colour"
-    scene.changes.lose(effect, kind, "is not in Mitsuba 3, and is left out", place)
-
-
-def _drop(node: Element, properties: list[str], message: str) -> None:
-    before = len(node)
-    for part in list(node):
-        if part.get("name") in properties:
-            node.remove(part)
-    if len(node) == before:  # a part without a name, which Mitsuba numbers
-        unnamed = [part for part in node if part.get("name") is None]
-        numbers = [int(name.removeprefix("_arg_")) for name in properties if name.startswith("_arg_")]
-        if not numbers or max(numbers) >= len(unnamed):
-            raise SpecError(f"Mitsuba cannot load the scene: {' '.join(message.split())}")
-        for number in numbers:
-            node.remove(unnamed[number])
-
-
-def _at_line(root: Element, line: int) -> Element | None:
-    """The element that a written document has in a line: it has one a line, and the ends of those with parts."""
-    number = 0
-    found: Element | None = None
-
-    def visit(node: Element) -> None:
-        nonlocal number, found
-        number += 1
-        if number == line:
-            found = node
-        for part in node:
-            visit(part)
-        number += len(node) > 0
-
-    visit(root)
-    return found

@@ -37,7 +37,8 @@ def move_to_origin(scene: ImportedScene, loaded: Any) -> bool:
     diagonal = float(np.linalg.norm(high - low))
     if not np.isfinite(diagonal) or not np.linalg.norm(low + high) / 2 > FAR * diagonal:
         return False
-    by = -np.floor(low)
+    step = 10.0 ** np.floor(np.log10(diagonal))
+    by = -np.floor(low / step) * step
     rounding = float(np.spacing(np.float32(np.abs(high).max())))
     for shape in scene.root.findall("shape"):
         if shape.get("id") in scene.meshes:
@@ -83,9 +84,7 @@ def make_normals_usable(scene: ImportedScene, loaded: Any) -> bool:
         if (np.abs(normals).max(axis=1, initial=0) > 0).all():  # false for NaN
             continue
         element = shapes[each.id()]
-        scene.meshes[each.id()], faults = of_shape(each).usable(smooth=True)
-        for fault in faults:
-            scene.changes.note(fault, each.id())
+        scene.meshes[each.id()] = of_shape(each).usable(each.id(), scene.changes)
         element[:] = [part for part in element if part.tag in ("ref", "bsdf", "emitter")]
         element.set("type", "ply")
         elements.put_value(element, "filename", "")

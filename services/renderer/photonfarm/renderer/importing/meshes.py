@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.importing.changes import Changes
+
 Floats = NDArray[np.float64]
 
 GAP, LEAST_GAP = 1e-4, 1e-5
@@ -39,23 +41,26 @@ class Mesh:
         """The mesh under an affine map (4, 4); where that mirrors, faces turn so that their fronts stay fronts."""
         linear = matrix[:3, :3]
         faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
-        normals = None if self.normals is None else _unit(self.normals @ np.linalg.pinv(linear))
+        normals = None if self.normals is None else unit(self.normals @ np.linalg.pinv(linear))
         return replace(self, vertices=self.vertices @ linear.T + matrix[:3, 3], faces=faces, normals=normals)
 
-    def usable(self, *, smooth: bool) -> tuple[Mesh, list[str]]:
-        """What of the mesh renders, without normals unless `smooth`, and what was wrong with it.
+    def usable(self, what: str, changes: Changes, *, smooth: bool = True) -> Mesh:
+        """What of the mesh renders, without normals unless `smooth`; what was wrong with it is said of `what`.
 
         Faces without an area or with corners that are no numbers are left out. Where a normal is zero or no number,
         its faces get their own.
         """
-        faults = []
         across = self._across()
-        good = np.isfinite(across).all(axis=1) & (np.linalg.norm(across, axis=1) > 0)
-        mesh = self if good.all() else self.part(good)
-        if not good.all():
-            faults.append(f"{(~good).sum()} of {len(good)} faces have no area or corners that are no numbers: left out")
+        known: NDArray[np.bool_] = np.isfinite(across).all(axis=1)
+        flat: NDArray[np.bool_] = np.linalg.norm(across, axis=1) == 0
+        mesh = self if (known & ~flat).all() else self.part(known & ~flat)
+        if not known.all():
+            meaning = "faces with corners that are no numbers are missing"
+            changes.lose("geometry", "NaN", meaning, f"{what}: {(~known).sum()} of {len(known)}")
+        if flat.any():
+            changes.note("faces without an area are left out", f"{what}: {flat.sum()} of {len(flat)}")
         if mesh.normals is None or not smooth:
-            return replace(mesh, normals=None), faults
+            return replace(mesh, normals=None)
         length = np.linalg.norm(mesh.normals, axis=1)
         bad = ~(np.isfinite(length) & (length > 1e-6))[mesh.faces].all(axis=1)
         if bad.all():
@@ -63,15 +68,16 @@ class Mesh:
         elif bad.any():
             mesh = mesh._with_own_normals(bad)
         if bad.any():
-            faults.append(f"{bad.sum()} of {len(bad)} faces have normals that are zero or no numbers: they are flat")
-        return mesh, faults
+            meaning = "faces whose normals are zero or no numbers get their own"
+            changes.note(meaning, f"{what}: {bad.sum()} of {len(bad)}")
+        return mesh
 
     def _with_own_normals(self, flat: NDArray[np.bool_]) -> Mesh:
         """The mesh with corners of their own, and the face's normal on them, for some faces, a mask (F,)."""
         assert self.normals is not None  # noqa: S101 - the one caller has them
         smooth, own = self.part(~flat), self._of_vertices(self.faces[flat].ravel(), np.zeros((0, 3), np.uint32))
         corners = np.arange(3 * int(flat.sum()), dtype=np.uint32).reshape(-1, 3) + len(smooth.vertices)
-        normals = np.repeat(_unit(self._across()[flat]), 3, axis=0)
+        normals = np.repeat(unit(self._across()[flat]), 3, axis=0)
 
         def joined(a: Floats | None, b: Floats | None) -> Floats | None:
             return None if a is None or b is None else np.concatenate([a, b])
@@ -107,10 +113,10 @@ class Mesh:
         for corner in range(3):
             np.add.at(away, self.faces[:, corner], self._across())
         gap = max(GAP * np.linalg.norm(np.ptp(self.vertices, axis=0)), LEAST_GAP * np.abs(self.vertices).max())
-        return replace(self, vertices=self.vertices - gap * _unit(away), faces=self.faces[:, ::-1])
+        return replace(self, vertices=self.vertices - gap * unit(away), faces=self.faces[:, ::-1])
 
 
-def _unit(vectors: Floats) -> Floats:
+def unit(vectors: Floats) -> Floats:
     """Vectors (…, 3) of length 1; zero stays zero."""
     made: Floats = vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
     return made
@@ -118,14 +124,18 @@ def _unit(vectors: Floats) -> Floats:
 
 def of_shape(shape: Any) -> Mesh:
     """The mesh of a shape that Mitsuba has loaded."""
+    import mitsuba as mi
+
     vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     faces = np.array(shape.faces_buffer(), np.uint32).reshape(-1, 3)
-    normals, uv = None, None
+    normals, uv, colours = None, None, None
     if shape.has_vertex_normals():
         normals = np.array(shape.vertex_normals_buffer(), np.float64).reshape(-1, 3)
     if shape.has_vertex_texcoords():
         uv = np.array(shape.vertex_texcoords_buffer(), np.float64).reshape(-1, 2)
-    return Mesh(vertices, faces, normals, uv)
+    if shape.has_attribute("vertex_color"):
+        colours = np.array(mi.traverse(shape)["vertex_color"], np.float64).reshape(-1, 3)
+    return Mesh(vertices, faces, normals, uv, colours)
 
 
 def write_ply(mesh: Mesh, file: Path) -> Path:

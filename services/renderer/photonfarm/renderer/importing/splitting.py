@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,53 +19,38 @@ REST = -1
 """The number of all that belongs to no thing."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Belonging:
-    """Which thing each face is of."""
-
-    shape: NDArray[np.int32]  # (F,)
-    thing: NDArray[np.int64]  # (F,): a number, or REST
-
-
 def shapes_of_things(
-    scene: ImportedScene, loaded: Any, belonging: Belonging, count: int, scratch: Path
+    scene: ImportedScene, loaded: Any, shape_of: NDArray[np.int32], thing_of: NDArray[np.int64], scratch: Path
 ) -> list[list[str]]:  # fmt: skip
-    """The ids of the shapes of each thing; shapes of several things, or of one and the room, are split in `scene`."""
+    """The ids of the shapes of each thing; shapes of several things, or of one and the room, are split in `scene`.
+
+    `shape_of` and `thing_of` (F,) are the numbers of each face's shape and thing, or REST.
+    """
     ids = Ids()
     for node in scene.root.iter():
         ids.keep(node.get("id", ""))
-    found: list[list[str]] = [[] for _ in range(count)]
+    found: list[list[str]] = [[] for _ in range(int(thing_of.max(initial=REST)) + 1)]
     split = []
     for number, shape in enumerate(loaded.shapes()):
-        faces = belonging.thing[belonging.shape == number]
-        things = np.unique(faces)
-        if len(things) == 1:
-            if things[0] != REST:
-                found[things[0]].append(shape.id())
-            continue
-        element = next(node for node in scene.root.findall("shape") if node.get("id") == shape.id())
-        for part in _split(scene.root, element, shape, faces, ids, scratch):
-            if part.thing != REST:
-                found[part.thing].append(part.shape_id)
-        split.append(shape.id())
+        faces = thing_of[shape_of == number]
+        parts = [(shape.id(), int(thing)) for thing in np.unique(faces)]
+        if len(parts) > 1:
+            parts = list(_split(scene, shape, faces, ids, scratch))
+            split.append(shape.id())
+        for name, thing in parts:
+            if thing != REST:
+                found[thing].append(name)
     if split:
         scene.changes.note(f"{listed(split)}: held separate things in one mesh, and became a shape for each")
     return found
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    shape_id: str
-    thing: int
-
-
 def _split(
-    root: Element, element: Element, shape: Any, faces: NDArray[np.int64], ids: Ids, scratch: Path
-) -> list[_Part]:  # fmt: skip
-    """Replace a shape by a shape for each of its things."""
-    mesh = of_shape(shape)
-    place = list(root).index(element)
-    parts = []
+    scene: ImportedScene, shape: Any, faces: NDArray[np.int64], ids: Ids, scratch: Path
+) -> Iterator[tuple[str, int]]:  # fmt: skip
+    """Replace a shape by a shape for each of its things; their ids, and the numbers of the things."""
+    element = next(node for node in scene.root.findall("shape") if node.get("id") == shape.id())
+    mesh, place = of_shape(shape), list(scene.root).index(element)
     for thing in np.unique(faces):
         made = ids.make(f"{shape.id()}_part")
         part = mesh.part(faces == thing)
@@ -74,7 +59,6 @@ def _split(
         file = write_ply(part, scratch / "meshes" / f"{made}.ply")
         new = elements.mesh_shape(elements.scene(), made, file, faceted=part.normals is None)
         new.extend(elements.copied(node) for node in element if node.tag in ("ref", "bsdf", "emitter"))
-        root.insert(place, new)
-        parts.append(_Part(made, int(thing)))
-    root.remove(element)
-    return parts
+        scene.root.insert(place, new)
+        yield made, int(thing)
+    scene.root.remove(element)

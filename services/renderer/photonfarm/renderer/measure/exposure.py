@@ -48,6 +48,10 @@ SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
 
 
+class DarkError(SpecError):
+    """No exposure makes pictures bright: too much of them is black."""
+
+
 @dataclass(frozen=True, slots=True)
 class Proposal:
     """An exposure, and its uncertainty."""
@@ -118,11 +122,14 @@ def _means(images: F32, exposure: float) -> NDArray[np.float64]:
 
 
 def propose(
-    spec: SceneSpec, beside: Path | None, work: WorkLog, *, target: float = TARGET, frames: int = FRAMES
-) -> Proposal:
+    spec: SceneSpec, beside: Path | None, work: WorkLog, *, target: float = TARGET, frames: int = FRAMES,
+    least: float | None = None,
+) -> Proposal:  # fmt: skip
     """Render some views, each of a random configuration of its own, and search for the exposure.
 
-    The backend must have been loaded. Raises SpecError as loading does, and if too much is black for any exposure.
+    The backend must have been loaded. Raises SpecError as loading does, and DarkError where too much is black for any
+    exposure to reach the target; with `least` only if less than that share of pixels is lit, and else what is lit gets
+    the target.
     """
     small = shrunk(spec, SIDE).model_copy(update={"exposure": 1.0})  # with the same views whatever it is
     spp = _half_spp(small.film)
@@ -132,11 +139,14 @@ def propose(
     pictures = Pictures(np.stack(list(_rendered(scene, frames, spp, steps))))
     exposure = pictures.exposure(target)
     if exposure is None:
-        reached = pictures.display_means(2 ** RANGE[1]).mean()
-        raise SpecError(
-            f"{spec.name}: no exposure gives a display mean of {target:g}: too much is black, and the mean stays below "
-            f"{reached:.3g}"
-        )
+        reached = float(pictures.display_means(2 ** RANGE[1]).mean())
+        exposure = None if reached < (target if least is None else least) else pictures.exposure(target * reached)
+        if exposure is None or not reached:
+            raise DarkError(
+                f"{spec.name}: no exposure gives a display mean of {target:g}: too much is black, and the mean stays "
+                f"below {reached:.3g}"
+            )
+        target *= reached
     return _proposal(spec, pictures, target, exposure, spp)
 
 

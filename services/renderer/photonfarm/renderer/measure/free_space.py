@@ -42,6 +42,10 @@ LEAST = 0.02
 """The share of the box that must be free, so that drawing cameras in it ends soon."""
 
 
+class NothingFreeError(SpecError):
+    """No camera of a spec, or hardly any, stands in the open."""
+
+
 @dataclass(frozen=True, slots=True)
 class Measured:
     """The free space of a scene."""
@@ -64,7 +68,7 @@ class Measured:
 
 
 def measure(spec: SceneSpec, beside: Path | None, log: Log) -> Measured:
-    """Measure free space by rays; raises SpecError as loading does, and where almost nothing is free."""
+    """Measure free space by rays; raises SpecError as loading does, NothingFreeError where little is free."""
     log(f"loading {spec.name}")
     scene = LoadedScene.load(spec, beside)
     groups = _group_boxes(scene)
@@ -72,12 +76,14 @@ def measure(spec: SceneSpec, beside: Path | None, log: Log) -> Measured:
     log(f"looking around from {np.prod(middles.shape[:3])} places in the box of origins of {spec.name}")
     free = _free(scene, middles.reshape(-1, 3), 0.5 * np.linalg.norm(sides)).reshape(middles.shape[:3])
     if not free.any():
-        raise SpecError(f"{spec.name}: view.origin: no camera in it stands in the open; move the box into the room")
+        raise NothingFreeError(
+            f"{spec.name}: view.origin: no camera in it stands in the open; move the box into the room"
+        )
     x, y, z, _ = middles.shape
     space = FreeSpace(of=spec.free_space_digest, cells=(x, y, z), free=packed(free), groups=groups)
     found = Measured(space, float(sides.max()), float(free.mean()), _share(spec, space))
     if found.free < LEAST:
-        raise SpecError(
+        raise NothingFreeError(
             f"{spec.name}: view.origin: only {found.free:.1%} of it is free beside the groups of a configuration; make "
             "the box larger, or let groups leave room in it"
         )

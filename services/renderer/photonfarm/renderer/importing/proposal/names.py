@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import unicodedata
 
 _SHELL = re.compile(
     "wall|floor|ceil|window|door|skirting|baseboard|curtain|drape|blind|roof|ground|beam|column|pillar|stair|radiator|"
@@ -15,7 +16,6 @@ _FURNITURE = re.compile(
 )
 
 _NUMBERS_AT_END = re.compile(r"([\W_]*\d+)+$")
-_NOT_OF_A_NAME = re.compile(r"[^0-9a-z]+")
 
 
 def is_shell(name: str) -> bool:
@@ -28,7 +28,12 @@ def is_furniture(name: str) -> bool:
     return _FURNITURE.search(name.lower()) is not None
 
 
+def stem(name: str) -> str:
+    """A name without the numbers at its end, which things of one kind share."""
+    return _NUMBERS_AT_END.sub("", name).lower()
+
+
 def group_name(name: str) -> str:
-    """A name for a group: small letters and hyphens, without numbers at its end."""
-    small = _NUMBERS_AT_END.sub("", re.sub(r"(?<=[a-z])(?=[A-Z])", "-", name)).lower()
-    return _NOT_OF_A_NAME.sub("-", small).strip("-")[:40] or "object"
+    """A name as it is, as far as a spec allows it: without accents, and with hyphens for other signs."""
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", plain).strip("-_.")[:60] or "object"

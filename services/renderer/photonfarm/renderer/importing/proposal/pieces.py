@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from photonfarm.renderer.importing.proposal.surfaces import Points, Surfaces
+from photonfarm.renderer.importing.proposal.surfaces import Points, Surfaces, bounds
 
 Labels = NDArray[np.int64]
 
@@ -30,21 +30,23 @@ class Pieces:
     low: Points  # (N, 3)
     high: Points  # (N, 3)
     area: NDArray[np.float64]  # (N,)
+    flat: NDArray[np.float64]  # (N,): the share of its area that lies flat
     sample: Points  # (M, 3): points on all surfaces
     sample_piece: Labels  # (M,)
     sample_flat: NDArray[np.bool_]  # (M,): whether it is on a face that lies flat
 
     @classmethod
-    def of(cls, surfaces: Surfaces, cell: float) -> Self:
-        """The pieces of all shapes, with points about half a cell apart."""
+    def of(cls, surfaces: Surfaces, cell: float, widest: float) -> Self:
+        """The pieces of all shapes, with points about half a cell apart, or more on faces above `widest`²."""
         count, label = _connected(surfaces)
-        low, high = surfaces.bounds(label, count)
+        low, high = bounds(label, count, surfaces.corners.min(axis=1), surfaces.corners.max(axis=1))
         shape = np.zeros(count, np.int64)
         shape[label] = surfaces.shape
         flat = surfaces.facing_up > 0.9
         area = np.bincount(label, surfaces.area, count).astype(np.float64)
-        face, sample = _samples(surfaces, cell)
-        return cls(count, label, shape, low, high, area, sample, label[face], flat[face])
+        face, sample = _samples(surfaces, cell, widest)
+        level = np.bincount(label, surfaces.area * flat, count) / np.maximum(area, 1e-30)
+        return cls(count, label, shape, low, high, area, level, sample, label[face], flat[face])
 
     def touching(self, cell: float, among: NDArray[np.bool_], owner: Labels) -> Labels:
         """Numbers (N,) of what touches and has the same owner; −1 for pieces that are not `among` those asked for.
@@ -56,23 +58,16 @@ class Pieces:
         shared, _ = _shared(self.sample[chosen], cell, piece[chosen], owner[piece[chosen]])
         return numbered(shared, self.count, among)
 
-    def contacts(self, cell: float, group: Labels, above: float = -np.inf) -> tuple[Labels, Labels]:
-        """Pairs (K, 2) of groups (N,) that touch, and in how many cells (K,).
+    def contacts(self, cell: float, group: Labels, above: float = -np.inf) -> tuple[Labels, Labels, Labels]:
+        """Pairs (K, 2) of groups (N,) that touch, in how many cells (K,), and the group of each cell.
 
         Pieces of group −1, and all that is not `above` a height, are ignored.
         """
         chosen = (group[self.sample_piece] >= 0) & (self.sample[:, 2] > above)
         label = group[self.sample_piece[chosen]]
-        shared, _ = _shared(self.sample[chosen], cell, label, np.zeros_like(label))
+        shared, owned = _shared(self.sample[chosen], cell, label, np.zeros_like(label))
         unique, times = np.unique(np.sort(shared, axis=1), axis=0, return_counts=True)
-        return unique, times.astype(np.int64)
-
-    def cells(self, cell: float, group: Labels, count: int, above: float) -> Labels:
-        """How many cells each group has above a height, (count,)."""
-        chosen = (group[self.sample_piece] >= 0) & (self.sample[:, 2] > above)
-        label = group[self.sample_piece[chosen]]
-        _, owned = _shared(self.sample[chosen], cell, label, np.zeros_like(label))
-        return np.bincount(owned, minlength=count)
+        return unique, times.astype(np.int64), owned
 
 
 def _shared(position: Points, cell: float, label: Labels, owner: Labels) -> tuple[Labels, Labels]:
@@ -132,10 +127,10 @@ def _hashed(columns: list[Labels]) -> Labels:
     return mixed.view(np.int64)
 
 
-def _samples(surfaces: Surfaces, cell: float) -> tuple[Labels, Points]:
+def _samples(surfaces: Surfaces, cell: float, widest: float) -> tuple[Labels, Points]:
     """Faces (M,) and points on them (M, 3): the middle of each face, and random ones by area."""
     rng = np.random.default_rng(0)
-    wanted = surfaces.area * SAMPLES_PER_CELL / cell**2
+    wanted = np.minimum(surfaces.area, widest**2) * SAMPLES_PER_CELL / cell**2
     wanted *= min(1.0, MOST_SAMPLES / max(wanted.sum(), 1.0))
     face = np.repeat(np.arange(len(wanted)), rng.poisson(wanted))
     u, v = rng.uniform(size=(2, len(face)))

@@ -1,14 +1,16 @@
-"""The room that a scene shows from within: its floor, its ceiling and its sides, found by rays."""
+"""The room that a scene shows from within: its floor, its ceiling and its sides, found by rays; or what is outdoors."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing.proposal.surfaces import Frame, Points, Surfaces
+from photonfarm.renderer.scene.surroundings import NONE, surroundings
 from photonfarm.shared.core.errors import SpecError
 
 RAYS = 512
@@ -33,6 +35,16 @@ LEVEL, BACKS = 0.5, 0.95
 """Rays within 30 degrees of the horizon count as level; where more than that share of all hits are backs of surfaces,
 the point of view is inside of a thing, and not of a room."""
 
+PART = 0.6
+"""What is a smaller part of the scene, or shows more backs of surfaces, is a room only if something is in it."""
+
+GROUND, AROUND, RISES = 0.25, 1.5, 0.75
+"""There is ground where rays from above meet that share of the lowest level; outdoors reaches so many times the size of
+what stands there beyond it, and is at least so high, as a share of its lengths, that cameras look down on it."""
+
+NEAR_FLOOR = 0.03
+"""Flat surfaces within this share of the room's height are the floor, or lie on it."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Room:
@@ -41,7 +53,9 @@ class Room:
     low: Points  # (3,)
     high: Points  # (3,); its height is that of what stands there, in a scene without a ceiling
     has_ceiling: bool
-    is_stage: bool = False  # nothing encloses: what is there is seen from outside
+    is_stage: bool = False  # nothing encloses it, and it has no ground: what is there is seen from outside
+    is_doubtful: bool = False  # it may be the inside of something that is to be seen from outside
+    subject: tuple[Points, Points] | None = None  # outdoors, the corners (3,) around all that stands on the ground
 
     @property
     def size(self) -> Points:
@@ -50,8 +64,8 @@ class Room:
 
     @property
     def height(self) -> float:
-        """The distance from the floor to the ceiling."""
-        return float(self.high[2] - self.low[2])
+        """The distance from the floor to the ceiling; of what lies flat, a share of its length."""
+        return float(max(self.size[2], 0.01 * self.size.max()))
 
     @property
     def floor(self) -> float:
@@ -59,64 +73,93 @@ class Room:
         return float(self.low[2])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Hits:
+class _Hits(NamedTuple):
     origin: Points  # (N, 3)
     direction: Points  # (N, 3)
     distance: NDArray[np.float64]  # (N,); infinite without a hit
     normal: Points  # (N, 3), towards the ray's origin
     is_back: NDArray[np.bool_]  # (N,): whether it is a surface's back that was hit
 
-    @property
-    def found(self) -> NDArray[np.bool_]:
-        return np.isfinite(self.distance)
 
-    @property
-    def position(self) -> Points:
-        return self.origin[self.found] + self.distance[self.found, None] * self.direction[self.found]
-
-
-def find_room(scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | None) -> Room:
-    """The room around the camera, or around a point that is chosen; raises SpecError for a scene of no extent."""
-    rng = np.random.default_rng(0)
+def extent_of(surfaces: Surfaces) -> tuple[Points, Points]:
+    """The corners (3,) around a scene; raises SpecError for one of no extent."""
     low, high = surfaces.corners.min(axis=(0, 1)), surfaces.corners.max(axis=(0, 1))
     if not np.isfinite(low).all() or max(high - low) <= 0:
         raise SpecError("the scene has no extent; nothing can be rendered")
-    within = bool(camera is not None and ((camera >= low) & (camera <= high)).all())
-    viewpoints = camera[None] if camera is not None and within else _best_viewpoint(scene, frame, low, high, rng)
+    return low, high
+
+
+def find_room(
+    scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | None, others: Sequence[Room] = ()
+) -> Room:  # fmt: skip
+    """The room around the camera, or around a point that is chosen; what is outdoors where nothing encloses that.
+
+    `others` are rooms that the point must not be in.
+    """
+    rng = np.random.default_rng(0)
+    low, high = extent_of(surfaces)
+    if camera is not None and ((camera < low) | (camera > high)).any():
+        camera = None
+    viewpoints = _best_viewpoint(scene, frame, low, high, rng, others) if camera is None else camera[None]
     seen = []
     for _ in range(ROUNDS):
-        hits = _cast(scene, frame, viewpoints, rng)
-        seen.append(hits)
-        if not hits.found.any():
+        seen.append(_cast(scene, frame, viewpoints, rng))
+        if not np.isfinite(seen[-1].distance).any():
             break
-        viewpoints = _along(hits, rng)
-    if camera is None and _is_stage(seen[0]):
+        viewpoints = _along(seen[-1], rng)
+    found, level = np.isfinite(seen[0].distance), np.abs(seen[0].direction[:, 2]) < LEVEL
+    backs = seen[0].is_back[found].mean() if found.any() else 1.0
+    if camera is None and (found[level].mean() < OPEN_SHARE or backs > BACKS):
+        return outdoors(scene, surfaces, frame)
+    low, high, has_ceiling = _sides(_Hits(*map(np.concatenate, zip(*seen, strict=True))), low, high)
+    still = surfaces.corners[~surfaces.emits[surfaces.shape]].reshape(-1, 3)
+    whole = np.ptp(still, axis=0).prod() if len(still) else 0
+    doubtful = camera is None and bool((high - low).prod() < PART * whole or backs > PART)
+    return Room(low, high, has_ceiling, is_doubtful=doubtful)
+
+
+def outdoors(scene: Any, surfaces: Surfaces, frame: Frame) -> Room:
+    """The ground with what stands on it, and some room around that; a stage where there is no ground."""
+    low, high = extent_of(surfaces)
+    level = NEAR_FLOOR * (high[2] - low[2]) + 1e-6 * float((high - low).max())
+    steps = np.stack(np.meshgrid(*(np.arange(32) + 0.5,) * 2, indexing="ij"), axis=-1).reshape(-1, 2) / 32
+    above = np.column_stack([low[:2] + steps * (high - low)[:2], np.full(len(steps), high[2] + 10 * level)])
+    met = above[:, 2] - trace(scene, frame, above, np.tile([0.0, 0.0, -1.0], (len(above), 1)))[0]
+    near = np.abs(met - low[2]) < level
+    if near.mean() < GROUND:
         return Room(low, high, has_ceiling=False, is_stage=True)
-    return _room(seen, low, high)
+    floor = float(np.median(met[near]))
+    rising = surfaces.corners[surfaces.corners[:, :, 2].max(axis=1) > floor + level].reshape(-1, 3)
+    first, last = (rising.min(axis=0), rising.max(axis=0)) if len(rising) else (low, high)
+    reach = AROUND * float((last - first).max())
+    low, high = np.maximum(low, first - reach), np.minimum(high, last + reach)
+    low[2], high[2] = floor, max(last[2], floor + RISES * float(np.sqrt((high - low)[:2].prod())))
+    return Room(low, high, has_ceiling=False, subject=(np.array([*first[:2], floor]), last))
 
 
-def _is_stage(hits: _Hits) -> bool:
-    """Whether there is no room: most rays along the ground leave the scene, or all that they meet are backs."""
-    level = np.abs(hits.direction[:, 2]) < LEVEL
-    return bool(hits.found[level].mean() < OPEN_SHARE or hits.is_back[hits.found].mean() > BACKS)
-
-
-def _best_viewpoint(scene: Any, frame: Frame, low: Points, high: Points, rng: np.random.Generator) -> Points:
-    """A point (1, 3) from which most rays hit something, and what they hit is far."""
+def _best_viewpoint(
+    scene: Any, frame: Frame, low: Points, high: Points, rng: np.random.Generator, others: Sequence[Room]
+) -> Points:  # fmt: skip
+    """A point (1, 3), in no solid and no other room, from which most rays hit something, and what they hit is far."""
     steps = [(np.arange(n) + 0.5) / n for n in (8, 8, 4)]
     grid = low + (high - low) * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
     hits = _cast(scene, frame, grid, rng, rays=64)
-    distance = hits.distance.reshape(len(grid), -1)
-    enclosed = np.isfinite(distance).mean(axis=1)
-    reach = np.median(np.where(np.isfinite(distance), distance, 0), axis=1)
-    reach[enclosed < 0.9 * enclosed.max()] = 0
+    distance, back = (values.reshape(len(grid), -1) for values in (hits.distance, hits.is_back))
+    met = np.isfinite(distance)
+    enclosed = met.mean(axis=1)
+    solid = surroundings(scene, frame.world(grid).astype(np.float32)).solid != NONE
+    enclosed[solid & ((back & met).sum(axis=1) > PART * met.sum(axis=1))] = -1
+    for room in others:
+        enclosed[((grid > room.low) & (grid < room.high)).all(axis=1)] = -1
+    reach = np.median(np.where(met, distance, 0), axis=1)
+    reach[enclosed < 0.9 * enclosed.max()] = -1
     return grid[[int(np.argmax(reach))]]
 
 
 def _along(hits: _Hits, rng: np.random.Generator) -> Points:
     """Points on the way to what was hit."""
-    chosen = rng.choice(np.flatnonzero(hits.found), min(VIEWPOINTS, int(hits.found.sum())), replace=False)
+    found = np.flatnonzero(np.isfinite(hits.distance))
+    chosen = rng.choice(found, min(VIEWPOINTS, len(found)), replace=False)
     share = rng.uniform(0.2, 0.8, (len(chosen), 1))
     made: Points = hits.origin[chosen] + share * hits.distance[chosen, None] * hits.direction[chosen]
     return made
@@ -146,30 +189,27 @@ def trace(scene: Any, frame: Frame, origin: Points, direction: Points) -> tuple[
     return distance, frame.inward(np.array(normal, np.float64).T)
 
 
-def _room(seen: list[_Hits], low: Points, high: Points) -> Room:
-    found = np.concatenate([hits.found for hits in seen])
+def _sides(hits: _Hits, low: Points, high: Points) -> tuple[Points, Points, bool]:
+    """The corners (3,) of the room that was seen, and whether it has a ceiling; `low` and `high` are the scene's."""
+    found = np.isfinite(hits.distance)
     if not found.any():
-        return Room(low, high, has_ceiling=False)
-    position = np.concatenate([hits.position for hits in seen])
-    normal = np.concatenate([hits.normal[hits.found] for hits in seen])
-    steep = np.concatenate([hits.direction for hits in seen])[:, 2] > 0.7  # within 45 degrees of up
+        return low, high, False
+    position, normal = (hits.origin + hits.distance[:, None] * hits.direction)[found], hits.normal[found]
+    steep = hits.direction[:, 2] > 0.7  # within 45 degrees of up
     has_ceiling = bool(steep.any() and found[steep].mean() > OPEN_SHARE)
     room_low, room_high = low.copy(), high.copy()
     for axis in range(3):
-        for sign in (1, -1):
+        for sign, bound in ((1, room_low), (-1, room_high)):
             facing = position[sign * normal[:, axis] > FACING, axis]
             side = _side(sign * facing, float(high[axis] - low[axis]))
             if side is None or (sign * position[:, axis] < side).mean() > BEYOND:
                 side = float(np.percentile(sign * position[:, axis], 0.5))
-            if sign > 0:
-                room_low[axis] = side
-            elif axis < 2 or has_ceiling:
-                room_high[axis] = -side
+            bound[axis] = sign * side
     if not has_ceiling:
         room_high[2] = max(np.percentile(position[:, 2], 99.5), room_low[2] + 0.3 * (room_high - room_low)[:2].max())
     wrong = room_low >= room_high
     room_low[wrong], room_high[wrong] = low[wrong], high[wrong]
-    return Room(room_low, room_high, has_ceiling)
+    return room_low, room_high, has_ceiling
 
 
 def _side(values: NDArray[np.float64], extent: float) -> float | None:

@@ -70,9 +70,10 @@ class Surfaces:
         emits = np.array([shape.is_emitter() for shape in shapes])
         return cls([shape.id() for shape in shapes], emits, corners, geometry.face_shape, length / 2, facing)
 
-    def bounds(self, label: NDArray[np.integer[Any]], count: int) -> tuple[Points, Points]:
-        """The lower and upper corners (count, 3) of faces by their labels (F,)."""
-        low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
-        np.minimum.at(low, label, self.corners.min(axis=1))
-        np.maximum.at(high, label, self.corners.max(axis=1))
-        return low, high
+
+def bounds(label: NDArray[np.integer[Any]], count: int, lower: Points, upper: Points) -> tuple[Points, Points]:
+    """The corners (count, 3) around all boxes of a label (N,), by their corners (N, 3)."""
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    np.minimum.at(low, label, lower)
+    np.maximum.at(high, label, upper)
+    return low, high

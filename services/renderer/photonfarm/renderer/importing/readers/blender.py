@@ -6,18 +6,24 @@ Blender is GPL and large, so it is no part of photonfarm. It is the program `ble
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.readers import gltf
+from photonfarm.renderer.importing.readers.blender_lamps import Lamps
 from photonfarm.shared.core.errors import BackendError, SpecError
 from photonfarm.shared.core.waiting import Log
 
 VARIABLE = "PHOTONFARM_BLENDER"
 """The variable that names Blender, or a Python that has `bpy`."""
+
+DULLEST = 1.0101
+"""The index of refraction of what the reader of glTF has no reflections for."""
 
 _SCRIPT = Path(__file__).with_name("blender_export.py")
 
@@ -27,21 +33,56 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     command = blender_command(path)
     out = scratch / "exported.glb"
     log(f"{path.name}: Blender writes it as glTF")
-    output = scratch / "blender.log"
+    _run([*command, str(path.resolve()), str(out)], path, out)
+    try:
+        scene = gltf.read(out, scratch, log)
+    except SpecError as error:
+        raise SpecError(str(error).replace(str(out), str(path))) from error
+    beside: dict[str, Any] = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
+    scene.objects = {made: beside["owners"].get(owner, owner) for made, owner in scene.objects.items()}
+    for effect, name, meaning, place in beside["said"]:
+        if effect is None:
+            scene.changes.note(meaning, place, name=name)
+        else:
+            scene.changes.lose(effect, name, meaning, place)
+    if beside["camera"] is not None:
+        x, y, z = beside["camera"]
+        scene.camera = (x, z, -y)
+    _make_dull_diffuse(scene)
+    lamps = Lamps(scene, scratch)
+    for lamp in beside["lamps"]:
+        lamps.put(lamp)
+    lamps.put_sky(beside["sky"])
+    return scene
+
+
+def _make_dull_diffuse(scene: ImportedScene) -> None:
+    """Let what reflects by its colour alone be `diffuse`, as in Cycles; `principled` brightens it at grazing angles."""
+    for material in scene.root.iter("bsdf"):
+        found = {part.get("name"): float(part.get("value", 0)) for part in material if part.tag == "float"}
+        if found.pop("eta", 2.0) > DULLEST or found.get("metallic", 1.0) > 0 or len(found) > 2:
+            continue
+        material.set("type", "diffuse")
+        material[:] = [part for part in material if part.get("name") == "base_color"]
+        material[0].set("name", "reflectance")
+
+
+def _run(command: list[str], path: Path, out: Path) -> None:
+    output = out.with_suffix(".log")
     with output.open("wb") as stream:
-        process = subprocess.Popen([*command, str(path.resolve()), str(out)], stdout=stream, stderr=stream)
+        process = subprocess.Popen(command, stdout=stream, stderr=stream)
         try:
             process.wait()
         finally:
             process.kill()
-    text = output.read_text(errors="replace")
-    if process.returncode or not out.is_file():
-        raise SpecError(f"{path}: Blender cannot read it: {_last_words(text)}")
-    scene = gltf.read(out, scratch, log)
-    for line in text.splitlines():
-        if line.startswith("note: "):
-            scene.changes.note(line.removeprefix("note: "))
-    return scene
+    lines = [line.strip() for line in output.read_text(errors="replace").splitlines() if line.strip()]
+    if process.returncode == 0 and out.with_suffix(".json").is_file():
+        return
+    for line in lines:
+        if line.startswith("fault: "):
+            raise SpecError(f"{path}: {line.removeprefix('fault: ')[:300]}")
+    said = ([line for line in lines if "rror" in line] or lines or ["it said nothing"])[-1][:300]
+    raise SpecError(f"{path}: Blender cannot read it: {said}")
 
 
 def blender_command(path: Path) -> list[str]:
@@ -57,10 +98,4 @@ def blender_command(path: Path) -> list[str]:
         )
     if Path(program).name.startswith("python"):
         return [program, str(_SCRIPT)]
-    return [program, "--background", "--factory-startup", "--python", str(_SCRIPT), "--"]
-
-
-def _last_words(text: str) -> str:
-    lines = [line.strip() for line in text.splitlines() if line.strip()]
-    errors = [line for line in lines if "rror" in line]
-    return (errors or lines or ["it said nothing"])[-1][:300]
+    return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python", str(_SCRIPT), "--"]

@@ -2,163 +2,187 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import SubElement
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.imported import Ids, ImportedScene
-from photonfarm.renderer.importing.meshes import Mesh
-from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node
-from photonfarm.renderer.importing.readers.gltf_materials import Materials
+from photonfarm.renderer.importing.meshes import Floats, Mesh
+from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node, extension
+from photonfarm.renderer.importing.readers.gltf_materials import Look, Materials
+from photonfarm.renderer.importing.readers.gltf_meshes import Meshes, Placed
+from photonfarm.renderer.importing.readers.gltf_textures import Textures
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
-
-Matrix = NDArray[np.float64]
-
-_LISTS, _STRIPS, _FANS = 4, 5, 6
-"""The modes of primitives that are triangles."""
 
 OBJECT_SHARE = 0.34
 """A node is an object as a whole up to this share of all meshes; above, it is a folder of objects."""
 
-_NOT_CARRIED = {"animations": "animations", "skins": "skins (meshes stand as modelled)"}
-
-_READ = ("KHR_lights_punctual", "KHR_texture_transform", "KHR_mesh_quantization", "EXT_texture_webp")
-"""The extensions that are carried over, beside those of materials, each of which says what it loses."""
+_LIGHTS = "KHR_lights_punctual"
+_INSTANCES = "EXT_mesh_gpu_instancing"
 
 
 def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file; meshes and images are put into the folder `scratch`. Raises SpecError for what cannot be read."""
-    file = GltfFile(path)
-    scene = ImportedScene()
-    ids = Ids()
-    reader = _Reader(file, scene, scratch, Materials(file, scene.root, scratch, scene.changes, ids), log, ids)
+    scene, ids = ImportedScene(), Ids()
+    file = GltfFile(path, scene.changes)
+    materials = Materials(file, scene.root, Textures(file, scratch), ids)
     try:
-        reader.read()
-    except (KeyError, IndexError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        if isinstance(error, SpecError):
-            raise
+        _Reader(file, scene, materials, log, ids).read()
+    except SpecError:
+        raise
+    except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
         raise SpecError(f"{path}: is not valid glTF: {type(error).__name__}: {error}") from error
     if scene.root.find("shape") is None:
         raise SpecError(f"{path}: its scene has no triangles; nothing can be rendered")
     return scene
 
 
+@dataclass(slots=True, eq=False)
+class _Visit:
+    """A node where the scene has it."""
+
+    number: int
+    above: _Visit | None
+    matrix: Floats  # to the world
+    path: frozenset[int] = frozenset()  # all nodes above it
+    meshes: int = 0  # at it and below it
+    owner: str = ""  # the object that it belongs to
+
+
 @dataclass(slots=True)
 class _Reader:
     file: GltfFile
     scene: ImportedScene
-    scratch: Path
     materials: Materials
     log: Log
     ids: Ids
-    left_out: dict[str, int] = field(default_factory=dict)  # what is not carried over, and how often
+    worlds: dict[int, Floats] = field(default_factory=dict)
 
     def read(self) -> None:
         """Read all nodes of the file's scene."""
         nodes = self.file.all("nodes")
         self.log(f"reading {len(nodes)} nodes and {len(self.file.all('meshes'))} meshes of {self.file.path.name}")
-        meshes = max(1, sum("mesh" in node for node in nodes))
-        for number in self._roots():
-            self._visit(number, np.eye(4), "", meshes)
-        for key, name in _NOT_CARRIED.items():
-            if self.file.all(key):
-                self.left_out[name] = len(self.file.all(key))
-        for extension in self.file.document.get("extensionsUsed", ()):
-            if extension not in _READ and not extension.startswith("KHR_materials"):
-                self.left_out[extension] = 1
-        if self.left_out:
-            listed = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in self.left_out.items())
-            self.scene.changes.note(f"not carried over: {listed}")
+        if self.file.all("animations"):
+            self.scene.changes.note("all stands as its nodes place it at rest", name="animations")
+        visits = self._visits()
+        self._find_owners(visits, max(1, sum("mesh" in node for node in nodes)))
+        pieces = [piece for visit in visits if "mesh" in nodes[visit.number] for piece in self._pieces(visit)]
+        for mesh, look, made, owner in pieces:  # materials need to know all meshes that have them
+            material = self.materials.made(look)
+            if material is not None:
+                both = bool(self.materials.entry(look.number).get("doubleSided"))
+                self.scene.put_shape(made, mesh, material[0], owner, material[1], both_sides=both)
+        for visit in visits:
+            self.file.report(nodes[visit.number], "geometry", f"node {self._name(visit)!r}")
+            number = extension(nodes[visit.number], _LIGHTS).get("light")
+            if number is not None:
+                self._put_light(self.file.document["extensions"][_LIGHTS]["lights"][number], visit.matrix)
+
+    def _visits(self) -> list[_Visit]:
+        """The visible nodes, each after the one above it."""
+        visits: list[_Visit] = []
+        waiting = [_Visit(number, None, np.eye(4)) for number in reversed(self._roots())]
+        while waiting:
+            visit = waiting.pop()
+            node = self.file.all("nodes")[visit.number]
+            if visit.number in visit.path:
+                raise SpecError(f"{self.file.path}: node {visit.number} is below itself; take it out of its children")
+            visit.matrix = visit.matrix @ _matrix(node)
+            self.worlds.setdefault(visit.number, visit.matrix)
+            if "camera" in node and self.scene.camera is None:
+                x, y, z = visit.matrix[:3, 3].tolist()
+                self.scene.camera = (x, y, z)
+            if extension(node, "KHR_node_visibility").get("visible", True):
+                visits.append(visit)
+                path, below = visit.path | {visit.number}, reversed(node.get("children", ()))
+                waiting += [_Visit(child, visit, visit.matrix, path) for child in below]
+        return visits
 
     def _roots(self) -> list[int]:
         scenes = self.file.all("scenes")
         if scenes:
-            return list(scenes[self.file.document.get("scene", 0)].get("nodes", ()))
+            scene = scenes[self.file.document.get("scene", 0)]
+            if len(scenes) > 1:
+                self.scene.changes.note(f"{scene.get('name', 'one')!r} of {len(scenes)} is read", name="scenes")
+            self.file.report(scene, "light", "scene")
+            return list(scene.get("nodes", ()))
         below = {child for node in self.file.all("nodes") for child in node.get("children", ())}
         return [number for number in range(len(self.file.all("nodes"))) if number not in below]
 
-    def _visit(self, number: int, above: Matrix, owner: str, meshes: int) -> None:
-        node = self.file.all("nodes")[number]
-        matrix = above @ _matrix(node)
-        name = node.get("name") or f"node_{number}"
-        if not owner and self._meshes_below(number) <= max(1.0, OBJECT_SHARE * meshes):
-            owner = name
-        if "mesh" in node:
-            self._put_mesh(node["mesh"], name, matrix, owner or name)
-        if "camera" in node and self.scene.camera is None:
-            x, y, z = matrix[:3, 3]
-            self.scene.camera = (float(x), float(y), float(z))
-        light = node.get("extensions", {}).get("KHR_lights_punctual")
-        if light is not None:
-            self._put_light(light["light"], matrix)
-        for child in node.get("children", ()):
-            self._visit(child, matrix, owner, meshes)
+    def _find_owners(self, visits: list[_Visit], meshes: int) -> None:
+        for visit in reversed(visits):
+            visit.meshes += "mesh" in self.file.all("nodes")[visit.number]
+            if visit.above is not None:
+                visit.above.meshes += visit.meshes
+        for visit in visits:
+            visit.owner = visit.above.owner if visit.above is not None else ""
+            if not visit.owner and visit.meshes <= max(1.0, OBJECT_SHARE * meshes):
+                visit.owner = self._name(visit)
 
-    def _meshes_below(self, number: int) -> int:
-        node = self.file.all("nodes")[number]
-        return ("mesh" in node) + sum(map(self._meshes_below, node.get("children", ())))
+    def _name(self, visit: _Visit) -> str:
+        node = self.file.all("nodes")[visit.number]
+        named = node.get("name") or ("mesh" in node and self.file.all("meshes")[node["mesh"]].get("name"))
+        return str(named or f"node_{visit.number}")
 
     # ------------------------------------------------------------------------------------------------------ meshes
 
-    def _put_mesh(self, number: int, name: str, matrix: Matrix, owner: str) -> None:
-        primitives = self.file.all("meshes")[number]["primitives"]
-        for place, primitive in enumerate(primitives):
-            if primitive.get("mode", _LISTS) not in (_LISTS, _STRIPS, _FANS):
-                self._lose("points and lines")
-                continue
-            if "targets" in primitive:
-                self._lose("morph targets")
-            if "COLOR_0" in primitive["attributes"]:
-                self._lose("colours of vertices")
-            mesh = self._mesh(primitive).moved(matrix)
-            self._put_shape(mesh, f"{name}_{place}" if len(primitives) > 1 else name, primitive, owner)
+    def _pieces(self, visit: _Visit) -> Iterator[tuple[Mesh, Look, str, str]]:
+        """The meshes of a node in the world, with their materials, ids and objects."""
+        node, name = self.file.all("nodes")[visit.number], self._name(visit)
+        mesh = self.file.all("meshes")[node["mesh"]]
+        self.file.report(mesh, "geometry", f"node {name!r}")
+        weights = node.get("weights", mesh.get("weights", ()))
+        meshes = Meshes(self.file, self.materials, self.worlds)
+        for at in self._places(node, name, visit):
+            for number, primitive in enumerate(mesh["primitives"]):
+                called = f"{at.name}_{number}" if len(mesh["primitives"]) > 1 else at.name
+                for part, look in meshes.pieces(primitive, weights, at):
+                    yield part, look, self.ids.make(called), at.owner
 
-    def _put_shape(self, mesh: Mesh, name: str, primitive: Node, owner: str) -> None:
-        material = primitive.get("material")
-        both = bool(self.file.all("materials")[material].get("doubleSided")) if material is not None else False
-        light, made = self.materials.light(material), self.ids.make(name)
-        self.scene.put_shape(made, mesh, self.materials.material_id(material), owner, light, both_sides=both)
-
-    def _mesh(self, primitive: Node) -> Mesh:
-        attributes = primitive["attributes"]
-        vertices = self.file.array(attributes["POSITION"]).astype(np.float64)
-        order = np.arange(len(vertices)) if "indices" not in primitive else self.file.array(primitive["indices"])[:, 0]
-        if order.size and order.max() >= len(vertices):
-            raise SpecError(f"{self.file.path}: a mesh names vertex {order.max()}, and has {len(vertices)}")
-        uv_name = f"TEXCOORD_{self.materials.uv_set(primitive.get('material'))}"
-        normals = self.file.array(attributes["NORMAL"]) if "NORMAL" in attributes else None
-        uv = self.file.array(attributes[uv_name]) if uv_name in attributes else None
-        return Mesh(
-            vertices,
-            _triangles(order.astype(np.uint32), primitive.get("mode", _LISTS)),
-            None if normals is None else normals.astype(np.float64),
-            None if uv is None else uv.astype(np.float64),
-        )
-
-    def _lose(self, what: str) -> None:
-        self.left_out[what] = self.left_out.get(what, 0) + 1
+    def _places(self, node: Node, name: str, visit: _Visit) -> list[Placed]:
+        """Where a node's mesh is: once, or as often as it has instances, which are objects of their own."""
+        instances = extension(node, _INSTANCES).get("attributes")
+        if not instances:
+            return [Placed(node, name, visit.matrix, visit.owner or name)]
+        values = {key: self.file.array(number) for key, number in instances.items()}
+        for key in values:
+            if key not in _PARTS and not key.startswith("_"):
+                self.scene.changes.lose("colour", key, f"{_INSTANCES} has no such attribute", f"node {name!r}")
+        made = []
+        for number in range(len(next(iter(values.values())))):
+            parts = {_PARTS[key]: each[number] for key, each in values.items() if key in _PARTS}
+            made.append(Placed(node, f"{name}_{number}", visit.matrix @ _matrix(parts), f"{name}_{number}"))
+        return made
 
     # ------------------------------------------------------------------------------------------------------ lights
 
-    def _put_light(self, number: int, matrix: Matrix) -> None:
+    def _put_light(self, light: Node, matrix: Floats) -> None:
         """Candela and lux are taken as radiometric units, as emissive strength is, so that all lights agree."""
-        light = self.file.document["extensions"]["KHR_lights_punctual"]["lights"][number]
-        kinds = {"point": "point", "spot": "spot", "directional": "directional"}
-        kind = kinds[light["type"]]
-        emitter = SubElement(self.scene.root, "emitter", type=kind, id=self.ids.make(light.get("name", kind)))
+        kind, name = light["type"], light.get("name", light["type"])
+        self.file.report(light, "light", f"light {name!r}")
         colour = [light.get("intensity", 1.0) * part for part in light.get("color", (1, 1, 1))]
+        if kind not in ("point", "spot", "directional"):
+            self.scene.changes.lose("light", str(kind), "is no kind of light that is known", f"light {name!r}")
+            return
+        if max(colour) <= 0:
+            return
+        if "range" in light:
+            self.scene.changes.note("light does not end there", f"light {name!r}", name="range")
+        emitter = SubElement(self.scene.root, "emitter", type=kind, id=self.ids.make(name))
         elements.put_value(emitter, "irradiance" if kind == "directional" else "intensity", colour)
         if kind == "point":
-            _put_point(emitter, matrix)
+            place = {axis: f"{part:.10g}" for axis, part in zip("xyz", matrix[:3, 3], strict=True)}
+            SubElement(emitter, "point", {"name": "position", **place})
             return
         facing = np.diag([-1.0, 1.0, -1.0, 1.0])  # glTF's lights shine along −z, Mitsuba's along +z
         elements.put_matrix(emitter, "to_world", (_rigid(matrix) @ facing).tolist())
         if kind == "spot":
+            self.scene.changes.note("the edge of its cone fades evenly", f"light {name!r}", name="spot")
             cone = light.get("spot", {})
             outer = np.degrees(cone.get("outerConeAngle", np.pi / 4))
             elements.put_value(emitter, "cutoff_angle", float(outer))
@@ -166,12 +190,11 @@ class _Reader:
             elements.put_value(emitter, "beam_width", float(inner))
 
 
-def _put_point(emitter: Element, matrix: Matrix) -> None:
-    x, y, z = (f"{value:.7g}" for value in matrix[:3, 3])
-    SubElement(emitter, "point", name="position", x=x, y=y, z=z)
+_PARTS = {"TRANSLATION": "translation", "ROTATION": "rotation", "SCALE": "scale"}
+"""The attributes of instances, as nodes have them."""
 
 
-def _rigid(matrix: Matrix) -> Matrix:
+def _rigid(matrix: Floats) -> Floats:
     """The rotation and the place of a matrix, without its scale."""
     made = np.eye(4)
     u, _, v = np.linalg.svd(matrix[:3, :3])
@@ -180,31 +203,14 @@ def _rigid(matrix: Matrix) -> Matrix:
     return made
 
 
-def _matrix(node: Node) -> Matrix:
+def _matrix(node: Node) -> Floats:
     """A node's transform in its parent."""
+    from scipy.spatial.transform import Rotation
+
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
-    turned = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
     made = np.eye(4)
-    made[:3, :3] = turned * np.array(node.get("scale", (1, 1, 1)), np.float64)
+    made[:3, :3] = Rotation.from_quat(node.get("rotation", (0, 0, 0, 1))).as_matrix()
+    made[:3, :3] *= np.array(node.get("scale", (1, 1, 1)), np.float64)
     made[:3, 3] = node.get("translation", (0, 0, 0))
     return made
-
-
-def _triangles(order: NDArray[np.uint32], mode: int) -> NDArray[np.uint32]:
-    """The triangles (F, 3) of a list, a strip or a fan of vertices."""
-    if mode == _LISTS:
-        return order[: len(order) // 3 * 3].reshape(-1, 3)
-    n = max(len(order) - 2, 0)
-    i = np.arange(n)
-    if mode == _FANS:
-        return np.stack([np.broadcast_to(order[:1], n), order[i + 1], order[i + 2]], axis=1)
-    odd = i % 2
-    return np.stack([order[i], order[i + 1 + odd], order[i + 2 - odd]], axis=1)

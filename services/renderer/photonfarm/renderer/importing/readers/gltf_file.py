@@ -1,4 +1,4 @@
-"""glTF 2.0 containers: the JSON document, its buffers, and the arrays and images in them."""
+"""glTF 2.0 containers: the JSON document, its extensions, its buffers, and the arrays and images in them."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import base64
 import json
 import struct
 from collections.abc import Mapping
-from functools import cached_property
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
+from urllib.parse import unquote, unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.shared.core.errors import SpecError
 
 Node = Mapping[str, Any]
@@ -22,90 +22,138 @@ _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 _JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
-_COMPRESSED = {
-    "KHR_draco_mesh_compression": "its meshes are compressed by Draco",
-    "EXT_meshopt_compression": "its meshes are compressed by meshopt",
-    "KHR_texture_basisu": "its textures are in KTX2",
+READ = frozenset(
+    {"EXT_mesh_gpu_instancing", "EXT_texture_avif", "EXT_texture_webp", "KHR_lights_punctual", "KHR_mesh_quantization",
+     "KHR_materials_clearcoat", "KHR_materials_emissive_strength", "KHR_materials_ior",
+     "KHR_materials_pbrSpecularGlossiness", "KHR_materials_specular", "KHR_materials_transmission",
+     "KHR_materials_volume", "KHR_node_visibility", "KHR_texture_transform", "MSFT_texture_dds"}
+)  # fmt: skip
+"""The extensions that are carried over; what of one is not is said where it is read."""
+
+HARMLESS = frozenset(
+    {"AGI_articulations", "EXT_instance_features", "EXT_mesh_features", "EXT_structural_metadata",
+     "FB_geometry_metadata", "KHR_animation_pointer", "KHR_audio", "KHR_audio_emitter", "KHR_implicit_shapes",
+     "KHR_interactivity", "KHR_materials_variants", "KHR_node_hoverability", "KHR_node_selectability",
+     "KHR_physics_rigid_bodies", "KHR_xmp", "KHR_xmp_json_ld", "MSFT_lod", "MSFT_packing_normalRoughnessMetallic",
+     "MSFT_packing_occlusionRoughnessMetallic", "OMI_collider", "OMI_physics_body", "OMI_physics_joint",
+     "OMI_physics_shape", "VRMC_node_constraint", "VRMC_springBone"}
+)  # fmt: skip
+"""Those that leave a picture of what is shown first as it is."""
+
+COMPRESSED = frozenset({"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_meshopt_compression"})
+"""Those that may have the same data uncompressed beside them, which is read then."""
+
+_ZEROS = {
+    "KHR_materials_anisotropy": "anisotropyStrength",
+    "KHR_materials_diffuse_transmission": "diffuseTransmissionFactor",
+    "KHR_materials_dispersion": "dispersion",
+    "KHR_materials_iridescence": "iridescenceFactor",
+    "KHR_materials_sheen": "sheenColorFactor",
 }
-"""What changes how bytes are read, so that nothing can be read without it."""
+"""Extensions of materials, and what of them is 0 where they have no effect."""
 
 
 class GltfFile:
     """One glTF file with all that it names."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, changes: Changes) -> None:
+        self.path, self.changes = path, changes
         self.document, self._binary = _opened(path)
+        self._buffers: dict[int, bytes] = {}
         version = str(self.document.get("asset", {}).get("version", ""))
         if not version.startswith("2."):
             raise SpecError(f"{path}: is glTF of version {version or 'unknown'!r}; only version 2 is read")
-        for extension in self.document.get("extensionsRequired", ()):
-            if extension in _COMPRESSED:
-                raise SpecError(
-                    f"{path}: {_COMPRESSED[extension]} ({extension}), which is not read; export it without compression"
-                )
+        refused = [name for name in self.document.get("extensionsRequired", ()) if name not in READ | HARMLESS]
+        if refused:
+            raise SpecError(
+                f"{path}: extensionsRequired has {', '.join(refused)}, which is not read; export the file without it"
+            )
+        for name in self.document.get("extensions", ()):
+            if name not in READ | HARMLESS:
+                changes.note("what the file as a whole has of it is not read", name=name)
 
     def all(self, kind: str) -> list[Node]:
         """The entries of one array of the document, such as meshes."""
-        return list(self.document.get(kind, ()))
+        entries: list[Node] = self.document.get(kind, [])
+        return entries
 
-    @cached_property
-    def _buffers(self) -> list[bytes]:
-        return [self._buffer(entry, number) for number, entry in enumerate(self.all("buffers"))]
+    def report(self, entry: Node, effect: Effect, place: str) -> None:
+        """Say which extensions of an entry, and of all in it, are not carried over."""
+        for name, value in entry.get("extensions", {}).items():
+            if name in HARMLESS:
+                self.changes.note("leaves a picture of what is shown first as it is", place, name=name)
+            elif name not in READ | COMPRESSED and (name not in _ZEROS or np.any(value.get(_ZEROS[name], 0))):
+                self.changes.lose("light" if "light" in name else effect, name, "is not carried over", place)
+        for key, value in entry.items():
+            if isinstance(value, dict) and key != "extras":
+                self.report(value, effect, place)
 
-    def _buffer(self, entry: Node, number: int) -> bytes:
+    # ------------------------------------------------------------------------------------------------------- bytes
+
+    def _buffer(self, number: int) -> bytes:
+        if number not in self._buffers:
+            entry = self.all("buffers")[number]
+            data = self._bytes_of(entry, number)
+            if len(data) < entry["byteLength"]:
+                raise SpecError(
+                    f"{self.path}: buffer {number} is cut off: it has {len(data)} bytes and needs {entry['byteLength']}"
+                )
+            self._buffers[number] = data
+        return self._buffers[number]
+
+    def _bytes_of(self, entry: Node, number: int) -> bytes:
         if "uri" in entry:
             return self._read(entry["uri"], f"buffer {number}")
-        if self._binary is None:
-            raise SpecError(f"{self.path}: buffer {number} has no uri, and the file has no binary chunk")
-        return self._binary
+        if number == 0 and self._binary is not None:
+            return self._binary
+        compressed = ", ".join(entry.get("extensions", ()))
+        why = f"{compressed} has its data, which is not read" if compressed else "the file has no binary chunk for it"
+        raise SpecError(f"{self.path}: buffer {number} has no uri, and {why}; export the file without compression")
 
     def _read(self, uri: str, what: str) -> bytes:
         if uri.startswith("data:"):
-            return base64.b64decode(uri.partition(",")[2])
-        file = self.path.parent / unquote(uri)
+            kind, _, words = uri.partition(",")
+            return base64.b64decode(words) if kind.endswith(";base64") else unquote_to_bytes(words)
+        name = unquote(uri).replace("\\", "/")
         try:
-            return file.read_bytes()
+            return (self.path.parent / name).read_bytes()
         except OSError as error:
             reason = error.strerror or str(error)
-            raise SpecError(f"{self.path}: {what}: {unquote(uri)!r} cannot be read: {reason}") from error
+            raise SpecError(f"{self.path}: {what}: {name!r} cannot be read: {reason}; put it there") from error
 
     def _view(self, number: int) -> tuple[bytes, int]:
         """The bytes of a buffer view, and its stride."""
         view = self.all("bufferViews")[number]
-        start = view.get("byteOffset", 0)
-        return self._buffers[view["buffer"]][start : start + view["byteLength"]], view.get("byteStride", 0)
+        start, data = view.get("byteOffset", 0), self._buffer(view["buffer"])
+        end = start + view["byteLength"]
+        if end > len(data):
+            raise SpecError(f"{self.path}: buffer {view['buffer']} has {len(data)} bytes; view {number} needs {end}")
+        return data[start:end], view.get("byteStride", 0)
 
     def array(self, number: int) -> NDArray[Any]:
         """The values of an accessor, (N, width): integers as they are, unless normalised to floats."""
         accessor = self.all("accessors")[number]
         width, count = _WIDTHS[accessor["type"]], accessor["count"]
         kind = np.dtype(_TYPES[accessor["componentType"]])
-        if "bufferView" in accessor:
-            values = self._strided(accessor["bufferView"], accessor.get("byteOffset", 0), kind, count, width)
-        else:
-            values = np.zeros((count, width), kind)
+        values = self._strided(accessor, kind, count, width)
         if "sparse" in accessor:
-            values = self._with_sparse(values, accessor["sparse"], kind)
-        return _normalised(values) if accessor.get("normalized") else values
+            sparse = accessor["sparse"]
+            where = self._strided(sparse["indices"], np.dtype(_TYPES[sparse["indices"]["componentType"]]),
+                                  sparse["count"], 1)  # fmt: skip
+            values[where[:, 0]] = self._strided(sparse["values"], kind, sparse["count"], width)
+        return normalised(values) if accessor.get("normalized") else values
 
-    def _strided(self, view: int, offset: int, kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
+    def _strided(self, entry: Node, kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
+        """Values in a buffer view (count, width); zeros without one."""
+        if "bufferView" not in entry:
+            return np.zeros((count, width), kind)
+        view, offset = entry["bufferView"], entry.get("byteOffset", 0)
         data, stride = self._view(view)
         step = stride or width * kind.itemsize
         needed = offset + (count - 1) * step + width * kind.itemsize
         if count and len(data) < needed:
             raise SpecError(f"{self.path}: buffer view {view} has {len(data)} bytes, and an accessor needs {needed}")
         return np.ndarray((count, width), kind, data, offset, (step, kind.itemsize)).copy()
-
-    def _with_sparse(self, values: NDArray[Any], sparse: Node, kind: np.dtype[Any]) -> NDArray[Any]:
-        where, what, count = sparse["indices"], sparse["values"], sparse["count"]
-        places = self._strided(
-            where["bufferView"], where.get("byteOffset", 0), np.dtype(_TYPES[where["componentType"]]), count, 1
-        )
-        values[places[:, 0]] = self._strided(
-            what["bufferView"], what.get("byteOffset", 0), kind, count, values.shape[1]
-        )
-        return values
 
     def image(self, number: int) -> tuple[str, bytes]:
         """The name and the encoded bytes of an image."""
@@ -117,10 +165,17 @@ class GltfFile:
         return named or f"image_{number}", self._read(uri, f"image {number}")
 
 
-def _normalised(values: NDArray[Any]) -> NDArray[np.float32]:
+def extension(entry: Node, name: str) -> Node:
+    """What an extension says of an entry."""
+    found: Node = entry.get("extensions", {}).get(name, {})
+    return found
+
+
+def normalised(values: NDArray[Any]) -> NDArray[np.float64]:
+    """Integers as fractions of the largest one of their kind; floats as they are."""
     if values.dtype.kind == "f":
-        return values.astype(np.float32)
-    return np.maximum(values.astype(np.float32) / np.iinfo(values.dtype).max, -1.0).astype(np.float32)
+        return values.astype(np.float64)
+    return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
 
 
 def _opened(path: Path) -> tuple[dict[str, Any], bytes | None]:

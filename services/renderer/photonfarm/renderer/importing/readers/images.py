@@ -1,10 +1,11 @@
-"""Images changed on the way: channels taken out, factors multiplied in. Letters: H W image."""
+"""Images changed on the way: channels taken out, factors multiplied in. Letters: H W image, C channels."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,18 +13,53 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import SpecError
 
 Image = NDArray[np.float32]
-"""Linear or encoded values in [0, 1], (H, W, 4)."""
+"""Linear or encoded values (H, W, C), in [0, 1] but for light."""
+
+_OF_FLOATS = (b"\x76\x2f\x31\x01", b"#?", b"PF", b"Pf")
+"""How files of OpenEXR, Radiance and PFM begin."""
 
 
-def decoded(data: bytes, what: str) -> Image:
-    """An encoded image as RGBA, its values as they are stored; raises SpecError if it cannot be decoded."""
+def decoded(data: bytes, what: str, *, raw: bool = False) -> Image:
+    """An encoded image of any depth as RGBA (H, W, 4), its values as they are stored; profiles of colour are ignored.
+
+    Images of floats hold linear light, and their colours are encoded here, unless `raw`. Raises SpecError if an image
+    cannot be decoded.
+    """
     from PIL import Image as Pillow
 
+    is_light = data.startswith(_OF_FLOATS)
     try:
-        with Pillow.open(io.BytesIO(data)) as image:
-            return np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
-    except (OSError, ValueError, SyntaxError) as error:
+        if is_light or (data.startswith(b"\x89PNG") and data[24:25] == b"\x10"):
+            values = _by_mitsuba(data)  # of which Pillow keeps 8 bits
+        else:
+            with Pillow.open(io.BytesIO(data)) as image:
+                values, is_light = _by_pillow(image), image.mode == "F"
+    except (OSError, ValueError, SyntaxError, RuntimeError, Pillow.DecompressionBombError) as error:
         raise SpecError(f"{what}: is not a readable image: {error}") from error
+    if is_light and not raw:
+        values[..., :3] = encoded(values[..., :3])
+    return values
+
+
+def _by_mitsuba(data: bytes) -> Image:
+    import mitsuba as mi
+
+    from photonfarm.renderer.scene.loading import threads_to_read_with
+
+    stream = mi.MemoryStream(len(data))
+    stream.write(data)
+    stream.seek(0)
+    with threads_to_read_with():
+        image = mi.Bitmap(stream)
+        made = image.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, image.srgb_gamma())
+    return np.array(made, np.float32)
+
+
+def _by_pillow(image: Any) -> Image:
+    if image.mode[0] not in "IF":
+        return np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
+    grey = np.asarray(image, np.float32) / np.float32(1 if image.mode == "F" else 65535)
+    return np.dstack([grey, grey, grey, np.ones_like(grey)])
 
 
 def linear(encoded: Image) -> Image:
@@ -32,8 +68,8 @@ def linear(encoded: Image) -> Image:
 
 
 def encoded(values: Image) -> Image:
-    """The sRGB values of linear ones."""
-    values = values.clip(0, 1)
+    """The sRGB values of linear ones, by the same curve above 1."""
+    values = values.clip(0)
     return np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
@@ -43,10 +79,19 @@ def tinted(image: Image, factor: Sequence[float]) -> Image:
 
 
 def save(values: Image, file: Path) -> Path:
-    """Write values in [0, 1], (H, W) or (H, W, 3), as PNG."""
-    from PIL import Image as Pillow
+    """Write numbers (H, W) or (H, W, 1), or sRGB colours (H, W, 3), as PNG; the file, whose ending may be another.
 
-    Pillow.fromarray((values.clip(0, 1) * 255 + 0.5).astype(np.uint8)).save(file)
+    It has 16 bits where 8 would round. Colours above 1 become OpenEXR, which is linear.
+    """
+    import mitsuba as mi
+
+    if values.ndim == 3 and values.shape[2] == 3 and values.max() > 1:
+        return save_radiance(linear(values), file.with_suffix(".exr"))
+    values = values.clip(0, 1)
+    rounded = np.round(values * 255)
+    fits = np.abs(values * 255 - rounded).max() < 1e-3
+    stored = rounded.astype(np.uint8) if fits else np.round(values * 65535).astype(np.uint16)
+    mi.Bitmap(np.ascontiguousarray(stored)).write(str(file))
     return file
 
 

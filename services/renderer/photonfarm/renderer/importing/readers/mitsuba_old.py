@@ -1,180 +1,295 @@
-"""Scenes of Mitsuba 0.6 and older: old names to those of Mitsuba 3, and what has no successor to what is nearest."""
+"""What changed since Mitsuba 0.6: names, and what has another meaning or default under the same name.
+
+Sources: Mitsuba 0.6's documentation and code; for 0.3 to 0.5, its `data/schema/upgrade_0.4.0.xsl`.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
 from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.readers import images
+from photonfarm.renderer.importing.readers.mitsuba_spectra import numbers_of, of_old, put
+from photonfarm.shared.core.errors import SpecError
 
 _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
-_TAGS = {"luminaire": "emitter", "camera": "sensor", "lookAt": "lookat", "srgb": "rgb"}
+_TAGS = {"luminaire": "emitter", "camera": "sensor", "lookAt": "lookat"}
+
+_NEAREST = {"roughdiffuse": "diffuse", "ward": "roughplastic", "phong": "roughplastic", "ldrtexture": "bitmap",
+            "sky": "sunsky", "sun": "sunsky"}  # fmt: skip
+"""The usual counterparts of what Mitsuba 3 has not."""
+
+_PROPERTIES: dict[tuple[str, str], str | None] = {
+    ("area", "intensity"): "radiance",
+    ("constant", "intensity"): "radiance",
+    ("directional", "intensity"): "irradiance",
+    ("envmap", "intensity_scale"): "scale",
+    ("diffuse", "diffuse_reflectance"): "reflectance",
+    ("ward", "alpha_u"): "alpha",
+    **dict.fromkeys(
+        [("ward", "alpha_v"), ("ward", "variant"), ("ward", "specular_reflectance"), ("phong", "specular_reflectance"),
+         ("roughdiffuse", "alpha"), ("roughdiffuse", "use_fast_approx"),
+         ("bitmap", "cache"), ("bitmap", "max_anisotropy"), ("envmap", "cache"), ("obj", "collapse"),
+         ("sky", "resolution"), ("sun", "resolution"), ("sunsky", "resolution")]
+    ),
+}  # fmt: skip
+"""Properties by the type that has them: the name of today, or none for what no picture shows, or no counterpart has."""
 
 
-def upgrade(root: Element) -> list[str]:
-    """Upgrade a scene in place; sentences about what changed more than its name."""
-    notes: list[str] = []
-    for node in root.iter():
+@dataclass(slots=True)
+class Upgrade:
+    """Brings files to the terms of Mitsuba 3, and says what changes."""
+
+    changes: Changes
+    names: dict[str, str]  # of properties, as the files have them
+    scratch: Path
+    root: Element = field(default_factory=elements.scene)  # of the file at hand
+    find: Callable[[str], Path | None] = Path  # the file of a name in it
+
+    def run(self, root: Element, find: Callable[[str], Path | None]) -> None:
+        """Upgrade a file's elements in place; raises SpecError for a value that is none."""
+        self.root, self.find = root, find
+        root.set("version", "3.0.0")
+        for node in root.iter():
+            self._rename(node)
+        try:
+            for node in list(root.iter()):
+                for part in list(node):
+                    self._upgrade_property(node, part)
+            for node in reversed(list(root.iter())):  # what is in others first
+                self._upgrade_object(node)
+        except ValueError as error:
+            raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
+
+    def _upgrade_object(self, node: Element) -> None:
+        kind = node.get("type", "")
+        if kind in _UPGRADES:
+            _UPGRADES[kind](self, node)
+        if kind in _NEAREST:
+            node.set("type", _NEAREST[kind])
+            self.changes.note(f"became {_NEAREST[kind]!r}, the nearest in Mitsuba 3", elements.place(node), name=kind)
+
+    def _rename(self, node: Element) -> None:
         node.tag = _TAGS.get(node.tag, node.tag)
-        if "name" in node.attrib and node.tag != "default":
-            node.set("name", _HUMP.sub("_", node.get("name", "")).lower())
-        _upgrade_colour(node)
-    for node in list(root.iter()):
-        _upgrade_texture(node)
-        successor = _SUCCESSORS.get((node.tag, node.get("type", "")))
-        if successor is not None:
-            old = node.get("type", "")
-            successor(node)
-            notes.append(
-                f"{elements.place(node)} of type {old!r} became {node.get('type')!r}, the nearest in Mitsuba 3"
-            )
-    return notes
+        node.attrib.pop("intent", None)
+        node.attrib.update({key: text.lower() for key, text in node.attrib.items() if key == "type"})
+        for part in [part for part in node if part.tag != "default" and part.get("name")]:
+            old = part.get("name", "")
+            new = _HUMP.sub("_", old).lower()
+            self.names[new] = old
+            today = _PROPERTIES.get((node.get("type", ""), new), new)
+            if today is None:
+                node.remove(part)
+            else:
+                part.set("name", today)
+
+    def _upgrade_property(self, node: Element, part: Element) -> None:
+        name = part.get("name", "")
+        if part.tag == "animation":
+            node[list(node).index(part)] = first = min(part, key=lambda step: abs(float(step.get("time", "0"))))
+            first.attrib = {"name": name}
+            self.changes.note("stands still, as it is at time 0", elements.place(node), name="animation")
+        elif part.tag == "subsurface":
+            node.remove(part)
+            self.lose("colour", "subsurface", "is left out: Mitsuba 3 has none", node)
+        elif name == "distribution" and part.get("value", "").lower() in ("as", "phong"):
+            part.set("value", "beckmann")  # Walter et al. 2007: of the same α, they are about as wide
+            self.changes.note("became 'beckmann', of the same width", elements.place(node), name="distribution")
+        elif part.tag == "lookat" and not part.get("up"):
+            part.set("up", _any_up(part))
+        elif name == "ext_eta" and part.get("value") in ("air", "vacuum", "1", "1.0"):
+            node.remove(part)
+        elif (colour := of_old(part)) is not None:
+            if node.tag == "bsdf" and re.search("reflectance|transmittance", name):
+                colour = colour / max(1.0, float(colour.max()))  # as 0.6 does, to conserve energy
+            put(part, colour)
+
+    def bake(self, texture: Element, gamma: float, channels: str) -> None:
+        """Let a bitmap name an image of some of its channels, with sRGB in place of another gamma."""
+        named = elements.child(texture, "filename")
+        file = self.find(_value(texture, "filename"))
+        if named is None or file is None:
+            return
+        texels = images.decoded(file.read_bytes(), str(file), raw=True)
+        if gamma not in (1, -1):
+            texels[..., :3] = images.encoded(texels[..., :3] ** gamma)
+        texels = texels[..., ["rgba".index(channel) for channel in channels]]
+        name = f"{len(list(self.scratch.iterdir()))}-{file.stem}.png"
+        named.set("value", str(images.save(texels, self.scratch / name)))
+
+    def lose(self, effect: Effect, name: str, meaning: str, node: Element) -> None:
+        """Say what is lost of an element."""
+        self.changes.lose(effect, self.names.get(name, name), meaning, elements.place(node))
 
 
-def _upgrade_colour(node: Element) -> None:
-    if node.tag == "blackbody":
-        temperature = float(node.get("temperature", "5000").rstrip("Kk "))
-        scale = float(node.get("scale", "1"))
-        node.tag = "rgb"
-        name = node.get("name", "")
-        node.attrib.clear()
-        node.attrib.update(name=name, value=elements.numbers([scale * part for part in blackbody(temperature)]))
-    elif node.tag in ("spectrum", "rgb") and node.get("value", "").startswith("#"):
-        digits = node.get("value", "")[1:7]
-        encoded = [int(digits[i : i + 2], 16) / 255 for i in (0, 2, 4)]
-        node.tag = "rgb"
-        node.set("value", elements.numbers(images.linear(np.array(encoded, np.float32)).tolist()))
-    elif node.tag == "spectrum" and re.fullmatch(r"\s*[^\s:,]+[\s,]+[^\s:,]+[\s,]+[^\s:,]+\s*", node.get("value", "")):
-        node.tag = "rgb"  # three numbers were a colour
+def _any_up(step: Element) -> str:
+    """The `up` that 0.6 takes where none is given; Mitsuba 3 takes another."""
+    x, y, z = (np.array(numbers_of(step.get("target", ""))) - numbers_of(step.get("origin", ""))).tolist()
+    across = (z, 0, -x) if abs(x) > abs(y) else (0, z, -y)
+    return elements.numbers(np.cross(across, (x, y, z)).tolist())
 
 
-def blackbody(temperature_k: float) -> tuple[float, float, float]:
-    """The colour of a black body in linear RGB with a mean of 1, by Tanner Helland's fit to its chromaticity."""
-    t = max(10.0, min(400.0, temperature_k / 100))
-    red = 1.0 if t <= 66 else 329.7 * (t - 60) ** -0.1332 / 255
-    green = (99.47 * math.log(t) - 161.12) / 255 if t <= 66 else 288.12 * (t - 60) ** -0.0755 / 255
-    blue = 1.0 if t >= 66 else 0.0 if t <= 19 else (138.52 * math.log(t - 10) - 305.04) / 255
-    linear = [max(0.0, min(1.0, part)) ** 2.2 for part in (red, green, blue)]
-    mean = sum(linear) / 3
-    return linear[0] / mean, linear[1] / mean, linear[2] / mean
-
-
-def _upgrade_texture(texture: Element) -> None:
-    """Scale and offset of texture coordinates, which were numbers of their own."""
-    if texture.tag != "texture":
-        return
-    found = {name: _taken(texture, name) for name in ("uscale", "vscale", "uvscale", "uoffset", "voffset")}
-    if any(value is not None for value in found.values()):
-        both = found["uvscale"] or 1.0
-        transform = SubElement(texture, "transform", name="to_uv")
-        SubElement(transform, "scale", x=str(found["uscale"] or both), y=str(found["vscale"] or both))
-        SubElement(transform, "translate", x=str(found["uoffset"] or 0.0), y=str(found["voffset"] or 0.0))
-
-
-def _taken(node: Element, name: str) -> float | None:
+def _taken(node: Element, name: str, otherwise: str) -> str:
+    """The value of a property, which is taken out."""
     found = elements.child(node, name)
     if found is None:
-        return None
+        return otherwise
     node.remove(found)
-    return float(found.get("value", "0"))
+    return found.get("value", otherwise).lower()
 
 
-# ------------------------------------------------------------------------------------------- what has a successor
+def _value(node: Element, name: str) -> str:
+    found = elements.child(node, name)
+    return "" if found is None else found.get("value", "")
 
 
-def _phong(bsdf: Element) -> None:
+def _texture(_: Upgrade, texture: Element) -> None:
+    """Scale and offset of texture coordinates, which were numbers of their own: uv · scale + offset."""
+    both = _taken(texture, "uvscale", "1")
+    scale = {axis: _taken(texture, f"{uv}scale", both) for axis, uv in zip("xy", "uv", strict=True)}
+    offset = {axis: _taken(texture, f"{uv}offset", "0") for axis, uv in zip("xy", "uv", strict=True)}
+    if {*scale.values(), *offset.values()} != {"0", "1"}:
+        SubElement(texture, "transform", name="to_uv").extend([Element("scale", scale), Element("translate", offset)])
+
+
+def _bitmap(upgrade: Upgrade, texture: Element) -> None:
+    """Gamma 1 is `raw`; filters but `nearest` are `bilinear`, the default; one way to wrap for both axes."""
+    _texture(upgrade, texture)
+    is_float = Path(_value(texture, "filename")).suffix.lower() in (".exr", ".hdr", ".rgbe", ".pfm")
+    gamma, channel = float(_taken(texture, "gamma", "1" if is_float else "-1")), _value(texture, "channel")
+    if gamma == 1 or channel == "a":
+        elements.put_value(texture, "raw", True)
+    if not is_float and (channel in tuple("rgba") or gamma not in (1, -1)):
+        upgrade.bake(texture, gamma, _taken(texture, "channel", "rgb"))
+    elif is_float and gamma != 1:
+        upgrade.lose("colour", "gamma", f"{gamma:g} is left out: texels are read as their file says", texture)
+    if _taken(texture, "filter_type", "ewa") == "nearest":
+        elements.put_value(texture, "filter_type", "nearest")
+    both = _taken(texture, "wrap_mode", "repeat")
+    u, v = (_taken(texture, f"wrap_mode_{axis}", both) for axis in "uv")
+    mode = {"zero": "clamp", "one": "clamp", "black": "clamp", "white": "clamp"}.get(v, v)
+    if u != mode or v != mode:
+        said = f"{u} and {v} became {mode}: Mitsuba 3 repeats, mirrors or clamps, both axes alike"
+        upgrade.lose("colour", "wrapMode", said, texture)
+    elements.put_value(texture, "wrap_mode", mode)
+
+
+def _scaled_texture(upgrade: Upgrade, texture: Element) -> None:
+    """The texture or the colour that was scaled; a height's factor becomes that of its bump map."""
+    factor = np.array(numbers_of(_taken(texture, "scale", "1")))
+    inner, parent = texture[0], elements.parents(upgrade.root)[texture]
+    if parent.get("type") == "bumpmap":
+        elements.put_value(parent, "scale", float(factor.mean()))
+    elif inner.tag == "rgb":
+        inner.set("value", elements.numbers((factor * numbers_of(inner.get("value", ""))).tolist()))
+    elif (factor != 1).any():
+        upgrade.lose("colour", "scale", "a factor of a texture is left out: Mitsuba 3 has none", texture)
+    inner.attrib.pop("name", None)
+    kept = ("name",) if inner.tag == "ref" else ("name", "id")
+    inner.attrib.update({key: text for key, text in texture.attrib.items() if key in kept})
+    parent[list(parent).index(texture)] = inner
+
+
+def _obj(upgrade: Upgrade, shape: Element) -> None:
+    """Where a shape has no material, 0.6 takes those of the OBJ file."""
+    file = upgrade.find(_value(shape, "filename"))
+    if shape.find("bsdf") is None and shape.find("ref") is None and file and b"mtllib" in file.read_bytes():
+        upgrade.lose("colour", "mtllib", "is not read: Mitsuba 3 wants a material for the shape", shape)
+
+
+def _conductor(_: Upgrade, bsdf: Element) -> None:
+    """Copper was what a conductor is made of by default; Mitsuba 3's reflects all."""
+    if not {part.get("name") for part in bsdf} & {"material", "eta", "k"}:
+        elements.put_value(bsdf, "material", "Cu")
+
+
+def _phong(_: Upgrade, bsdf: Element) -> None:
     """Walter et al. 2007: a Phong lobe of exponent n is about as wide as a Beckmann lobe of α = √(2 / (n + 2))."""
-    exponent = _taken(bsdf, "exponent")
-    _glossy(bsdf, math.sqrt(2 / ((30.0 if exponent is None else exponent) + 2)))
+    elements.put_value(bsdf, "alpha", math.sqrt(2 / (float(_taken(bsdf, "exponent", "30")) + 2)))
 
 
-def _ward(bsdf: Element) -> None:
-    alphas = [_taken(bsdf, name) for name in ("alpha", "alpha_u", "alpha_v")]
-    given = [alpha for alpha in alphas if alpha]
-    _glossy(bsdf, sum(given) / len(given) if given else 0.1)
-
-
-def _glossy(bsdf: Element, alpha: float) -> None:
-    for name in ("exponent", "alpha_u", "alpha_v", "variant", "specular_reflectance"):
-        old = elements.child(bsdf, name)
-        if old is not None:
-            bsdf.remove(old)
-    bsdf.set("type", "roughplastic")
-    elements.put_value(bsdf, "alpha", alpha)
-
-
-def _coating(bsdf: Element) -> None:
-    """What lies under the coat stays."""
-    under = next((node for node in bsdf if node.tag in ("bsdf", "ref")), None)
-    if under is None or under.tag == "ref":
-        _keep_children(bsdf, ("ref",))
-        bsdf.set("type", "twosided")
-        return
-    bsdf[:] = list(under)
-    bsdf.set("type", under.get("type", "diffuse"))
-
-
-def _mixture(bsdf: Element) -> None:
-    """The first two are blended by their weights."""
-    weights = elements.child(bsdf, "weights")
-    given = [float(x) for x in re.findall(r"[-+.\deE]+", weights.get("value", "") if weights is not None else "")]
-    parts = [node for node in bsdf if node.tag in ("bsdf", "ref")][:2]
-    share = given[1] / max(given[0] + given[1], 1e-9) if len(given) > 1 else 0.5
-    bsdf[:] = parts
-    if len(parts) == 2:
-        bsdf.set("type", "blendbsdf")
-        elements.put_value(bsdf, "weight", share)
+def _coating(upgrade: Upgrade, bsdf: Element) -> None:
+    """A coat on a diffuse material is plastic; of others, what lies under the coat stays."""
+    under = next(node for node in bsdf if node.tag == "bsdf" or (node.tag == "ref" and not node.get("name")))
+    bsdf.remove(under)
+    same = (node for node in upgrade.root.iter("bsdf") if under.tag == "ref" and node.get("id") == under.get("id"))
+    found, kind = next(same, under), bsdf.get("type", "")
+    if found.get("type") == "diffuse":
+        bsdf.extend(elements.copied(part) for part in found)
+        for part in bsdf:
+            part.set("name", part.get("name", "").replace("reflectance", "diffuse_reflectance"))
+        bsdf.set("type", kind.replace("coating", "plastic"))
+        upgrade.changes.note("on a diffuse material became plastic", elements.place(bsdf), name=kind)
     else:
-        bsdf.set("type", "twosided")
+        upgrade.lose("colour", kind, "is left out: Mitsuba 3 has it on diffuse materials alone", bsdf)
+        _blend(bsdf, [(0.5, under), (0.5, elements.copied(under))])
 
 
-def _keep_children(node: Element, tags: tuple[str, ...]) -> None:
-    node[:] = [part for part in node if part.tag in tags]
+def _mixture(_: Upgrade, bsdf: Element) -> None:
+    """Blends of two, one in another; what the weights leave of 1 is absorbed, as in 0.6."""
+    weights = numbers_of(_taken(bsdf, "weights", ""))
+    mixed = [node for node in bsdf if node.tag in ("bsdf", "ref")]
+    if len(weights) != len(mixed):
+        raise ValueError(f"it has {len(weights)} weights for {len(mixed)} materials")
+    black = Element("bsdf", type="diffuse")
+    elements.put_value(black, "reflectance", (0.0, 0.0, 0.0))
+    _blend(bsdf, [*zip(weights, mixed, strict=True), (max(0.0, 1 - sum(weights)), black)])
 
 
-def _scaled_texture(texture: Element) -> None:
-    """The texture that was scaled."""
-    inner = next((node for node in texture if node.tag == "texture"), None)
-    if inner is not None:
-        texture[:] = list(inner)
-        texture.set("type", inner.get("type", "bitmap"))
+def _blend(bsdf: Element, parts: list[tuple[float, Element]]) -> None:
+    total, made = parts[-1]
+    for weight, part in parts[-2::-1]:
+        total += weight
+        blend = Element("bsdf", type="blendbsdf")
+        elements.put_value(blend, "weight", 1 - weight / max(total, 1e-9))
+        blend.extend([part, made])
+        made = blend
+    bsdf[:] = list(made)
+    bsdf.set("type", "blendbsdf")
 
 
-def _sky(dark: str) -> Callable[[Element], None]:
-    """The part of `sunsky` that is meant: the other one gets no light."""
-
-    def become(emitter: Element) -> None:
-        emitter.set("type", "sunsky")
-        for old in ("extend", "sky_scale", "sun_scale", "resolution", "stretch", "sun_radius_scale"):
-            found = elements.child(emitter, old)
-            if found is not None:
-                emitter.remove(found)
-        elements.put_value(emitter, dark, 0.0)
-
-    return become
+def _normalmap(_: Upgrade, bsdf: Element) -> None:
+    for node in bsdf.findall("texture"):
+        node.set("name", "normalmap")
 
 
-def _becomes(successor: str) -> Callable[[Element], None]:
-    return lambda node: node.set("type", successor)
+def _sky(upgrade: Upgrade, emitter: Element) -> None:
+    """The part of `sunsky` that is meant. +Y was up, and is +Z; a sun's direction is in world coordinates in both.
+
+    Of a place and time, 0.6 has east at +X and north at −Z, and Mitsuba 3 south at +X and west at +Y.
+    """
+    kind = emitter.get("type", "")
+    scale = _taken(emitter, "scale", "1")
+    for part in ("sun", "sky"):
+        own = _taken(emitter, f"{part}_scale", scale)
+        elements.put_value(emitter, f"{part}_scale", float(own) if part in kind else 0.0)
+    elements.put_value(emitter, "sun_aperture", 0.5358 * (float(_taken(emitter, "sun_radius_scale", "1")) or 0.02))
+    if float(_taken(emitter, "stretch", "1")) != 1 or _taken(emitter, "extend", "false") == "true":
+        upgrade.lose("light", "stretch", "is left out: nothing comes from below the horizon", emitter)
+    placed = elements.child(emitter, "to_world")
+    if placed is None:
+        placed = SubElement(emitter, "transform", name="to_world")
+    of_place = Element("matrix", value="0 -1 0 0 0 1 1 0 0")
+    is_of_place = elements.child(emitter, "sun_direction") is None
+    placed.insert(0, of_place if is_of_place else Element("rotate", x="1", angle="-90"))
+    if "sky" in kind and elements.child(emitter, "albedo") is None:
+        meaning = "the ground's albedo is Mitsuba 3's 0.3, not 0.6's 0.15"
+        upgrade.changes.note(meaning, elements.place(emitter), name=kind)
 
 
-_SUCCESSORS: dict[tuple[str, str], Callable[[Element], None]] = {
-    ("bsdf", "phong"): _phong,
-    ("bsdf", "ward"): _ward,
-    ("bsdf", "roughdiffuse"): _becomes("diffuse"),
-    ("bsdf", "difftrans"): _becomes("diffuse"),
-    ("bsdf", "coating"): _coating,
-    ("bsdf", "roughcoating"): _coating,
-    ("bsdf", "mixturebsdf"): _mixture,
-    ("texture", "ldrtexture"): _becomes("bitmap"),
-    ("texture", "gridtexture"): _becomes("checkerboard"),
-    ("texture", "scale"): _scaled_texture,
-    ("emitter", "sky"): _sky("sun_scale"),
-    ("emitter", "sun"): _sky("sky_scale"),
-}
+_UPGRADES: dict[str, Callable[[Upgrade, Element], None]] = {
+    "bitmap": _bitmap, "ldrtexture": _bitmap, "checkerboard": _texture,
+    "scale": _scaled_texture, "obj": _obj, "conductor": _conductor, "roughconductor": _conductor, "phong": _phong,
+    "coating": _coating, "roughcoating": _coating, "mixturebsdf": _mixture, "normalmap": _normalmap,
+    "sky": _sky, "sun": _sky, "sunsky": _sky,
+}  # fmt: skip
+"""What means something else in Mitsuba 3, or is no longer there, by type."""

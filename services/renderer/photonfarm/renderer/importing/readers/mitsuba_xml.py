@@ -3,121 +3,101 @@
 from __future__ import annotations
 
 import re
+from bisect import bisect
+from itertools import accumulate
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.changes import listed
+from photonfarm.renderer.importing.changes import Changes, listed
 from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
-from photonfarm.renderer.importing.readers import mitsuba_instances, mitsuba_old, mitsuba_parts
+from photonfarm.renderer.importing.readers import mitsuba_files, mitsuba_instances, mitsuba_old, mitsuba_parts
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
-from photonfarm.shared.scene.located_xml import Located, line_of, parse
+from photonfarm.shared.scene.located_xml import Located, line_of
 
-INCLUDES = 15
-"""The deepest nesting of files that is followed; more is a file that includes itself."""
-
-_IGNORED = ("integrator", "sensor", "film", "sampler", "default", "alias")
-"""What photonfarm has settings of its own for, and what is used up by reading."""
+_TAGS = {"PhaseFunction": "phase", "ReconstructionFilter": "rfilter"}
+"""The elements of Mitsuba's kinds of objects that are not called like them."""
 
 _OF_FILES = ("bitmap", "envmap", "obj", "ply", "serialized")
 """The plugins that are nothing without a file; Mitsuba crashes on a bitmap that names none."""
 
+_FULL = ("path", "bdpt", "ptracer", "volpath", "volpathmis", "volpath_simple", "mlt", "pssmlt", "erpt", "photonmapper",
+         "ppm", "sppm", "vpl", "adaptive", "irrcache", "prb", "prb_basic", "prb_projective")  # fmt: skip
+"""The integrators that compute all light, as photonfarm does."""
+
 _GENERATED = re.compile(r"^(_unnamed_\d+|_arg_\d+|)$")
 
 
-def read(path: Path, _: Path, log: Log) -> ImportedScene:
+def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a scene; raises SpecError for what is no scene, and for files that are not there."""
     log(f"reading {path.name}")
-    root = _parsed(path)
-    _put_values(root, path)
-    _join(root, path, path.parent, 0)
-    notes: list[str] = []
-    if _version(root) < (2,):
-        try:
-            notes += mitsuba_old.upgrade(root)
-        except ValueError as error:
-            raise SpecError(f"{path}: {error}") from error
-    root.set("version", "3.0.0")
-    camera, up = _camera(root)
-    _drop_ignored(root)
-    notes += mitsuba_parts.mend(root)
-    notes += mitsuba_instances.expand(root)
-    _find_files(root, path)
-    notes += _name_shapes(root)
-    if root.find("shape") is None:
+    scene = ImportedScene()
+    files = mitsuba_files.Files(mitsuba_old.Upgrade(scene.changes, scene.names, scratch), scratch)
+    scene.root = _Tree(files.parsed(path), files).element(0)
+    if scene.root.tag != "scene":
+        raise SpecError(f"{path}: begins with <{scene.root.tag}>; a Mitsuba scene begins with <scene>")
+    scene.root.set("version", "3.0.0")
+    scene.camera, scene.up = _camera(scene.root)
+    _drop_settings(scene.root, scene.changes)
+    mitsuba_parts.mend(scene.root, scene.changes)
+    mitsuba_instances.expand(scene.root, scene.changes)
+    _find_files(scene.root, files)
+    _name_shapes(scene)
+    if scene.root.find("shape") is None:
         raise SpecError(f"{path}: has no shape that photonfarm can render")
-    scene = ImportedScene(root, up=up, camera=camera)
-    for note in notes:
-        scene.changes.note(note)
     return scene
 
 
-def _parsed(path: Path) -> Located:
-    try:
-        root = parse(path)
-    except (OSError, ParseError) as error:
-        raise SpecError(f"{path}: is not a readable Mitsuba scene file: {error}") from error
-    if root.tag != "scene":
-        raise SpecError(f"{path}: begins with <{root.tag}>; a Mitsuba scene begins with <scene>")
-    return root
+class _Tree:
+    """Elements of Mitsuba's nodes."""
+
+    def __init__(self, state: Any, files: mitsuba_files.Files) -> None:
+        self._nodes, self._ids = list(state.nodes), state.id_to_index
+        self._files = [files.originals.get(str(file), file) for file in state.files]
+        texts = [Path(str(file)).read_bytes().split(b"\n") for file in state.files]
+        self._ends = [list(accumulate(len(line) + 1 for line in text)) for text in texts]
+
+    def element(self, number: int, name: str = "") -> Located:
+        """The element of a node, with all in it."""
+        node = self._nodes[number]
+        tag = _TAGS.get(node.type.name, node.type.name.lower())
+        given = {"type": node.props.plugin_name(), "id": node.props.id(), "name": name}
+        made = Located(tag, {key: text for key, text in given.items() if text and tag != "scene"})
+        made.file = str(self._files[node.file_index])
+        made.line = bisect(self._ends[node.file_index], node.offset) + 1
+        for key in node.props:
+            part = self._part("" if key.startswith("_arg_") else key, node.props[key], node.props.type(key).name)
+            part.file, part.line = part.file or made.file, part.line or made.line
+            made.append(part)
+        return made
+
+    def _part(self, name: str, value: Any, kind: str) -> Located:
+        if kind == "ResolvedReference":
+            return self.element(value.index(), name)
+        given = {"name": name} if name else {}
+        if kind == "Reference":
+            referred = self._ids[value.id()]  # by its own name or by an alias
+            return Located("ref", given, id=self._nodes[referred].props.id())
+        if kind == "Transform":
+            part = Located("transform", given)
+            part.append(Element("matrix", value=_numbers(value.matrix)))
+            return part
+        if kind == "Vector":
+            return Located("vector", given, **dict(zip("xyz", _numbers(value).split(), strict=True)))
+        if kind == "Spectrum":
+            pairs = [f"{at!r}:{of!r}" for at, of in zip(value.wavelengths, value.values, strict=False)]
+            return Located("spectrum", given, value=" ".join(pairs) or _numbers(value.values))
+        text = value if kind == "String" else str(value).lower() if kind == "Bool" else _numbers(value)
+        return Located({"Bool": "boolean", "Color": "rgb"}.get(kind, kind.lower()), given, value=text)
 
 
-def _version(root: Element) -> tuple[int, ...]:
-    return tuple(int(part) for part in re.findall(r"\d+", root.get("version", "3")))[:2]
-
-
-def _put_values(root: Element, path: Path) -> None:
-    """Put the values of `<default>` where their names stand."""
-    values = {node.get("name", ""): node.get("value", "") for node in root.iter("default")}
-    names = sorted(values, key=len, reverse=True)  # $max_depth before $max
-    for node in root.iter():
-        for key, text in node.attrib.items():
-            for name in names if "$" in text else ():
-                text = text.replace(f"${name}", values[name])
-            if text.startswith("$"):
-                raise SpecError(f"{path}: line {line_of(node)}: {text} has no <default>; add one, or put a value there")
-            node.set(key, text)
-
-
-def _join(root: Element, path: Path, folder: Path, depth: int) -> None:
-    """Put the content of `<include>` files where they are named."""
-    for include in root.findall("include"):
-        name = include.get("filename") or ""
-        file = folder / name
-        line = line_of(include)
-        if not file.is_file():
-            raise SpecError(f"{path}: line {line}: included file {name!r} is not there")
-        if depth == INCLUDES:
-            raise SpecError(f"{path}: line {line}: {name!r} is included more than {INCLUDES} files deep")
-        included = _parsed(file)
-        _put_values(included, file)
-        _join(included, file, folder, depth + 1)
-        place = list(root).index(include)
-        root.remove(include)
-        for node in reversed(included):
-            root.insert(place, node)
-
-
-def _drop_ignored(root: Element) -> None:
-    for node in list(root):
-        if node.tag in _IGNORED:
-            root.remove(node)
-
-
-def _find_files(root: Element, path: Path) -> None:
-    """Make the names of files absolute; raises SpecError for one that is not there, or not named where it must be."""
-    for node in root.iter():
-        if node.get("type") in _OF_FILES and elements.child(node, "filename") is None:
-            raise SpecError(f"{path}: {elements.place(node)} of type {node.get('type')!r} has no filename; add one")
-    for node, key in elements.file_names(root):
-        name = node.get(key, "")
-        file = (path.parent / name.replace("\\", "/")).resolve()
-        if not file.is_file():
-            raise SpecError(
-                f"{path}: line {line_of(node)}: file {name!r} is not there; put it there, or take its place out"
-            )
-        node.set(key, str(file))
+def _numbers(values: Any) -> str:
+    """Numbers as they are in double precision."""
+    return " ".join(repr(value).removesuffix(".0") for value in np.array(values).ravel().tolist())
 
 
 def _camera(root: Element) -> tuple[Vector | None, Vector]:
@@ -126,43 +106,57 @@ def _camera(root: Element) -> tuple[Vector | None, Vector]:
     placed = None if sensor is None else elements.child(sensor, "to_world")
     if placed is None:
         return None, (0.0, 1.0, 0.0)
-    import mitsuba as mi
-    import numpy as np
-
-    alone = elements.scene()
-    holder = Element("sensor", type="perspective")
-    holder.append(placed)
-    alone.append(holder)
-    try:
-        camera = mi.load_string(elements.text(alone)).sensors()[0]
-    except RuntimeError:
-        return None, (0.0, 1.0, 0.0)
-    matrix = np.array(camera.world_transform().matrix, np.float64).reshape(4, 4)
-    up = np.zeros(3)
-    axis = int(np.argmax(np.abs(matrix[:3, 1])))
-    up[axis] = np.sign(matrix[axis, 1])
-    x, y, z = matrix[:3, 3]
-    return (float(x), float(y), float(z)), (float(up[0]), float(up[1]), float(up[2]))
+    matrix = np.array(placed[0].get("value", "").split(), np.float64).reshape(4, 4)
+    axis = int(np.abs(matrix[:3, 1]).argmax())
+    x, y, z = np.where(np.arange(3) == axis, np.sign(matrix[axis, 1]), 0.0)
+    right, up, back = matrix[:3, 3]
+    return (float(right), float(up), float(back)), (float(x), float(y), float(z))
 
 
-def _name_shapes(root: Element) -> list[str]:
-    """Give ids to shapes without one, by material and order; what the user reads about it."""
-    ids = Ids()
-    shapes = root.findall("shape")
+def _drop_settings(root: Element, changes: Changes) -> None:
+    """Take out what photonfarm has settings of its own for, and say what that changes."""
+    for node in [part for part in root if part.tag in ("integrator", "sensor", "film", "sampler")]:
+        root.remove(node)
+        kind = node.get("type", "")
+        hides = (elements.child(part, "hide_emitters") for part in node.iter("integrator"))
+        if any(found is not None and found.get("value") == "true" for found in hides):
+            changes.note("lights are visible here", elements.place(node), name="hide_emitters")
+        if node.tag == "integrator" and kind not in _FULL:
+            changes.note("all light is computed here", elements.place(node), name=kind)
+        if node.tag == "sensor" and kind != "perspective":
+            changes.note("cameras are perspective here", elements.place(node), name=kind)
+
+
+def _find_files(root: Element, files: mitsuba_files.Files) -> None:
+    """Make the names of files absolute; raises SpecError for one that is not there, or not named where it must be."""
     for node in root.iter():
+        if node.get("type") in _OF_FILES and elements.child(node, "filename") is None:
+            raise SpecError(f"{elements.place(node)} of type {node.get('type')!r} has no filename; add one")
+    for node, key in elements.file_names(root):
+        name = node.get(key, "")
+        beside = getattr(node, "file", "")
+        file = files.find(name, Path(beside))
+        if file is None:
+            raise SpecError(
+                f"{beside}: line {line_of(node)}: file {name!r} is not there; put it there, or take its place out"
+            )
+        node.set(key, str(file))
+
+
+def _name_shapes(scene: ImportedScene) -> None:
+    """Give ids to shapes without one, by material and order, and say so."""
+    ids = Ids()
+    shapes = scene.root.findall("shape")
+    for node in scene.root.iter():
         if node.tag not in ("shape", "ref") and node.get("id"):
             ids.keep(node.get("id", ""))
-    unnamed = [shape for shape in shapes if _is_unnamed(shape) or not ids.keep(shape.get("id", ""))]
+    unnamed = [shape for shape in shapes if _GENERATED.match(shape.get("id", "")) or not ids.keep(shape.get("id", ""))]
     for shape in unnamed:
         shape.set("id", ids.make(_material(shape), "shape"))
-    if not unnamed:
-        return []
-    made = listed([shape.get("id", "") for shape in unnamed])
-    return [f"{len(unnamed)} of {len(shapes)} shapes had no id of their own, and got one by material and order: {made}"]
-
-
-def _is_unnamed(shape: Element) -> bool:
-    return _GENERATED.match(shape.get("id", "")) is not None
+    if unnamed:
+        made = listed([shape.get("id", "") for shape in unnamed])
+        count = f"{len(unnamed)} of {len(shapes)} shapes"
+        scene.changes.note(f"{count} had no id of their own, and got one by material and order: {made}")
 
 
 def _material(shape: Element) -> str:

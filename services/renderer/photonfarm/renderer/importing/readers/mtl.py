@@ -1,182 +1,233 @@
-"""Materials of MTL files, also with the keys of its extension for metal and roughness."""
+"""MTL files: their statements, the numbers of these, and the images that they name."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import Element
+
+import numpy as np
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.changes import Changes
+from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.readers import images
 from photonfarm.shared.core.errors import SpecError
 
-_IMAGES = ("map_kd", "map_d", "map_pr", "map_pm", "norm")
-_LOST = {"map_bump": "bump map", "bump": "bump map", "map_ke": "map of its light", "map_ks": "map of its gloss",
-         "disp": "displacement", "refl": "reflection map"}  # fmt: skip
-_WHITE = (1.0, 1.0, 1.0)
+Meaning = tuple[Effect | None, str]
+"""What of the picture a statement changes that is not carried over, if anything, and how."""
 
-_OPTIONS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
-"""The options of image files that take several values; all others take one."""
+_OPTION = re.compile(
+    r"-(?:(type|imfchan)\s+(\S+)|(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?=\s)){0,3}))\s+",
+    re.IGNORECASE,
+)
+"""An option before the name of an image: one word, or up to three numbers."""
 
-GLASS = (4, 6, 7, 9)
-"""The models of illumination that are glass."""
+_CARRIED = ("mm", "o", "s", "clamp", "bm", "imfchan", "blendu", "blendv", "boost", "texres")
+"""The options that have their meaning here, or speak of how programs filter; others have none if 0 or off."""
 
-SHINES = 0.02
-"""Gloss is modelled from this specular reflectance on."""
+RELIEFS = ("norm", "map_bump", "bump")
+
+_CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
+
+_OF_XYZ = ((3.2404542, -1.5371385, -0.4985314), (-0.969266, 1.8760108, 0.041556), (0.0556434, -0.2040259, 1.0572252))
+"""Linear sRGB of CIE XYZ (IEC 61966-2-1)."""
+
+_BY_MITSUBA = {".png", ".jpg", ".jpeg", ".bmp", ".tga", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm"}
 
 
-@dataclass(slots=True)
+def statements(file: Path) -> Iterator[tuple[int, str, str]]:
+    """The line, first word and rest of each statement of a text; a backslash at a line's end joins the next to it."""
+    try:
+        data = file.read_bytes()
+    except OSError as error:
+        raise SpecError(f"{file}: cannot be read: {error.strerror or error}") from error
+    try:
+        text = data.decode("utf-16" if data[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = data.decode("latin-1")
+    if "\0" in text:
+        raise SpecError(f"{file}: is no text, and so no OBJ or MTL")
+    lines = enumerate(re.split(r"\r\n?|\n", text), 1)
+    for number, line in lines:
+        while line.endswith("\\") and not line.lstrip().startswith("#"):
+            line = f"{line[:-1]} {next(lines, (0, ''))[1]}"
+        words = line.split(None, 1)
+        if words and (words[0][0] != "#" or words[0] == "#MRGB"):
+            yield number, words[0], words[1].rstrip() if len(words) > 1 else ""
+
+
+def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[str, Material]:
+    """The materials of the `mtllib` statements of a file, by name; of two of one name the first is taken."""
+    found: dict[str, Material] = {}
+    for file in dict.fromkeys(file for names in stated for file in _libraries(path, names, changes)):
+        material: Material | None = None
+        for line, word, rest in statements(file):
+            if word.lower() == "newmtl":
+                material = Material(rest, file, changes)
+                if found.setdefault(rest, material) is not material:
+                    changes.note("is defined twice, and the first is taken", f"{file.name}: line {line}", name=rest)
+            elif material is None:
+                changes.note("stands before all materials, and means nothing", f"{file.name}: line {line}", name=word)
+            elif not rest:
+                material.say((None, "has no value, and means nothing"), word)
+            else:
+                if material.lines.get(word.lower(), (0, "", rest))[2] != rest:
+                    material.say((None, "is stated twice, and the last is taken"), word)
+                material.lines[word.lower()] = (line, word, rest)
+    return found
+
+
+def _libraries(path: Path, stated: str, changes: Changes) -> Iterator[Path]:
+    """The files of a statement, which may be several, and have spaces in their names."""
+    words = stated.split()
+    while words:
+        ends = range(len(words), 0, -1)
+        end = next((end for end in ends if _found(path.parent, " ".join(words[:end]))), len(words))
+        file = _located(path.parent, " ".join(words[:end]), changes)
+        if file is None:
+            name = " ".join(words)
+            raise SpecError(f"{path}: material file {name!r} is not there; put it there, or take its mtllib line out")
+        yield file
+        words = words[end:]
+
+
+def _located(folder: Path, name: str, changes: Changes) -> Path | None:
+    """The file of a name, or else the one of its last part in the folder, as paths may be those of another machine."""
+    file = _found(folder, name)
+    if file is None and (last := re.split(r"[/\\]", name.strip("\"'"))[-1]) and (file := _found(folder, last)):
+        changes.note(f"{name!r} is not there; {file.name!r} beside the file is taken")
+    return file
+
+
+def _found(folder: Path, name: str) -> Path | None:
+    """The file of a name, which may have the separators of Windows, quotes and other capitals."""
+    file = folder
+    try:
+        for part in Path(name.strip("\"'").replace("\\", "/")).parts:
+            named = [part] if (file / part).exists() else [each.name for each in file.iterdir()]
+            file /= next(each for each in named if each.lower() == part.lower())
+    except (StopIteration, OSError):
+        return None
+    return file if file.is_file() else None
+
+
+@dataclass(slots=True, eq=False)
 class Material:
-    """One material: its lines, by their first words in small letters."""
+    """One material: its lines, as (number, word, rest), by their first words in small letters."""
 
     name: str
     file: Path
-    lines: dict[str, list[str]] = field(default_factory=dict)
+    changes: Changes
+    lines: dict[str, tuple[int, str, str]] = field(default_factory=dict)
 
     def number(self, key: str, otherwise: float) -> float:
         """The first number of a line."""
         return self.colour(key, (otherwise,))[0]
 
-    def colour(self, key: str, otherwise: Sequence[float]) -> Sequence[float]:
+    def colour(self, key: str, otherwise: Sequence[float] = (0.0, 0.0, 0.0)) -> Sequence[float]:
         """The numbers of a line; one stands for all three."""
-        if key not in self.lines:
+        line, word, rest = self.lines.get(key, (0, key, ""))
+        words = rest.partition("#")[0].split()
+        form = words[0].lower() if words else ""
+        if form in ("", "spectral"):
+            if form:
+                self.say(("colour", "spectra of files are left out"), f"{word} spectral")
             return otherwise
         try:
-            values = [float(word) for word in self.lines[key][:3]]
-        except ValueError as error:
-            words = " ".join(self.lines[key])
-            raise SpecError(f"{self.file}: material {self.name!r}: {key} = {words!r} has no numbers") from error
-        return values * 3 if len(values) == 1 and len(otherwise) > 1 else values
-
-    def image(self, key: str) -> Path | None:
-        """The image of a line; raises SpecError if it is not there."""
-        if key not in self.lines:
-            return None
-        words = list(self.lines[key])
-        while words and words[0].startswith("-"):
-            words = words[1 + _OPTIONS.get(words[0], 1) :]
-        name = " ".join(words).replace("\\", "/")
-        file = self.file.parent / name
-        if not file.is_file():
+            values = [float(part) for part in words[form in ("xyz", "-halo") :][: len(otherwise)]]
+        except ValueError:
+            values = []
+        values = values * len(otherwise) if len(values) == 1 else values
+        if len(values) != len(otherwise) or not all(map(math.isfinite, values)):
             raise SpecError(
-                f"{self.file}: material {self.name!r}: image {name!r} is not there; put it there, or take its line out"
+                f"{self.file}: line {line}: material {self.name!r}: {word} = {rest!r} is no number, or three"
             )
-        return file
+        return [float(part) for part in np.array(_OF_XYZ) @ values] if form == "xyz" else values
+
+    def image(self, key: str) -> Image | None:
+        """The image of a line; raises SpecError if it is not there."""
+        line, word, rest = self.lines.get(key, (0, key, ""))
+        if not rest:
+            return None
+        options: dict[str, str] = {}
+        while (found := _OPTION.match(rest)) and not _found(self.file.parent, rest):
+            options[(found[1] or found[3]).lower()] = (found[2] or found[4]).strip().lower()
+            rest = rest[found.end() :]
+        file = _located(self.file.parent, rest, self.changes)
+        if file is None:
+            remedy = "put it there, or take its line out"
+            raise SpecError(f"{self.file}: line {line}: material {self.name!r}: image {rest!r} is not there; {remedy}")
+        made = Image(file, options)
+        for name, value in options.items():
+            neutral = (*_CHANNELS, "l") if name == "imfchan" else ("0", "0.0", "off")
+            if (name not in _CARRIED or name == "imfchan") and set(value.split()) - set(neutral):
+                self.say(("colour", "is an option that is not carried over"), f"{word} -{name}")
+        return made
 
     @property
-    def emits(self) -> bool:
-        """Whether it is a light."""
-        return max(self.colour("ke", (0.0,))) > 0
+    def has_images(self) -> bool:
+        """Whether it names images."""
+        return any(key.startswith("map_") or key in RELIEFS for key in self.lines)
+
+    def say(self, meaning: Meaning, name: str) -> None:
+        """Say what a statement means that is not carried over."""
+        self.changes.say(meaning[0], name, meaning[1], f"material {self.name!r}")
 
     @property
-    def opacity(self) -> float:
-        """Its `d`, or 1 − `Tr`."""
-        return self.number("d", 1 - self.number("tr", 0.0))
+    def relief(self) -> str:
+        """The key of its normal map, or else of its bump map, or nothing."""
+        return next((key for key in RELIEFS if key in self.lines), "")
+
+    def light(self, file: Path) -> Element | None:
+        """What it emits, by `Ke` and an image that is written to `file`; None if it does not."""
+        factor, image = np.maximum(self.colour("ke"), 0).astype(np.float32), self.image("map_ke")
+        if image is None:
+            return elements.area_light(factor.tolist()) if factor.any() else None
+        values = images.linear(image.values()[..., :3]) * (factor if factor.any() else np.float32(1))
+        if not values.any():
+            return None
+        emitter = Element("emitter", type="area")
+        image.put_place(elements.put_bitmap(emitter, "radiance", images.save_radiance(values, file), raw=True))
+        return emitter
 
 
-def read_materials(file: Path) -> dict[str, Material]:
-    """The materials of a file, by name."""
-    found: dict[str, Material] = {}
-    material: Material | None = None
-    for line in file.read_text(encoding="utf-8", errors="replace").splitlines():
-        words = line.split()
-        if len(words) > 1 and words[0].lower() == "newmtl":
-            material = Material(" ".join(words[1:]), file)
-            found[material.name] = material
-        elif len(words) > 1 and material is not None and not words[0].startswith("#"):
-            material.lines[words[0].lower()] = words[1:]
-    return found
+@dataclass(frozen=True, slots=True)
+class Image:
+    """An image file, and the options that stand before its name, without their hyphens."""
 
+    file: Path
+    options: dict[str, str]
 
-def put_material(root: Element, made: str, material: Material | None, scratch: Path, changes: Changes) -> None:
-    """Add a material to a scene; None is a grey one."""
-    top = SubElement(root, "bsdf", id=made)
-    if material is None:
-        top.set("type", "twosided")
-        elements.put_value(SubElement(top, "bsdf", type="diffuse"), "reflectance", (0.7, 0.7, 0.7))
-        return
-    if lost := sorted({_LOST[key] for key in material.lines if key in _LOST}):
-        for name in lost:
-            changes.lose("colour", name, "is not carried over", f"material {material.name!r}")
-    if _put_glass(top, material):
-        return
-    top = _put_mask(top, material, made, scratch)
-    top.set("type", "twosided")
-    place = SubElement(top, "bsdf")
-    normal_map = material.image("norm")
-    if normal_map is not None:
-        place.set("type", "normalmap")
-        elements.put_bitmap(place, "normalmap", normal_map, raw=True)
-        place = SubElement(place, "bsdf")
-    _put_surface(place, material, made, scratch)
+    @property
+    def is_plain(self) -> bool:
+        """Whether Mitsuba reads the file as it is."""
+        return self.file.suffix.lower() in _BY_MITSUBA and not {"mm", "imfchan"} & set(self.options)
 
+    def triple(self, option: str, otherwise: float = 0.0) -> list[float]:
+        """The numbers of an option, three or those that are missing `otherwise`."""
+        return [*(float(part) for part in self.options.get(option, "").split()), *[otherwise] * 3][:3]
 
-def _put_glass(place: Element, material: Material) -> bool:
-    """Make it clear glass, if it is; whether it is. Its sheets have no thickness that MTL says anything of."""
-    is_glass = material.number("illum", 2) in GLASS or material.opacity < 0.5
-    if material.opacity >= 1 or not is_glass or "map_d" in material.lines:
-        return False
-    place.set("type", "thindielectric")
-    elements.put_value(place, "int_ior", max(material.number("ni", 1.5), 1.01))
-    tint = material.colour("tf", _WHITE)
-    elements.put_value(place, "specular_transmittance", tint if max(tint) > 0 else _WHITE)
-    return True
+    def values(self, *, raw: bool = False) -> images.Image:
+        """Its values as they are stored (H, W, 4), under `-mm` and `-imfchan`."""
+        values = images.decoded(self.file.read_bytes(), str(self.file), raw=raw)
+        channel = self.options.get("imfchan", "")
+        if channel in _CHANNELS:
+            values = np.dstack([values[..., _CHANNELS[channel]]] * 3 + [np.ones_like(values[..., 0])])
+        elif channel == "l":
+            values[..., :3] = values[..., :3].mean(axis=2, keepdims=True)
+        if "mm" in self.options:
+            base, gain, _ = self.triple("mm", 1.0)
+            values[..., :3] = (base + gain * values[..., :3]).clip(0)
+        return values
 
-
-def _put_mask(top: Element, material: Material, made: str, scratch: Path) -> Element:
-    """The place of the surface under its opacity."""
-    stencil = material.image("map_d")
-    if stencil is None and material.opacity >= 1:
-        return top
-    top.set("type", "mask")
-    if stencil is None:
-        elements.put_value(top, "opacity", float(material.opacity))
-    else:
-        image = _decoded(stencil)
-        alpha = image[..., 3] if image[..., 3].min() < 1 else image[..., :3].mean(axis=2)
-        elements.put_bitmap(top, "opacity", images.save(alpha, scratch / f"{made}_opacity.png"), raw=True)
-    return SubElement(top, "bsdf")
-
-
-def _put_surface(place: Element, material: Material, made: str, scratch: Path) -> None:
-    specular = max(material.colour("ks", (0.0,)))
-    if {"pr", "pm", "map_pr", "map_pm"} & set(material.lines):
-        place.set("type", "principled")
-        _put_colour(place, "base_color", material, made, scratch)
-        for name, key, otherwise in (("roughness", "pr", 0.5), ("metallic", "pm", 0.0)):
-            _put_number(place, name, material, key, otherwise)
-    elif specular > SHINES and material.number("illum", 2) >= 2:
-        place.set("type", "roughplastic")
-        exponent = max(material.number("ns", 30.0), 0.0)
-        elements.put_value(place, "alpha", max(math.sqrt(2 / (exponent + 2)), 0.02))
-        _put_colour(place, "diffuse_reflectance", material, made, scratch)
-    else:
-        place.set("type", "diffuse")
-        _put_colour(place, "reflectance", material, made, scratch)
-
-
-def _put_number(place: Element, name: str, material: Material, key: str, otherwise: float) -> None:
-    image = material.image(f"map_{key}")
-    if image is not None:
-        elements.put_bitmap(place, name, image, raw=True)
-    else:
-        elements.put_value(place, name, float(material.number(key, otherwise)))
-
-
-def _put_colour(place: Element, name: str, material: Material, made: str, scratch: Path) -> None:
-    """Its colour; an image is multiplied by `Kd`, unless that is black, as some programs write it beside images."""
-    factor, image = material.colour("kd", _WHITE), material.image("map_kd")
-    if image is None:
-        elements.put_value(place, name, [min(max(part, 0.0), 1.0) for part in factor])
-        return
-    if max(factor) == 0 or min(factor) >= 0.999:
-        elements.put_bitmap(place, name, image)
-        return
-    elements.put_bitmap(place, name, images.save(images.tinted(_decoded(image), factor), scratch / f"{made}_color.png"))
-
-
-def _decoded(file: Path) -> images.Image:
-    return images.decoded(file.read_bytes(), str(file))
+    def put_place(self, bitmap: Element) -> None:
+        """Add where a texture lies and how far it reaches. MTL's v goes upwards, and Mitsuba's downwards."""
+        (su, sv, _), (u, v, _) = self.triple("s", 1.0), self.triple("o")
+        if self.options.get("clamp") == "on":
+            elements.put_value(bitmap, "wrap_mode", "clamp")
+        if (su, sv, u, v) != (1, 1, 0, 0):
+            rows = ((su, 0.0, 0.0, u), (0.0, sv, 0.0, 1 - sv - v), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+            elements.put_matrix(bitmap, "to_uv", rows)

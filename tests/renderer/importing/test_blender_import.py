@@ -1,0 +1,336 @@
+"""What comes of Blender's files: lamps and skies, all that is drawn, materials, and what is said of the rest."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+import pytest
+
+from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.importing.readers import blender
+from photonfarm.renderer.importing.readers.blender_lamps import Lamps
+from photonfarm.shared.core.errors import SpecError
+
+Loaded = Callable[[Path], tuple[ImportedScene, Any]]
+
+needs_blender = pytest.mark.skipif(not os.environ.get(blender.VARIABLE), reason=f"{blender.VARIABLE} names no Blender")
+STRAIGHT_DOWN = np.diag([1.0, 1, 1, 1]).tolist()
+LAMP: dict[str, Any] = {
+    "name": "Lamp", "kind": "POINT", "matrix": STRAIGHT_DOWN, "strength": [4.0, 2.0, 0.0], "normalize": True,
+    "shadow_soft_size": 0.0, "angle": 0.0, "spot_size": 1.0, "spot_blend": 0.0, "shape": "SQUARE", "size": 2.0,
+    "size_y": 1.0, "spread": np.pi,
+}  # fmt: skip
+
+
+def run(script: str, folder: Path, *arguments: str) -> None:
+    """Let Blender's Python run a script."""
+    (folder / "script.py").write_text(script)
+    command = blender.blender_command(folder / "it.blend")
+    place = next(number for number, word in enumerate(command) if word.endswith("blender_export.py"))
+    made = subprocess.run([*command[:place], str(folder / "script.py"), *arguments], capture_output=True, check=False)
+    assert made.returncode == 0, made.stderr.decode()[-1000:]
+
+
+@pytest.fixture
+def emitters(tmp_path: Path) -> Callable[..., list[Any]]:
+    """Function (numbers of a lamp) → Mitsuba's emitters of it."""
+
+    kept: list[Any] = []
+
+    def make(**numbers: Any) -> list[Any]:
+        from photonfarm.renderer.scene.loading import threads_to_read_with
+
+        scene = ImportedScene()
+        Lamps(scene, tmp_path).put(LAMP | numbers)
+        scene.write_meshes(tmp_path)
+        elements.write(scene.root, tmp_path / "lamp.xml")
+        with threads_to_read_with():
+            kept.append(mi.load_file(str(tmp_path / "lamp.xml"), optimize=False))
+        return list(kept[-1].emitters())
+
+    return make
+
+
+def irradiance(emitters: list[Any], at: tuple[float, float, float]) -> np.ndarray:
+    """What a surface at a point that faces up receives of lights without an extent."""
+    reference = mi.Interaction3f()
+    reference.p = mi.Point3f(*at)
+    total = np.zeros(3)
+    for emitter in emitters:
+        sample, weight = emitter.sample_direction(reference, mi.Point2f(0.5))
+        total += np.array(weight).ravel() * max(float(sample.d.y[0]), 0)
+    return total
+
+
+@pytest.mark.parametrize(("normalize", "intensity"), [(True, 1 / (4 * np.pi)), (False, 1 / np.pi)])
+def test_a_point_has_the_intensity_of_cycles(emitters: Callable[..., Any], normalize: bool, intensity: float) -> None:
+    found = irradiance(emitters(normalize=normalize), (0, -2, 0))
+    assert found == pytest.approx(np.array([4, 2, 0]) * intensity / 4, rel=1e-5)
+
+
+def test_a_point_with_a_radius_is_a_sphere_of_the_same_power(emitters: Callable[..., Any]) -> None:
+    (light,) = emitters(shadow_soft_size=0.5)
+    radiance = np.array(mi.traverse(light)["radiance.value"]).ravel()
+    assert radiance * np.pi * 4 * np.pi * 0.25 == pytest.approx([4, 2, 0], rel=1e-5)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5])
+def test_a_sun_has_its_strength_on_a_surface_that_faces_it(emitters: Callable[..., Any], angle: float) -> None:
+    found = emitters(kind="SUN", angle=angle)
+    assert len(found) == (16 if angle else 1)
+    assert irradiance(found, (0, -2, 0)) == pytest.approx([4, 2, 0], rel=1e-4)
+
+
+def test_the_cone_of_a_spot_is_that_of_cycles_and_is_squeezed_by_its_scale(emitters: Callable[..., Any]) -> None:
+    wide = np.diag([2.0, 1, 1, 1]).tolist()
+    spots = emitters(kind="SPOT", matrix=wide, spot_size=np.radians(60), spot_blend=0.5)
+    on_axis = 4 / (4 * np.pi) / 4
+    for x, side in ((0.0, 1.0), (0.9, 1.0), (1.8, 0.0)):  # glTF's z is Blender's -y
+        cosine = 2 / np.hypot(2, x)
+        squeezed = 2 / np.hypot(2, x / 2)
+        t = np.clip((squeezed - np.cos(np.pi / 6)) / (0.5 * (1 - np.cos(np.pi / 6))), 0, 1)
+        wanted = on_axis * cosine**3 * t * t * (3 - 2 * t)
+        assert irradiance(spots, (x, -2, 0))[0] == pytest.approx(wanted, rel=0.02, abs=1e-4)
+        assert side in (0, 1)
+    assert irradiance(spots, (0, -2, 1.2))[0] == 0
+
+
+@pytest.mark.parametrize(("shape", "area"), [("SQUARE", 4), ("RECTANGLE", 2), ("DISK", np.pi), ("ELLIPSE", np.pi / 2)])
+@pytest.mark.parametrize("normalize", [True, False])
+def test_an_area_shines_down_by_its_area_in_the_world(
+    emitters: Callable[..., Any], shape: str, area: float, normalize: bool
+) -> None:
+    scaled = np.diag([2.0, -3.0, 1, 1]).tolist()
+    (light,) = emitters(kind="AREA", shape=shape, normalize=normalize, matrix=scaled)
+    assert float(light.get_shape().surface_area()[0]) == pytest.approx(6 * area, rel=1e-4)
+    radiance = np.array(mi.traverse(light)["radiance.value"]).ravel()
+    assert radiance == pytest.approx(np.array([4, 2, 0]) / np.pi / (6 * area if normalize else 1), rel=1e-4)
+    normal = light.get_shape().sample_position(0.0, mi.Point2f(0.3, 0.3)).n
+    assert float(normal.y[0]) == pytest.approx(-1)
+
+
+def test_negative_lamps_are_a_loss_and_dark_ones_are_not(tmp_path: Path) -> None:
+    scene = ImportedScene()
+    Lamps(scene, tmp_path).put(LAMP | {"strength": [0.0, 0.0, 0.0]})
+    assert not list(scene.changes)
+    Lamps(scene, tmp_path).put(LAMP | {"strength": [-1.0, -1.0, -1.0]})
+    assert [(change.effect, change.name, change.places) for change in scene.changes] == [
+        ("light", "energy", ["lamp 'Lamp'"])
+    ]
+
+
+def test_a_fault_of_blenders_exporter_is_not_told_as_one_of_reading(tmp_path: Path, monkeypatch: Any) -> None:
+    program = tmp_path / "blender"
+    program.write_text("#!/bin/sh\necho 'fault: Blender reads it, but its exporter to glTF fails: no'\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setenv(blender.VARIABLE, str(program))
+    with pytest.raises(SpecError, match=r"den\.blend: Blender reads it, but its exporter to glTF fails: no$"):
+        blender.read(tmp_path / "den.blend", tmp_path, lambda _: None)
+
+
+# ------------------------------------------------------------------------------------------------------- Blender
+
+
+@pytest.fixture
+def make_case(case: Callable[[str], Path], tmp_path: Path) -> Callable[[str], Path]:
+    """Function (folder of a case) → the folder of its files, which Blender writes."""
+
+    def make(name: str) -> Path:
+        run(case(f"{name}/make.py").read_text(), tmp_path, str(tmp_path))
+        return tmp_path
+
+    return make
+
+
+def radiance_from(scene: Any, origin: list[float], target: list[float]) -> np.ndarray:
+    """The mean radiance of a field of view of 10°."""
+    to_world = mi.ScalarTransform4f().look_at(origin, target, [0, 0, 1])
+    film = {"type": "hdrfilm", "width": 16, "height": 16, "pixel_format": "rgb"}
+    sensor = mi.load_dict({"type": "perspective", "fov": 10, "to_world": to_world, "film": film})
+    image = mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "path"}), spp=512)
+    return np.array(image).mean(axis=(0, 1))
+
+
+@needs_blender
+@pytest.mark.slow
+def test_area_lights_are_as_in_cycles(make_case: Callable[[str], Path], loaded: Loaded) -> None:
+    folder = make_case("blender-area-light")
+    wanted: dict[str, tuple[Any, Any]] = {
+        "base": (63.7, 0.90),
+        "scaled": (15.9, 0.828),
+        "exposure": (254.6, 3.60),
+        "unnormalized": (15.9, 0.225),
+        "temperature": ((112.7, 53.7, 17.3), (1.595, 0.760, 0.245)),
+        "spread": (None, 21.8),
+    }
+    for name, (emission, radiance) in wanted.items():
+        made, scene = loaded(folder / f"{name}.blend")
+        assert not [change for change in made.changes if change.effect]
+        found = radiance_from(scene, [1.8, 1.6, -1.2], [1.8, 0, -1.2])
+        assert found == pytest.approx(np.broadcast_to(radiance, 3), rel=0.04), name
+        if emission is not None:
+            hit = scene.ray_intersect(mi.Ray3f([1.8, 1.6, -1.2], [0, 1, 0]))
+            assert np.array(hit.emitter(scene).eval(hit)).ravel() == pytest.approx(
+                np.broadcast_to(emission, 3), rel=0.01
+            )
+        else:
+            assert any("Lamp" in place for change in made.changes for place in change.places)
+
+
+@needs_blender
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "colour"), [("default", (1, 1, 1)), ("kelvin", (1.771, 0.844, 0.272))])
+def test_the_start_up_scene_has_its_lamp_and_its_grey_sky(
+    make_case: Callable[[str], Path], loaded: Loaded, name: str, colour: tuple[float, ...]
+) -> None:
+    made, scene = loaded(make_case(f"blender-{name}") / f"{name}.blend")
+    assert not [change for change in made.changes if change.effect]
+    (lamp,) = [shape for shape in scene.shapes() if shape.is_emitter()]
+    power = np.array(mi.traverse(lamp.emitter())["radiance.value"]).ravel() * np.pi * float(lamp.surface_area()[0])
+    assert power == pytest.approx(1000 * np.array(colour), rel=1e-3)
+    sky = mi.SurfaceInteraction3f()
+    sky.wi = mi.Vector3f(0, -1, 0)
+    assert np.array(scene.environment().eval(sky)).ravel() == pytest.approx([0.05088] * 3, rel=1e-3)
+    assert made.camera == pytest.approx((7.359, 4.958, 6.926), abs=1e-3)
+
+
+DRAWN = """
+import bpy, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+bpy.ops.mesh.primitive_cube_add(size=1, location=(0, 0, 5))
+cube = bpy.context.object
+cube.name = "Box"
+cube.modifiers.new("smooth", "ARRAY").count = 3
+bpy.ops.mesh.primitive_cube_add(size=1, location=(9, 0, 0))
+subdivided = bpy.context.object
+subdivided.name = "Ball"
+levels = subdivided.modifiers.new("subdivided", "SUBSURF")
+levels.levels, levels.render_levels = 0, 2
+bpy.ops.object.text_add(location=(0, 9, 0))
+bpy.ops.curve.primitive_bezier_circle_add(location=(0, -9, 0))
+bpy.context.object.data.bevel_depth = 0.1
+bpy.ops.object.metaball_add(location=(-9, 0, 0))
+kept = bpy.data.collections.new("Kept")
+bpy.ops.mesh.primitive_plane_add(size=1)
+plane = bpy.context.object
+scene.collection.objects.unlink(plane)
+kept.objects.link(plane)
+for x in (20, 22, 24):
+    holder = bpy.data.objects.new(f"Holder {x}", None)
+    holder.instance_type, holder.instance_collection = "COLLECTION", kept
+    holder.location, holder.scale = (x, 0, 0), (1, 2, 1)
+    scene.collection.objects.link(holder)
+parent = bpy.data.objects.new("Skewed", None)
+parent.scale = (1, 3, 1)
+scene.collection.objects.link(parent)
+leaning = bpy.data.objects.new("Leaning", plane.data)
+leaning.parent, leaning.rotation_euler, leaning.location = parent, (0, 0, 0.7), (30, 0, 0)
+scene.collection.objects.link(leaning)
+for name, flag in (("Hidden", "hide_render"), ("Eye", "hide_viewport")):
+    made = bpy.data.objects.new(name, plane.data)
+    made.location = (40, 0, 0)
+    setattr(made, flag, True)
+    scene.collection.objects.link(made)
+hair = bpy.data.hair_curves.new("Fur")
+scene.collection.objects.link(bpy.data.objects.new("Fur", hair))
+scene.unit_settings.scale_length = 0.01
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
+"""
+
+
+@needs_blender
+@pytest.mark.slow
+def test_all_that_blender_draws_is_there_and_what_is_missing_is_named(tmp_path: Path, loaded: Loaded) -> None:
+    file = tmp_path / "drawn.blend"
+    run(DRAWN, tmp_path, str(file))
+    made, scene = loaded(file)
+    area = {shape.id(): float(shape.surface_area()[0]) for shape in scene.shapes()}
+    assert area["Box"] == pytest.approx(18)
+    assert area["Leaning"] == pytest.approx(3, rel=1e-5)
+    assert [area[name] for name in ("Plane", "Plane_001", "Plane_002")] == pytest.approx([2, 2, 2])
+    assert {made.objects[name] for name in ("Plane", "Plane_001")} == {"Holder 20", "Holder 22"}
+    assert {"Text", "BézierCircle", "Mball", "Eye"} <= area.keys()
+    assert "Hidden" not in area
+    ball = next(shape for shape in scene.shapes() if shape.id() == "Ball")
+    assert ball.face_count() == 6 * 16 * 2  # as for renders, not for the window
+    said = {(change.effect, change.name): change.places for change in made.changes}
+    assert said["geometry", "CURVES"] == ["object 'Fur'"]
+    assert (None, "scale_length") in said
+
+
+SURFACES = """
+import bpy, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+
+def surface(x, name, kind, links=(), **values):
+    bpy.ops.mesh.primitive_plane_add(size=1, location=(x, 0, 0))
+    material = bpy.data.materials.new(name)
+    material.use_nodes = True
+    tree = material.node_tree
+    tree.nodes.clear()
+    output = tree.nodes.new("ShaderNodeOutputMaterial")
+    if kind:
+        shader = tree.nodes.new(kind)
+        for key, value in values.items():
+            shader.inputs[key.replace("_", " ")].default_value = value
+        tree.links.new(shader.outputs[0], output.inputs["Surface"])
+        for node_kind, target in links:
+            node = tree.nodes.new(node_kind)
+            if node_kind == "ShaderNodeRGB":
+                node.outputs[0].default_value = (0.1, 0.6, 0.2, 1)
+            tree.links.new(node.outputs[0], shader.inputs[target])
+    bpy.context.object.data.materials.append(material)
+
+surface(0, "dull", "ShaderNodeBsdfDiffuse", Color=(0.6, 0.3, 0.1, 1))
+surface(1, "lit", "ShaderNodeEmission", Color=(1, 0.5, 0.25, 1), Strength=4)
+surface(2, "constant", "ShaderNodeBsdfDiffuse", [("ShaderNodeRGB", "Color")])
+surface(3, "cloudy", "ShaderNodeBsdfPrincipled", [("ShaderNodeTexNoise", "Base Color")])
+surface(4, "waxen", "ShaderNodeBsdfPrincipled", Subsurface_Weight=0.5)
+surface(5, "cloth", "ShaderNodeBsdfSheen")
+surface(6, "none", "")
+surface(7, "glass", "ShaderNodeBsdfGlass", Roughness=0, IOR=1.4)
+world = bpy.data.worlds.new("World")
+world.use_nodes = True
+tree = world.node_tree
+background = tree.get_output_node("CYCLES").inputs["Surface"].links[0].from_node
+direction = tree.nodes.new("ShaderNodeTexCoord")
+tree.links.new(direction.outputs["Generated"], background.inputs["Color"])
+bpy.context.scene.world = world
+bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
+"""
+
+
+@needs_blender
+@pytest.mark.slow
+def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Path, loaded: Loaded) -> None:
+    file = tmp_path / "surfaces.blend"
+    run(SURFACES, tmp_path, str(file))
+    made, scene = loaded(file)
+
+    def down(x: float) -> Any:
+        return scene.ray_intersect(mi.Ray3f([x + 0.1, 3, 0.1], [0, -1, 0]))
+
+    for x, colour in ((0, (0.6, 0.3, 0.1)), (2, (0.1, 0.6, 0.2)), (6, (0, 0, 0))):
+        found = np.array(down(x).bsdf().eval_diffuse_reflectance(down(x))).ravel()
+        assert found == pytest.approx(colour, abs=1e-3)
+    for direction in (-1, 1):
+        hit = scene.ray_intersect(mi.Ray3f([1.1, -3 * direction, 0.1], [0, direction, 0]))
+        assert np.array(hit.emitter(scene).eval(hit)).ravel() == pytest.approx([4, 2, 1], rel=1e-5)
+    assert "Dielectric" in str(down(7).bsdf())
+    assert {(change.name, *change.places) for change in made.changes if change.effect == "colour"} == {
+        ("Noise Texture", "material 'cloudy'"),
+        ("Subsurface Weight", "material 'waxen'"),
+        ("Sheen BSDF", "material 'cloth'"),
+    }
+    for axis, colour in (((1, 0, 0), (1, 0, 0)), ((0, 1, 0), (0, 0, 1)), ((0, 0, -1), (0, 1, 0))):
+        sky = mi.SurfaceInteraction3f()
+        sky.wi = -mi.Vector3f(*axis)  # glTF's y is Blender's z, and its -z Blender's y
+        assert np.array(scene.environment().eval(sky)).ravel() == pytest.approx(colour, abs=0.02)

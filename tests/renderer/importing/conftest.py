@@ -149,12 +149,11 @@ def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quick render that is quicker."""
-    from photonfarm.renderer.importing import importer
     from photonfarm.renderer.measure import exposure
 
     monkeypatch.setattr(exposure, "PATHS", 1 << 13)
     monkeypatch.setattr(exposure, "SIDE", 32)
-    monkeypatch.setattr(importer, "FRAMES", 4)
+    monkeypatch.setattr(exposure.propose, "__kwdefaults__", exposure.propose.__kwdefaults__ | {"frames": 4})
 
 
 @pytest.fixture

@@ -144,17 +144,31 @@ def test_polygons_of_all_kinds_are_read(write: Callable[[str, str], Path], loade
 @pytest.mark.parametrize(
     ("faces", "materials", "named"),
     [
-        ("usemtl it\nf 1 2 3", "newmtl it\nmap_Kd gone.png", "gone.png"),
         ("usemtl it\nf 1 2 3", "newmtl it\nKd red", "Kd|kd"),
         ("", "newmtl it\nKd 1 1 1", "no faces"),
-        ("mtllib gone.mtl\nf 1 2 3", "newmtl it\nKd 1 1 1", "gone.mtl"),
     ],
 )
-def test_what_is_missing_is_named(
+def test_what_is_wrong_is_named(
     write: Callable[[str, str], Path], loaded: Loaded, faces: str, materials: str, named: str
 ) -> None:
     with pytest.raises(SpecError, match=named):
         loaded(write(faces, materials))
+
+
+@pytest.mark.parametrize(
+    ("faces", "materials", "name", "file"),
+    [
+        ("usemtl it\nf 1 2 3", "newmtl it\nmap_Kd gone.png", "map_Kd", "it.mtl: line 2: gone.png"),
+        ("mtllib gone.mtl\nf 1 2 3", "newmtl it\nKd 1 1 1", "mtllib", "gone.mtl"),
+    ],
+)
+def test_files_that_are_missing_change_the_picture(
+    write: Callable[[str, str], Path], loaded: Loaded, faces: str, materials: str, name: str, file: str
+) -> None:
+    scene, made = loaded(write(faces, materials))
+    (lost,) = [change for change in scene.changes if change.effect == "colour"]
+    assert (lost.name, lost.places) == (name, [file])
+    assert len(made.shapes()) == 1
 
 
 # ------------------------------------------------------------------------------------------------------------- faces
@@ -307,7 +321,7 @@ def test_statements_that_are_not_carried_over_are_said(obj: Obj, read: Callable[
     scene = read(obj(f"{FOUR_V}{others}f 1 2 3 4"))
     assert lost(scene) == {"surf": "geometry", "call": "geometry", "trace_obj": "light", "usemap": "colour",
                            "bogus": "geometry", "usemtl": "colour"}  # fmt: skip
-    assert "'gone' is in no material file" in said(scene)
+    assert "are in no material file, and their surfaces are grey ('gone', line 12)" in said(scene)
 
 
 def test_groups_are_owners_where_there_are_no_objects(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:

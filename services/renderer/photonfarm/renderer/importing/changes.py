@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from shlex import quote
 from typing import Literal
 
 from photonfarm.shared.core.errors import SpecError
@@ -57,7 +58,7 @@ class Changes:
         if not refused:
             return
         lines = "".join(f"\n  {change}" for change in refused)
-        options = " ".join(dict.fromkeys(f"--accept '{change.name}'" for change in refused))
+        options = " ".join(dict.fromkeys(f"--accept {quote(change.name)}" for change in refused))
         raise SpecError(
             f"{source}: the picture would differ from the file's:{lines}\nMend the file, or import it all the same by "
             f"{options}"

@@ -31,9 +31,6 @@ AXES: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0
 GENERAL = ("scene", "scene_v3", "model", "untitled", "main", "export")
 """Names of files that say nothing; the folder's name is taken instead."""
 
-FRAMES = 24
-"""The views that the exposure is measured on: its standard error is about 3 % then."""
-
 DARKEST = 1e5
 """A higher exposure than this is of a scene whose lights do not reach what is seen."""
 
@@ -164,7 +161,7 @@ def _measured(text: SpecText, draft: Path, least: float, work: WorkLog) -> SpecT
         text.changes.note(f"no place was found from which cameras see what is there; {BY_HAND}")
     work.begin("choosing the exposure by a quick render")
     draft.write_text(text.text(), encoding="utf-8")
-    found = exposure.propose(load_spec(draft), draft.parent, work, frames=FRAMES, least=least).exposure
+    found = exposure.propose(load_spec(draft), draft.parent, work, least=least).exposure
     if found > DARKEST:
         raise DarkError(f"exposure {found:.3g}")
     return replace(text, exposure=float(f"{found:.3g}"))

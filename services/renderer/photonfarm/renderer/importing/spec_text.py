@@ -105,7 +105,7 @@ class SpecText:
                 "`photonfarm scene free-space SPEC --write` again, which measures where cameras may stand."
             )
         yield from _said(f"{self._extent().capitalize()}.")
-        for change in list(self.changes)[:MOST_NOTES]:
+        for change in sorted(self.changes, key=lambda change: change.effect is None)[:MOST_NOTES]:
             yield from _said(str(change))
         yield f"name = {json.dumps(self.name)}"
         yield f"scene.file = {json.dumps(self.file, ensure_ascii=False)}"

@@ -29,14 +29,14 @@ from photonfarm.shared.scene.view import sample_view
 TARGET = 0.45
 """The display mean of a picture that is neither dark nor bright."""
 
-FRAMES = 24
+FRAMES = 48
 """The default number of views: their brightness differs so much that less noise would not help."""
 
 SIDE = 64
 """The pixels along the longer side: the display mean hardly depends on the resolution."""
 
-PATHS = 1 << 17
-"""The eye paths of a half of an image: 32 samples per pixel of a square one."""
+PATHS = 1 << 16
+"""The eye paths of a half of an image: 16 samples per pixel of a square one."""
 
 RANGE = (-40.0, 40.0)
 """The range of the search, as powers of 2."""

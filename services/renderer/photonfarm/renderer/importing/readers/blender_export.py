@@ -46,20 +46,19 @@ def main() -> None:
     scene = bpy.context.scene
     if scene.camera is None:
         scene.camera = bpy.data.objects.new("", bpy.data.cameras.new(""))
-    made: dict[str, Any] = {
-        "camera": list(scene.camera.matrix_world.translation) if scene.camera.name in scene.objects else None
-    }
+    seen = list(scene.camera.matrix_world.translation) if scene.camera.name in scene.objects else None
     _look(scene)
     _say_what_else(scene)
     if not Drawn.things:
         why = "; ".join(f"{name} {meaning} {place}" for _, name, meaning, place in said)
         sys.exit(f"fault: Blender draws no surface of it; {why or 'it has none'}")
-    made |= {"lamps": Drawn.lamps, "said": said, "sky": _sky(scene.world, str(Path(out).with_suffix(".exr")))}
-    made["owners"] = _replace_objects(scene)
+    made: dict[str, Any] = {"camera": seen, "lamps": Drawn.lamps, "said": said}
+    made |= {"sky": _sky(scene.world, str(Path(out).with_suffix(".exr"))), "owners": _replace_objects(scene)}
     known = bpy.ops.export_scene.gltf.get_rna_type().properties.keys()
-    off = {"export_animations", "export_active_vertex_color_when_no_material", "export_all_vertex_colors"} & set(known)
+    off = ("export_animations", "export_active_vertex_color_when_no_material", "export_all_vertex_colors")
     try:
-        bpy.ops.export_scene.gltf(filepath=out, export_format="GLB", **dict.fromkeys(off, False))
+        options = {"export_format": "GLB", "use_active_scene": True, **dict.fromkeys(off, False)}
+        bpy.ops.export_scene.gltf(filepath=out, **{key: options[key] for key in options.keys() & known})
     except RuntimeError as error:
         sys.exit(f"fault: Blender reads it, but its exporter to glTF fails: {str(error).strip().splitlines()[-1]}")
     Path(out).with_suffix(".json").write_text(json.dumps(made), encoding="utf-8")
@@ -220,12 +219,15 @@ def _photograph(world: Any, file: str) -> None:
     settings = scene.render.image_settings
     settings.file_format, settings.color_mode, settings.color_depth = "OPEN_EXR", "RGB", "32"
     bpy.ops.render.render(write_still=True, scene=scene.name)
+    bpy.data.scenes.remove(scene)
 
 
 def _say_what_else(scene: Any) -> None:
     for library in bpy.data.libraries:
         if not Path(bpy.path.abspath(library.filepath)).exists():
             say("geometry", "library", "is not there, nor what is in it", library.filepath)
+    if len(bpy.data.scenes) > 1:
+        say(None, "scenes", f"{scene.name!r} is read, of {len(bpy.data.scenes)}")
     if bpy.data.actions:
         say(None, "", f"the scene moves; it is read as in frame {scene.frame_current}")
     if abs(scene.unit_settings.scale_length - 1) > 1e-6:
@@ -253,9 +255,19 @@ def _replace_objects(scene: Any) -> dict[str, str]:
         scene.collection.objects.link(made)
         most = OBJECT_SHARE * len(Drawn.things)
         owners[made.name] = next((head for head in reversed(names) if heads[head] <= most), name)
-    shown = {mesh.materials[number] for mesh in {thing[1] for thing in Drawn.things} if mesh.materials
-             for number in {face.material_index for face in mesh.polygons}}  # fmt: skip
-    for material in shown - {None}:
+    grey = bpy.data.materials.new("no material")  # what Cycles takes where there is none: diffuse
+    grey.use_nodes = True
+    shader = grey.node_tree.nodes.new("ShaderNodeBsdfDiffuse")
+    shader.inputs["Color"].default_value = (0.8, 0.8, 0.8, 1.0)
+    grey.node_tree.links.new(shader.outputs[0], grey.node_tree.get_output_node("CYCLES").inputs["Surface"])
+    shown = set()
+    for mesh in {each.data for each in scene.objects}:
+        if not mesh.materials:
+            mesh.materials.append(grey)
+        for number in {min(face.material_index, len(mesh.materials) - 1) for face in mesh.polygons}:
+            mesh.materials[number] = mesh.materials[number] or grey
+            shown.add(mesh.materials[number])
+    for material in shown:
         place = f"material {material.name!r}"
         prepare(material, lambda effect, name, meaning, place=place: say(effect, name, meaning, place))
     return owners

@@ -26,10 +26,10 @@ AXES = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From Blender's coordinates, z up, to glTF's, y up."""
 
 PARTS = 16
-"""What Mitsuba has without an extent alone, spots, suns and areas of a small spread, becomes so many."""
+"""Spots with a radius, and areas of a small spread, become so many spots, which have no extent in Mitsuba."""
 
 SHARP = math.radians(1.0)
-"""A sun that is no wider is one direction."""
+"""A sun that is no wider is one direction; a wider one is a disc of the sky."""
 
 WIDEST, TEXELS, CORNERS = math.radians(89.5), 512, 64
 
@@ -39,6 +39,7 @@ class Lamps:
 
     def __init__(self, scene: ImportedScene, scratch: Path) -> None:
         self._scene, self._scratch, self._ids, self._black = scene, scratch, Ids(), ""
+        self._discs: list[tuple[Floats, Floats, float]] = []  # suns: direction, irradiance, sine of the half angle
         for part in scene.root.iter():
             self._ids.keep(part.get("id", ""))
 
@@ -52,26 +53,43 @@ class Lamps:
             kinds[lamp["kind"]](lamp, np.maximum(strength, 0), matrix)
 
     def put_sky(self, sky: list[float] | str | None) -> None:
-        """Surround the scene by a radiance, or by an image of all directions with Blender's +y in the middle."""
+        """Surround the scene by a radiance, or by an image of all directions with Blender's +y in the middle; last."""
+        if self._discs:
+            sky = self._with_discs(sky)
         if sky is None:
             return
-        emitter = self._emitter("constant" if isinstance(sky, list) else "envmap", "sky")
-        if isinstance(sky, list):
+        emitter = self._emitter("envmap" if isinstance(sky, str) else "constant", "sky")
+        if not isinstance(sky, str):
             elements.put_value(emitter, "radiance", sky)
             return
         elements.put_value(emitter, "filename", sky)
         elements.put_matrix(emitter, "to_world", np.diag([-1, 1, -1, 1]).tolist())
 
+    def _with_discs(self, sky: list[float] | str | None) -> str:
+        """An image of a sky with the discs of suns, each with its irradiance."""
+        if isinstance(sky, str):
+            values = images.decoded(Path(sky).read_bytes(), sky, raw=True)[..., :3].astype(np.float64)
+        else:
+            values = np.tile(np.array(sky or (0.0, 0.0, 0.0)), (1024, 2048, 1))
+        down = (np.arange(len(values)) + 0.5)[:, None] * math.pi / len(values)
+        along = (np.arange(values.shape[1]) + 0.5) * 2 * math.pi / values.shape[1]
+        x, z = -np.sin(down) * np.sin(along), np.sin(down) * np.cos(along)
+        for axis, flux, sine in self._discs:
+            cosine = axis[0] * x + axis[1] * np.cos(down) + axis[2] * z
+            disc = cosine >= math.sqrt(1 - sine**2)
+            sizes = np.sin(down) * 2 * math.pi**2 / values[..., 0].size
+            values[disc] += flux / (disc * cosine * sizes).sum()
+        return str(images.save_radiance(values.astype(np.float32), self._scratch / "sky.exr"))
+
     def _put_sun(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
-        sine = math.sin(min(lamp["angle"], math.pi) / 2)
+        sine, axis = math.sin(min(lamp["angle"], math.pi) / 2), _frame(matrix)[:, 2]
         flux = strength * (math.pi * sine**2 if sine and not lamp["normalize"] else 1.0)
-        places = sine * _spread_over("DISK") if lamp["angle"] > SHARP else np.zeros((1, 2))
-        for x, y in places:
-            cosine = math.sqrt(1 - x * x - y * y)
-            sun = self._emitter("directional", lamp["name"])
-            elements.put_value(sun, "irradiance", (flux / (len(places) * cosine)).tolist())
-            elements.put_matrix(sun, "to_world", _towards(_frame(matrix) @ (x, y, -cosine), np.zeros(3)))
-        self._say_parts(lamp, len(places))
+        if lamp["angle"] > SHARP:
+            self._discs.append((axis, flux, sine))
+            return
+        sun = self._emitter("directional", lamp["name"])
+        elements.put_value(sun, "irradiance", flux.tolist())
+        elements.put_matrix(sun, "to_world", _towards(-axis, np.zeros(3)))
 
     def _put_point(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
         radius = lamp["shadow_soft_size"]
@@ -151,11 +169,10 @@ class Lamps:
             elements.put_value(spot, "beam_width", math.degrees(cut) * 0.999)
             elements.put_matrix(spot, "to_world", _towards(axis, matrix[:3, 3] + place, up))
             elements.put_value(elements.put_bitmap(spot, "texture", file, raw=True), "wrap_mode", "clamp")
-        self._say_parts(lamp, len(places))
-
-    def _say_parts(self, lamp: Lamp, count: int) -> None:
-        if count > 1:
-            meaning = f"lights of a kind that is sharp here are {count} each, so that shadows stay soft"
+        if len(places) > 1:
+            meaning = (
+                f"spots with a radius and areas with a spread become {PARTS} spots each, whose shadows are as soft"
+            )
             self._scene.changes.note(meaning, f"lamp {lamp['name']!r}")
 
     def _emitter(self, kind: str, name: str) -> Element:

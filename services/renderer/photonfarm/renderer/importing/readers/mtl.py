@@ -88,8 +88,8 @@ def _libraries(path: Path, stated: str, changes: Changes) -> Iterator[Path]:
         end = next((end for end in ends if _found(path.parent, " ".join(words[:end]))), len(words))
         file = _located(path.parent, " ".join(words[:end]), changes)
         if file is None:
-            name = " ".join(words)
-            raise SpecError(f"{path}: material file {name!r} is not there; put it there, or take its mtllib line out")
+            changes.lose("colour", "mtllib", "material files are not there", " ".join(words))
+            return
         yield file
         words = words[end:]
 
@@ -148,7 +148,7 @@ class Material:
         return [float(part) for part in np.array(_OF_XYZ) @ values] if form == "xyz" else values
 
     def image(self, key: str) -> Image | None:
-        """The image of a line; raises SpecError if it is not there."""
+        """The image of a line; None if it is not there, which is said."""
         line, word, rest = self.lines.get(key, (0, key, ""))
         if not rest:
             return None
@@ -158,8 +158,8 @@ class Material:
             rest = rest[found.end() :]
         file = _located(self.file.parent, rest, self.changes)
         if file is None:
-            remedy = "put it there, or take its line out"
-            raise SpecError(f"{self.file}: line {line}: material {self.name!r}: image {rest!r} is not there; {remedy}")
+            self.changes.lose("colour", word, "images are not there", f"{self.file.name}: line {line}: {rest}")
+            return None
         made = Image(file, options)
         for name, value in options.items():
             neutral = (*_CHANNELS, "l") if name == "imfchan" else ("0", "0.0", "off")

@@ -182,8 +182,8 @@ def _parts(file: _File, materials: dict[str, Material]) -> Iterator[tuple[str, S
     for name in sorted({names[at][1] for at in np.unique(part)} - set(materials)):
         materials[name] = Material(name, file.path, file.changes)
         if name:
-            meaning = f"{name!r} is in no material file, and its surfaces are grey"
-            file.changes.lose("colour", "usemtl", meaning, f"line {file.uses[name]}")
+            meaning = "materials are in no material file, and their surfaces are grey"
+            file.changes.lose("colour", "usemtl", meaning, f"{name!r}, line {file.uses[name]}")
     mapped = np.array([name in materials and materials[name].relief != "" for _, name in names])
     a, b, c = tables[1][corner[..., 1]].swapaxes(0, 1)
     mirrored = mapped[part] & ((b - a)[:, 0] * (c - a)[:, 1] > (b - a)[:, 1] * (c - a)[:, 0])  # v is downwards

@@ -40,10 +40,10 @@ class Row:
     area: tuple[float, float]
     box: float  # the largest difference of the bounds, as a share of their diagonal
     albedo: float  # the 90th percentile of differences of diffuse reflectance, over pixels
-    radiance: tuple[float, ...]  # of each picture, the mean of ours over that of Cycles
+    radiance: tuple[float, ...]  # of each picture, the mean of ours over that of Cycles; NaN where both are dark
 
     def __str__(self) -> str:
-        light = " ".join(f"{ratio:.3f}" for ratio in self.radiance)
+        light = " ".join("dark" if np.isnan(ratio) else f"{ratio:.3f}" for ratio in self.radiance)
         triangles, area = "/".join(map(str, self.triangles)), "/".join(f"{part:.5g}" for part in self.area)
         return f"{self.file:40} {self.reader:8} {triangles:>13} {area:>15} {self.box:8.1e} {self.albedo:7.3f}  {light}"
 
@@ -120,7 +120,8 @@ def compare(file: Path, theirs: dict[str, Any], folder: Path, *, sky: bool = Fal
     for view, exr in zip(theirs["views"], theirs["pictures"], strict=True):
         ours, other = picture(scene, (np.array(view) + moved).tolist()), cycles_picture(exr)
         seen = ours[..., 6] > 0
-        ratios.append(float(ours[seen, :3].mean() / max(other[seen, :3].mean(), 1e-9)))
+        means = [float(values[seen, :3].mean()) if seen.any() else 0.0 for values in (ours, other)]
+        ratios.append(np.nan if max(means) < 1e-6 else means[0] / max(means[1], 1e-9))
         differences.append(np.abs(ours[seen, 3:6] - other[seen, 3:]).ravel())
     objects = theirs["objects"].values()
     return Row(
@@ -129,7 +130,7 @@ def compare(file: Path, theirs: dict[str, Any], folder: Path, *, sky: bool = Fal
         (sum(shape.face_count() for shape in shapes if shape.is_mesh()), sum(each["triangles"] for each in objects)),
         (sum(float(shape.surface_area()[0]) for shape in shapes), sum(each["area"] for each in objects)),
         float(np.abs(bounds - moved).max() / np.linalg.norm(high - low)),
-        float(np.percentile(np.concatenate(differences), 90)),
+        float(np.percentile(np.concatenate([[0.0], *differences]), 90)),
         tuple(ratios),
     )
 

@@ -208,10 +208,42 @@ def test_a_lamp_of_blender_lights_a_room_as_in_cycles(rooms: tuple[Path, dict[st
     assert row.radiance == pytest.approx([1.0, 1.0], abs=0.05)
 
 
+def show_all(names: list[str], out: Path, size: int = 256) -> None:
+    """Write a picture of files and rooms of `LAMPS`, two a row: as imported on the left, and by Cycles on the right.
+
+    Both are looked at from one place, under a white sky unless there are lamps, and with one exposure.
+    """
+    from PIL import Image
+
+    from photonfarm.shared.core.pictures import display_values
+
+    pairs = []
+    with TemporaryDirectory() as folder:
+        makes = [{"make": f"{folder}/{name}.blend", "lamp": LAMPS[name]} for name in names if name in LAMPS]
+        files = [Path(f"{folder}/{name}.blend" if name in LAMPS else name) for name in names]
+        looks = [{"look": str(file), "pictures": f"{folder}/cycles-{k}", "size": size, "sky": file.suffix != ".blend",
+                  "views": VIEWS[:1] if names[k] in LAMPS else None} for k, file in enumerate(files)]  # fmt: skip
+        found = run_in_blender(makes + looks, Path(folder))[len(makes) :]
+        for number, (file, theirs) in enumerate(zip(files, found, strict=True)):
+            _, scene = imported(file, Path(folder) / str(number), sky=file.suffix != ".blend")
+            ours, other = (
+                picture(scene, theirs["views"][0], size)[..., :3],
+                cycles_picture(theirs["pictures"][0])[..., :3],
+            )
+            exposure = 0.2 / max(float(np.median(other.mean(axis=2))), 1e-6)
+            pairs.append(np.concatenate([ours, np.ones((size, 4, 3)) * 1e6, other], axis=1) * exposure)
+    rows = [np.concatenate(pairs[k : k + 2], axis=1) for k in range(0, len(pairs), 2)]
+    shown = display_values(np.concatenate(rows).astype(np.float32))
+    Image.fromarray((shown * 255).round().astype(np.uint8)).save(out)
+
+
 if __name__ == "__main__":
     import mitsuba
 
     mitsuba.set_variant("llvm_ad_rgb")
-    with TemporaryDirectory() as made_in:
-        for made_row in compare_all([Path(name) for name in sys.argv[1:]], Path(made_in), sky=True):
-            sys.stdout.write(f"{made_row}\n")
+    if sys.argv[1] == "--pictures":
+        show_all(sys.argv[3:], Path(sys.argv[2]))
+    else:
+        with TemporaryDirectory() as made_in:
+            for made_row in compare_all([Path(name) for name in sys.argv[1:]], Path(made_in), sky=True):
+                sys.stdout.write(f"{made_row}\n")

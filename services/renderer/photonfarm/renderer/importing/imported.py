@@ -30,6 +30,7 @@ class ImportedScene:
     names: dict[str, str] = field(default_factory=dict)  # of properties as the file has them, by Mitsuba's
     up: Vector = (0.0, 1.0, 0.0)
     camera: Vector | None = None  # the position of the source's camera, which is inside the room, most likely
+    _backs: set[str] = field(default_factory=set)  # ids of meshes that are written as sheets behind themselves
 
     def put_shape(
         self,
@@ -47,21 +48,20 @@ class ImportedScene:
         Mitsuba's shine from the front alone, so a second sheet behind the first shines from the back.
         """
         mesh = mesh.usable(made, self.changes, smooth=light is None)
-        sheets = {made: mesh}
-        if light is not None and both_sides and not mesh.encloses():
-            sheets[f"{made}_back"] = mesh.back()
-        for shape_id, sheet in sheets.items():
-            if not len(sheet.faces):
-                continue
+        if not len(mesh.faces):
+            return
+        back = f"{made}_back" if light is not None and both_sides and not mesh.encloses() else ""
+        for shape_id in filter(None, (made, back)):
             shape = SubElement(self.root, "shape", type="ply", id=shape_id)
             elements.put_value(shape, "filename", "")
-            if sheet.normals is None:
+            if mesh.normals is None:
                 elements.put_value(shape, "face_normals", True)
             SubElement(shape, "ref", id=material)
             if light is not None:
                 shape.append(elements.copied(light))
-            self.meshes[shape_id] = sheet
+            self.meshes[shape_id] = mesh
             self.objects[shape_id] = owner
+        self._backs.add(back)
 
     def write_meshes(self, folder: Path) -> None:
         """Write the meshes into a folder, and let their shapes name the files."""
@@ -69,6 +69,7 @@ class ImportedScene:
             mesh = self.meshes.get(shape.get("id", ""))
             name = elements.child(shape, "filename")
             if mesh is not None and name is not None:
+                mesh = mesh.back() if shape.get("id") in self._backs else mesh
                 name.set("value", str(write_ply(mesh, folder / f"{shape.get('id')}.ply")))
 
 

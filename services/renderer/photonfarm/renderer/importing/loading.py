@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import listed
 from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.mending import make_normals_usable, move_to_origin
+from photonfarm.renderer.importing.mending import fit, make_normals_usable
 from photonfarm.renderer.importing.readers.mitsuba_parts import effect_of
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
@@ -26,7 +26,7 @@ def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
     log(f"loading {len(scene.root.findall('shape'))} shapes")
     scene.write_meshes(folder / "meshes")
     loaded = _loaded(scene)
-    for mended in (move_to_origin, make_normals_usable):
+    for mended in (fit, make_normals_usable):
         if mended(scene, loaded):
             scene.write_meshes(folder / "meshes")
             loaded = _loaded(scene)

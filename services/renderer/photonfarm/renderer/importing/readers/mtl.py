@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -35,7 +36,8 @@ _CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
 _OF_XYZ = ((3.2404542, -1.5371385, -0.4985314), (-0.969266, 1.8760108, 0.041556), (0.0556434, -0.2040259, 1.0572252))
 """Linear sRGB of CIE XYZ (IEC 61966-2-1)."""
 
-_BY_MITSUBA = {".png", ".jpg", ".jpeg", ".bmp", ".tga", ".exr", ".hdr", ".rgbe", ".pfm", ".ppm"}
+ROUNDING = 1e-3
+"""How far numbers go beyond their bounds by rounding alone."""
 
 
 def statements(file: Path) -> Iterator[tuple[int, str, str]]:
@@ -147,6 +149,14 @@ class Material:
             )
         return [float(part) for part in np.array(_OF_XYZ) @ values] if form == "xyz" else values
 
+    def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
+        """The numbers of a line from 0 to `most`, to which others are cut, which changes the `effect`."""
+        values = self.colour(key, otherwise)
+        made: list[float] = np.clip(values, 0, most).tolist()
+        if np.abs(np.subtract(made, values)).max() > ROUNDING:
+            self.say((effect, f"is cut to what lies between 0 and {most:g}"), self.lines[key][1])
+        return made
+
     def image(self, key: str) -> Image | None:
         """The image of a line; None if it is not there, which is said."""
         line, word, rest = self.lines.get(key, (0, key, ""))
@@ -181,18 +191,6 @@ class Material:
         """The key of its normal map, or else of its bump map, or nothing."""
         return next((key for key in RELIEFS if key in self.lines), "")
 
-    def light(self, file: Path) -> Element | None:
-        """What it emits, by `Ke` and an image that is written to `file`; None if it does not."""
-        factor, image = np.maximum(self.colour("ke"), 0).astype(np.float32), self.image("map_ke")
-        if image is None:
-            return elements.area_light(factor.tolist()) if factor.any() else None
-        values = images.linear(image.values()[..., :3]) * (factor if factor.any() else np.float32(1))
-        if not values.any():
-            return None
-        emitter = Element("emitter", type="area")
-        image.put_place(elements.put_bitmap(emitter, "radiance", images.save_radiance(values, file), raw=True))
-        return emitter
-
 
 @dataclass(frozen=True, slots=True)
 class Image:
@@ -203,8 +201,13 @@ class Image:
 
     @property
     def is_plain(self) -> bool:
-        """Whether Mitsuba reads the file as it is."""
-        return self.file.suffix.lower() in _BY_MITSUBA and not {"mm", "imfchan"} & set(self.options)
+        """Whether Mitsuba reads the file as it is; of other formats and modes it misreads some without a word."""
+        from PIL import JpegImagePlugin, PngImagePlugin
+
+        for kind in (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile):
+            with suppress(OSError, ValueError, SyntaxError), kind(self.file) as image:
+                return image.mode in ("L", "RGB", "RGBA") and not {"mm", "imfchan"} & set(self.options)
+        return False
 
     def triple(self, option: str, otherwise: float = 0.0) -> list[float]:
         """The numbers of an option, three or those that are missing `otherwise`."""
@@ -222,6 +225,10 @@ class Image:
             base, gain, _ = self.triple("mm", 1.0)
             values[..., :3] = (base + gain * values[..., :3]).clip(0)
         return values
+
+    def lies_as(self, other: Image) -> bool:
+        """Whether both lie in the same way on a surface."""
+        return all(self.options.get(name) == other.options.get(name) for name in ("s", "o", "clamp"))
 
     def put_place(self, bitmap: Element) -> None:
         """Add where a texture lies and how far it reaches. MTL's v goes upwards, and Mitsuba's downwards."""

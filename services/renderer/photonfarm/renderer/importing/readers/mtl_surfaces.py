@@ -12,7 +12,7 @@ import numpy as np
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.readers import images
-from photonfarm.renderer.importing.readers.mtl import RELIEFS, Image, Material, Meaning
+from photonfarm.renderer.importing.readers.mtl import RELIEFS, ROUNDING, Image, Material, Meaning
 
 _PRINCIPLED = {"pr": ("roughness", 0.5), "pm": ("metallic", 0.0), "ps": ("sheen", 0.0), "pc": ("clearcoat", 0.0),
                "aniso": ("anisotropic", 0.0)}  # fmt: skip
@@ -38,8 +38,10 @@ _UNKNOWN: Meaning = ("colour", "is no known statement of MTL, and is left out")
 GLASS, MIRRORS = (4, 6, 7, 9), (3, 5, 8)
 """The models of illumination that are glass, and those that reflect the scene."""
 
+_NO_MODEL: Meaning = (None, "is no known model of illumination, and is taken for 2")
 _UNUSUAL: dict[float, Meaning] = {
     0: (None, "has its colour without light in some programs, and is lit here"),
+    **dict.fromkeys(range(1, 10)),
     10: ("colour", "is seen here, and not its shadows alone"),
 }
 
@@ -49,7 +51,7 @@ GREY = (0.7, 0.7, 0.7)
 SHINES = 0.02
 """Gloss is modelled from this specular reflectance on."""
 
-_WHITE = (1.0, 1.0, 1.0)
+_BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 Change = Callable[[images.Image], images.Image]
 
@@ -63,35 +65,69 @@ class Surface:
     mirrored: bool  # whether images lie mirrored, and normal maps with them
     stem: Path = Path()  # what the names of images begin with that are changed
 
-    def put(self, top: Element) -> None:
-        """Make a material of an empty element."""
+    def put(self, top: Element) -> Element | None:
+        """Make a material of an empty element; the emitter of what shines with it."""
         material = self.material
         for key, (_, word, _) in material.lines.items():
             if key not in _CARRIED:
                 material.say(_LOST.get(key, _UNKNOWN), word)
         illum = material.number("illum", 2)
-        if illum in _UNUSUAL:
-            material.say(_UNUSUAL[illum], f"illum {illum:g}")
+        if meaning := _UNUSUAL.get(illum, _NO_MODEL):
+            material.say(meaning, f"illum {illum:g}")
         opacity, stencil = self._opacity(illum), material.image("map_d") or material.image("map_tr")
+        passes = stencil is not None or opacity < 1
+        tint = material.cut("tf", _WHITE) if passes else _WHITE
+        if max(tint) <= 0:
+            material.say((None, "is black where light passes through, and is taken for white"), "Tf")
+            tint = list(_WHITE)
         if illum in GLASS and opacity == 1:
             material.say((None, "is of glass, and opaque here by its d or Tr"), f"illum {illum:g}")
         elif illum in GLASS and not self._has_image:
             top.set("type", "thindielectric")
             elements.put_value(top, "int_ior", max(material.number("ni", 1.5), 1.01))
-            tint = material.colour("tf", _WHITE)
-            elements.put_value(top, "specular_transmittance", tint if max(tint) > 0 else _WHITE)
+            elements.put_value(top, "specular_transmittance", tint)
             material.say((None, "becomes clear glass without a thickness, of its Ni and Tf"), "illum")
-            return
-        if stencil is not None or opacity < 1:
+            if (light := self._light(1, None)) is not None:
+                material.say((None, "shines in full on glass, where d and Tr say how clear it is"), "Ke")
+            return light
+        if passes:
             top.set("type", "mask")
+            if min(tint) < 1:
+                material.say(("colour", "does not tint the light that passes through"), "Tf")
             if stencil is None:
                 elements.put_value(top, "opacity", float(opacity))
             else:
-                hides = "map_d" not in material.lines
-                self._put_image(top, "opacity", stencil, lambda values: opacity * abs(hides - _grey(values)), raw=True)
+                self._put_image(top, "opacity", stencil, lambda values: self._alpha(values, opacity), raw=True)
             top = SubElement(top, "bsdf")
         top.set("type", "twosided")
         self._put_gloss(self._put_relief(SubElement(top, "bsdf")), illum)
+        return self._light(opacity, stencil)
+
+    def _light(self, opacity: float, stencil: Image | None) -> Element | None:
+        """What it emits, by `Ke` and an image: Mitsuba's lights shine where their material lets light through."""
+        material, image = self.material, self.material.image("map_ke")
+        ke = np.array(material.cut("ke", _BLACK if image is None else _WHITE, math.inf, "light"), np.float32)
+        if image is not None and not ke.any():
+            material.say((None, "is black beside an image, and is taken for white"), "Ke")
+            ke = np.ones(3, np.float32)
+        values = ke[None, None] if image is None else images.linear(image.values()[..., :3]) * ke
+        if not values.any():
+            return None
+        alpha = np.full((1, 1), opacity) if stencil is None else self._alpha(stencil.values(raw=True), opacity)
+        if image is not None and stencil is not None and not image.lies_as(stencil):
+            material.say(("light", "lies unlike the image of opacity, whose mean is taken"), "map_Ke")
+            alpha = alpha.mean(keepdims=True)
+        size = np.maximum(values.shape, (*alpha.shape, 3))
+        values, image = _scaled(values, size) * _scaled(alpha[..., None], size), image or stencil
+        if image is None:
+            return elements.area_light(values.ravel().tolist())
+        emitter, file = Element("emitter", type="area"), self.stem.with_name(f"{self.stem.name}_light.exr")
+        image.put_place(elements.put_bitmap(emitter, "radiance", images.save_radiance(values, file), raw=True))
+        return emitter
+
+    def _alpha(self, values: images.Image, opacity: float) -> images.Image:
+        """Its opacity (H, W), given the image of it."""
+        return np.float32(opacity) * abs(("map_d" not in self.material.lines) - _grey(values)).clip(0, 1)
 
     @property
     def _has_image(self) -> bool:
@@ -100,15 +136,15 @@ class Surface:
     def _opacity(self, illum: float) -> float:
         """Its `d`, or 1 − `Tr`, unless that hides what is there to be seen."""
         material = self.material
-        d, tr = material.lines.get("d"), material.number("tr", 0)
-        opacity = min(max(material.number("d", 1 - tr), 0.0), 1.0)
+        d, tr = material.lines.get("d"), material.cut("tr", (0.0,))[0]
+        opacity = material.cut("d", (1 - tr,))[0]
         if d and d[2].lower().startswith("-halo") and opacity < 1:
             material.say(("colour", "is as opaque at its edges as in its middle"), "d -halo")
         if d and "tr" in material.lines and abs(opacity + tr - 1) > 0.01:
             material.say((None, f"is left out, as d says how opaque it is: {opacity:g}"), f"Tr {tr:g}")
         if opacity > 0 or (illum in GLASS and not self._has_image):
             return opacity
-        if not d or self._has_image or max(material.colour("ke")) > 0:
+        if not d or self._has_image or max(material.colour("ke")) > 0 or "map_ke" in material.lines:
             material.say((None, "would be unseen by this, and is opaque"), "d 0" if d else "Tr 1")
             return 1
         material.say((None, "is not seen, as the file says"), "d 0")
@@ -146,25 +182,27 @@ class Surface:
             normals = up + factor * (2 * values[..., :3] - 1 - up)
             return normals / np.linalg.norm(normals, axis=2, keepdims=True) / 2 + np.float32(0.5)
 
+        if min(image.triple("s", 1.0)) < 0:
+            self.material.say((None, "mirrors the image, and not the directions in it"), f"{self.material.relief} -s")
         place.set("type", "normalmap")
         self._put_image(place, "normalmap", image, change if strength != 1 or self.mirrored else None, raw=True)
         return SubElement(place, "bsdf")
 
     def _put_gloss(self, place: Element, illum: float) -> None:
-        material, ks = self.material, self.material.colour("ks")
+        material, ks = self.material, self.material.cut("ks", _BLACK)
         alpha = max(math.sqrt(2 / (max(material.number("ns", 30.0), 0.0) + 2)), 0.02)
         if _PBR & set(material.lines):
             self._put_principled(place)
-        elif max(ks) <= SHINES or illum < 2:
+        elif max(ks) <= SHINES or illum in (0, 1):
             place.set("type", "diffuse")
             self._put_colour(place, "reflectance")
         elif illum in MIRRORS:
             place.set("type", "blendbsdf")
-            elements.put_value(place, "weight", float(min(max(ks), 1)))
+            elements.put_value(place, "weight", max(ks))
             self._put_colour(SubElement(place, "bsdf", type="diffuse"), "reflectance")
             mirror = SubElement(place, "bsdf", type="roughconductor")
             elements.put_value(mirror, "material", "none")
-            elements.put_value(mirror, "specular_reflectance", (np.clip(ks, 0, None) / max(ks)).tolist())
+            elements.put_value(mirror, "specular_reflectance", [part / max(ks) for part in ks])
             elements.put_value(mirror, "alpha", alpha)
             material.say((None, "reflects as a metal does, and leaves the rest to Kd"), "Ks")
         elif self.coloured:  # Mitsuba's plastic needs a mean of its colour, and cannot take that of vertices
@@ -173,7 +211,7 @@ class Surface:
             place.set("type", "roughplastic")
             elements.put_value(place, "alpha", alpha)
             if min(ks) < max(ks):
-                elements.put_value(place, "specular_reflectance", (np.clip(ks, 0, None) / max(ks)).tolist())
+                elements.put_value(place, "specular_reflectance", [part / max(ks) for part in ks])
             self._put_colour(place, "diffuse_reflectance")
             material.say((None, "becomes the gloss of plastic, as Phong's has no exact counterpart"), "Ks")
 
@@ -186,8 +224,8 @@ class Surface:
             if image is not None:
                 self._put_image(place, name, image, raw=True)
             else:
-                elements.put_value(place, name, float(np.clip(material.number(key, least), 0, 1)))
-        elements.put_value(place, "clearcoat_gloss", 1 - float(np.clip(material.number("pcr", 0), 0, 1)))
+                elements.put_value(place, name, material.cut(key, (least,))[0])
+        elements.put_value(place, "clearcoat_gloss", 1 - material.cut("pcr", (0.0,))[0])
         elements.put_value(place, "eta", float(material.number("ni", 1.5)) if material.number("ni", 1) > 1 else 1.5)
         if material.number("aniso", 0) and material.number("anisor", 0):
             material.say(("colour", "its gloss is not turned"), "anisor")
@@ -197,13 +235,14 @@ class Surface:
     def _kd(self) -> Sequence[float]:
         """Its colour; black stands for white beside an image, as some programs write it."""
         beside = self.coloured or self.material.image("map_kd") is not None
-        kd = self.material.colour("kd", _WHITE if beside else GREY)
-        return _WHITE if beside and max(kd) <= 0 else kd
+        kd = self.material.cut("kd", _WHITE if beside else GREY)
+        if not beside or max(kd) > 0:
+            return kd
+        self.material.say((None, "is black beside an image or colours of vertices, and is taken for white"), "Kd")
+        return _WHITE
 
     def _put_colour(self, place: Element, name: str) -> None:
         kd, image = self._kd(), self.material.image("map_kd")
-        if max(kd) > 1:
-            self.material.say(("colour", "goes beyond 1, which no surface reflects, and is cut"), "Kd")
         if image is not None:
             tint = None if min(kd) >= 1 else lambda values: images.tinted(values, kd)
             self._put_image(place, name, image, tint)
@@ -211,7 +250,7 @@ class Surface:
             texture = SubElement(place, "texture", name=name, type="mesh_attribute")
             elements.put_value(texture, "name", "vertex_color")
         else:
-            elements.put_value(place, name, np.clip(kd, 0, 1).tolist())
+            elements.put_value(place, name, kd)
             if "kd" not in self.material.lines and self.material.lines:
                 self.material.say((None, "is not there; the surface is grey"), "Kd")
 
@@ -222,6 +261,8 @@ class Surface:
         if change is not None or not image.is_plain:
             values = image.values(raw=raw)
             values = change(values) if change is not None else values[..., :3]
+            if not raw and values.max() > 1 + ROUNDING:
+                self.material.say(("colour", "goes beyond 1, which no surface reflects, and is cut"), "map_Kd")
             file = images.save(values.clip(0, 1), self.stem.with_name(f"{self.stem.name}_{name}.png"))
         image.put_place(elements.put_bitmap(place, name, file, raw=raw))
 
@@ -229,6 +270,12 @@ class Surface:
 def _grey(values: images.Image) -> images.Image:
     """The one channel that a scalar image means: its opacity where it has that, or its brightness."""
     return values[..., 3] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2)
+
+
+def _scaled(values: images.Image, size: Sequence[int]) -> images.Image:
+    """An image of another size, each texel that of the same place."""
+    rows, columns = (np.arange(size[axis]) * values.shape[axis] // size[axis] for axis in (0, 1))
+    return values[rows][:, columns]
 
 
 def _are_normals(values: images.Image) -> bool:

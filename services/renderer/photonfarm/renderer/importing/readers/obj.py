@@ -44,7 +44,7 @@ _NO_NUMBER = re.compile(r"[+-]?(nan|\d\.#(ind|qnan|snan))", re.IGNORECASE)
 _Tables = tuple[Floats, Floats, Floats, Floats | None]
 """Points, texture coordinates, normals, and colours of points, if they have some."""
 
-_CORNER = re.compile(r"-?\d+(/(-?\d+)?){0,2}")
+_CORNER = re.compile(r"-?\d{1,18}(/(-?\d{1,18})?){0,2}")
 _MISSING = ("/0/0", "/0", "")
 """What a corner lacks, by the slashes in it; 0 is no index of OBJ."""
 
@@ -59,8 +59,7 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     for _, surface, _ in parts:
         if surface not in known:
             made = ids.make(surface.material.name, "material")
-            replace(surface, stem=scratch / made).put(SubElement(scene.root, "bsdf", id=made))
-            known[surface] = made, surface.material.light(scratch / f"{made}_light.exr")
+            known[surface] = made, replace(surface, stem=scratch / made).put(SubElement(scene.root, "bsdf", id=made))
     for owner, surface, mesh in parts:
         shape_id = ids.make("_".join(filter(None, (owner or path.stem, surface.material.name))))
         made, light = known[surface]
@@ -135,7 +134,7 @@ class _File:
             text = " ".join([corner + _MISSING[corner.count("/")] for corner in chain.from_iterable(faces)]) + " "
             text = text.replace("//", "/0/").replace("/ ", "/0 ").replace("/", " ")
             named = np.array(text.split(), np.int64).reshape(-1, 3)
-        except (ValueError, IndexError) as error:
+        except (ValueError, IndexError, OverflowError) as error:
             bad = [not _CORNER.fullmatch(corner) for corner in chain.from_iterable(faces)].index(True)
             raise SpecError(f"{self.path}: line {marks[bad, 0]}: f has a corner that is none of v/vt/vn") from error
         index = np.where(named < 0, marks[:, 1:4] + named, named - 1)
@@ -229,7 +228,9 @@ def _mesh(corner: Ints, tables: _Tables, material: Material) -> Mesh:
     coloured, image = np.isfinite(colour).any(), material.image("map_kd")
     if coloured and image is not None:
         material.say((None, "colours of vertices are left out beside the image"), "v")
-    kd = np.array(material.colour("kd", (1.0, 1.0, 1.0)))
+    if coloured and image is None and not np.isfinite(colour).all():
+        material.say((None, "some vertices have no colour, and are white"), "v")
+    kd = np.array(material.cut("kd", (1.0, 1.0, 1.0)))
     return Mesh(
         points[v],
         which.reshape(-1, 3).astype(np.uint32),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -303,6 +304,8 @@ def test_texts_of_all_kinds_are_read(obj: Obj, loaded: Loaded, text: bytes) -> N
         (FOUR_V + "f 1//1 2//1 3//1", "line 5: f names vn 1, and there are 0"),
         (FOUR_V + "f 1/1/1/1 2 3", "line 5: f has a corner"),
         (FOUR_V + "f 1.5 2 3", "line 5: f has a corner"),
+        (FOUR_V + "f 1 2 99999999999999999999", "line 5: f has a corner"),
+        (FOUR_V + "f 1 2 999999999999999999", "line 5: f names v 999999999999999999"),
         ("v 0 0 x\nf 1 1 1", "line 1: v has 'x'"),
         ("v 0 0 0\nv nan 0 0\nf 1 1 2", "line 2: v has no three finite"),
         ("v 0 0\nf 1 1 1", "line 1: v has no three finite"),
@@ -353,6 +356,12 @@ def test_colours_of_vertices_are_those_of_the_surface(
     assert not lost(scene)
 
 
+def test_vertices_without_a_colour_beside_others_are_said(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
+    assert "some vertices have no colour" in said(read(obj("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3")))
+    apart = "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\no a\nf 1 2 3\nv 0 0 1\nv 1 0 1\nv 0 1 1\no b\nf 4 5 6"
+    assert not said(read(obj(apart)))
+
+
 @pytest.mark.parametrize("colour", ["1 0", "1 0 0 0.5"])
 def test_numbers_of_vertices_without_a_meaning_are_said(
     obj: Obj, read: Callable[[Path], ImportedScene], colour: str
@@ -378,6 +387,7 @@ def test_transparency_beside_an_image_is_not_meant(case: Callable[[str], Path], 
         ("Tr 1", 1),
         ("Tr 1\nd 1", 1),
         ("Ke 1 1 1\nd 0", 1),
+        ("map_Ke four.png\nd 0", 1),
         ("d 0", 0),
         ("d 0.3", 0.3),
         ("Tr 0.3", 0.7),
@@ -423,6 +433,14 @@ def test_colours_in_each_form_are_read(write: Write, loaded: Loaded, line: str, 
     [
         ("Kd spectral a.rfl 1", {"Kd spectral": "colour"}),
         ("Kd 2 1 1", {"Kd": "colour"}),
+        ("Pr 1.7", {"Pr": "colour"}),
+        ("Ke -1 0 5", {"Ke": "light"}),
+        ("Kd 1 1 1\nKs 3 3 3\nillum 3", {"Ks": "colour"}),
+        ("d 0.5\nTf 1 0 0", {"Tf": "colour"}),
+        ("d 0.5\nTf 1 1 1\nmap_d four.png", {}),
+        ("d 1\nTf 0 0 0", {}),
+        ("map_Kd -mm 0 2 four.png", {"map_Kd": "colour"}),
+        ("map_Ke -o .5 0 four.png\nmap_d four.png", {"map_Ke": "light"}),
         ("map_Ks x.png\nmap_Ns x.png\ndecal x.png\nrefl -type sphere x.png",
          {"map_Ks": "colour", "map_Ns": "colour", "decal": "colour", "refl": "colour"}),
         ("disp x.png", {"disp": "geometry"}),
@@ -440,6 +458,25 @@ def test_statements_of_materials_are_carried_over_or_said(
 ) -> None:
     scene, _ = loaded(write(WHOLE, f"newmtl it\n{lines}"))
     assert lost(scene) == expected
+
+
+@pytest.mark.parametrize(
+    ("lines", "guess"),
+    [
+        ("Kd 0 0 0\nmap_Kd four.png", "Kd: is black where black is not meant, and is taken for white"),
+        ("Ke 0 0 0\nmap_Ke four.png", "Ke: is black where black is not meant"),
+        ("d 0.5\nTf 0 0 0", "Tf: is black where black is not meant"),
+        ("illum 11", "illum 11: is no known model"),
+        ("norm -s -1 1 1 four.png", "norm -s: mirrors the image, and not the directions in it"),
+        ("illum 4\nd 0\nKe 1 1 1", "Ke shines in full"),
+    ],
+)
+def test_guesses_about_materials_are_said(
+    write: Write, read: Callable[[Path], ImportedScene], lines: str, guess: str
+) -> None:
+    scene = read(write(WHOLE, f"newmtl it\n{lines}"))
+    assert guess in said(scene)
+    assert not lost(scene)
 
 
 @pytest.mark.parametrize("line", ["Kd 1 0", "Kd nan 0 0", "d x"])
@@ -542,6 +579,57 @@ def test_images_are_found_by_all_their_names(
     assert ("beside the file" in said(scene)) == (("/" in stated or ":" in stated) and there == Path(there).name)
 
 
+@pytest.mark.parametrize(
+    ("name", "mode", "kind"),
+    [
+        ("a.bmp", "P", "BMP"),
+        ("a.bmp", "RGB", "PPM"),
+        ("a.png", "RGB", "WEBP"),
+        ("a.jpg", "RGB", "PNG"),
+        ("a.png", "RGB", "TIFF"),
+        ("a.tga", "P", "TGA"),
+        ("a.jpg", "CMYK", "JPEG"),
+    ],
+)
+def test_images_of_all_formats_are_read_by_what_they_hold(
+    tmp_path: Path, write: Write, loaded: Loaded, name: str, mode: str, kind: str
+) -> None:
+    file = write(WHOLE, f"newmtl it\nmap_Kd {name}")
+    lossless = {"lossless": True} if kind == "WEBP" else {"quality": 100, "subsampling": 0} if kind == "JPEG" else {}
+    four = Image.open(tmp_path / "four.png").resize((16, 16), Image.Resampling.NEAREST)
+    four.convert(mode).save(tmp_path / name, kind, **lossless)
+    _, made = loaded(file)
+    for at, colour in zip(CORNERS, FOUR, strict=True):
+        assert reflectance(made, *at) == pytest.approx(FOUR[colour], abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        (b"P6 1 1 100\n" + bytes([50, 100, 0]), (0.216, 1, 0)),
+        (b"P3\n# grey\n1 1\n255\n128 128 128\n", (0.216, 0.216, 0.216)),
+        (b"BM" + struct.pack("<IHHI", 58, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, 1, 1, 1, 16, 0, 4, 0, 0, 0, 0)
+         + struct.pack("<HH", 31 << 10, 0), (1, 0, 0)),
+        (struct.pack("<BBBHHBHHHHBB", 0, 0, 2, 0, 0, 0, 0, 0, 1, 1, 24, 0x20) + bytes([255, 0, 0]), (0, 0, 1)),
+    ],
+)  # fmt: skip
+def test_images_of_old_forms_have_their_colours(
+    tmp_path: Path, write: Write, loaded: Loaded, data: bytes, expected: tuple[float, ...]
+) -> None:
+    kind = {b"P": "ppm", b"B": "bmp"}.get(data[:1], "tga")
+    (tmp_path / f"a.{kind}").write_bytes(data)
+    scene, made = loaded(write(WHOLE, f"newmtl it\nmap_Kd a.{kind}"))
+    assert reflectance(made, 0.5, 0.4) == pytest.approx(expected, abs=0.01)
+    assert not lost(scene)
+
+
+def test_images_beyond_1_are_cut_and_said(tmp_path: Path, write: Write, loaded: Loaded) -> None:
+    images.save_radiance(np.full((2, 2, 3), (2, 0.5, 0), np.float32), tmp_path / "two.exr")
+    scene, made = loaded(write(WHOLE, "newmtl it\nmap_Kd two.exr"))
+    assert reflectance(made, 0.5, 0.4) == pytest.approx([1, 0.5, 0], abs=0.01)
+    assert lost(scene) == {"map_Kd": "colour"}
+
+
 def test_faces_without_texture_coordinates_are_said(write: Write, loaded: Loaded) -> None:
     scene, made = loaded(write("usemtl it\nf 1 2 3\nf 1/1 3/3 4/4", "newmtl it\nKd 1 1 1\nmap_Kd four.png"))
     assert reflectance(made, 0.25, 0.75) == pytest.approx([1, 0, 0], abs=0.01)
@@ -565,6 +653,30 @@ def test_images_of_light_shine_to_both_sides(
         expected = tuple(images.linear(np.array(expected, np.float32) * 5).tolist())
     for side in (5, -5):
         assert emission(made, 0.25, 0.75, side) == pytest.approx(expected, rel=0.01)
+    assert not lost(scene)
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("Ke 4 4 4\nd 0.25", (1, 1, 1)),
+        ("Ke 4 4 4\nTr 0.25", (3, 3, 3)),
+        ("Ke 5 5 5\nmap_d -imfchan r four.png", (5, 5, 5)),
+        ("Ke 5 5 5\nmap_d -imfchan g four.png", (0, 0, 0)),
+        ("Ke 5 5 5\nmap_Tr -imfchan g four.png", (5, 5, 5)),
+        ("Ke 5 5 5\nmap_Ke four.png\nmap_d -imfchan r big.png", (5, 0, 0)),
+        ("Ke 5 5 5\nmap_Ke big.png\nmap_d -imfchan g four.png\nd 0.5", (0, 0, 0)),
+        ("Kd 1 1 1\nKe 4 4 4\nillum 4\nd 0", (4, 4, 4)),
+    ],
+)
+def test_surfaces_shine_as_far_as_they_are_opaque(
+    tmp_path: Path, write: Write, loaded: Loaded, lines: str, expected: tuple[float, ...]
+) -> None:
+    file = write(WHOLE, f"newmtl it\n{lines}")
+    Image.open(tmp_path / "four.png").resize((6, 5), Image.Resampling.NEAREST).save(tmp_path / "big.png")
+    scene, made = loaded(file)
+    for side in (5, -5):
+        assert emission(made, 0.25, 0.75, side) == pytest.approx(expected, rel=0.01, abs=0.01)
     assert not lost(scene)
 
 

@@ -7,6 +7,7 @@ point is the limit r → 0. Objects scale areas and the cones of spots, not radi
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
@@ -21,6 +22,7 @@ from photonfarm.renderer.importing.readers import images
 
 Floats = NDArray[np.float64]
 Lamp = dict[str, Any]
+Profile = Callable[[Floats, Floats], Floats]
 
 AXES = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From Blender's coordinates, z up, to glTF's, y up."""
@@ -32,6 +34,9 @@ SHARP = math.radians(1.0)
 """A sun that is no wider is one direction; a wider one is a disc of the sky."""
 
 WIDEST, TEXELS, CORNERS = math.radians(89.5), 512, 64
+
+STEEP = math.radians(80)
+"""Wider cones have finer images, as their tangents are large."""
 
 
 class Lamps:
@@ -153,22 +158,17 @@ class Lamps:
         self._put_cones(lamp, on_axis, matrix, places, half, profile)
 
     def _put_cones(
-        self, lamp: Lamp, intensity: Floats, matrix: Floats, places: Floats, cut: float, profile: Any
+        self, lamp: Lamp, intensity: Floats, matrix: Floats, places: Floats, cut: float, profile: Profile
     ) -> None:
         """Add spots at offsets (N, 3) that share an intensity; `profile`: its share at tangents (x, y) off the axis."""
         made = self._ids.make(lamp["name"], "lamp")
-        y, x = np.meshgrid(*[math.tan(cut) * (2 * (np.arange(TEXELS) + 0.5) / TEXELS - 1)] * 2, indexing="ij")
-        file = images.save_radiance(
-            np.repeat(profile(x, y)[..., None], 3, 2).astype(np.float32), self._scratch / f"{made}.exr"
-        )
+        file = cone_image(profile, cut, self._scratch / f"{made}.exr")
         axis, up = -_frame(matrix)[:, 2], _frame(matrix)[:, 1]
         for place in places:
             spot = self._emitter("spot", lamp["name"])
             elements.put_value(spot, "intensity", (intensity / len(places)).tolist())
-            elements.put_value(spot, "cutoff_angle", math.degrees(cut))
-            elements.put_value(spot, "beam_width", math.degrees(cut) * 0.999)
             elements.put_matrix(spot, "to_world", _towards(axis, matrix[:3, 3] + place, up))
-            elements.put_value(elements.put_bitmap(spot, "texture", file, raw=True), "wrap_mode", "clamp")
+            put_cone(spot, cut, file)
         if len(places) > 1:
             meaning = (
                 f"spots with a radius and areas with a spread become {PARTS} spots each, whose shadows are as soft"
@@ -185,6 +185,20 @@ class Lamps:
             elements.put_value(made, "reflectance", (0.0, 0.0, 0.0))
             self._scene.root.insert(0, made)
         return self._black
+
+
+def cone_image(profile: Profile, cut: float, file: Path) -> Path:
+    """The image of a spot within an angle; `profile`: its share at tangents (x, y) off the axis."""
+    texels = TEXELS if cut < STEEP else 4 * TEXELS
+    y, x = np.meshgrid(*[math.tan(cut) * (2 * (np.arange(texels) + 0.5) / texels - 1)] * 2, indexing="ij")
+    return images.save_radiance(np.repeat(profile(x, y)[..., None], 3, 2).astype(np.float32), file)
+
+
+def put_cone(spot: Element, cut: float, file: Path) -> None:
+    """Let a spot end at an angle and fade as an image says."""
+    elements.put_value(spot, "cutoff_angle", math.degrees(cut))
+    elements.put_value(spot, "beam_width", math.degrees(cut) * 0.999)
+    elements.put_value(elements.put_bitmap(spot, "texture", file, raw=True), "wrap_mode", "clamp")
 
 
 def _intensity(lamp: Lamp, strength: Floats) -> Floats:

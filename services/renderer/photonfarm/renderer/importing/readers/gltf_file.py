@@ -5,7 +5,8 @@ from __future__ import annotations
 import base64
 import json
 import struct
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, unquote_to_bytes
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing.changes import Changes, Effect
+from photonfarm.renderer.importing.meshes import Floats
 from photonfarm.shared.core.errors import SpecError
 
 Node = Mapping[str, Any]
@@ -40,7 +42,9 @@ HARMLESS = frozenset(
 )  # fmt: skip
 """Those that leave a picture of what is shown first as it is."""
 
-COMPRESSED = frozenset({"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_meshopt_compression"})
+COMPRESSED = frozenset(
+    {"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_meshopt_compression", "KHR_texture_basisu"}
+)
 """Those that may have the same data uncompressed beside them, which is read then."""
 
 _ZEROS = {
@@ -60,22 +64,46 @@ class GltfFile:
         self.path, self.changes = path, changes
         self.document, self._binary = _opened(path)
         self._buffers: dict[int, bytes] = {}
+        with self.at():
+            self._check()
+
+    def _check(self) -> None:
         version = str(self.document.get("asset", {}).get("version", ""))
         if not version.startswith("2."):
-            raise SpecError(f"{path}: is glTF of version {version or 'unknown'!r}; only version 2 is read")
-        refused = [name for name in self.document.get("extensionsRequired", ()) if name not in READ | HARMLESS]
+            raise SpecError(f"{self.path}: is glTF of version {version or 'unknown'!r}; only version 2 is read")
+        refused = ", ".join(str(name) for name in self.all("extensionsRequired") if name not in READ | HARMLESS)
         if refused:
-            raise SpecError(
-                f"{path}: extensionsRequired has {', '.join(refused)}, which is not read; export the file without it"
-            )
+            raise SpecError(f"{self.path}: extensionsRequired has {refused}, which is not read; export without it")
         for name in self.document.get("extensions", ()):
             if name not in READ | HARMLESS:
-                changes.note("what the file as a whole has of it is not read", name=name)
+                self.changes.note("what the file as a whole has of it is not read", name=name)
+
+    @contextmanager
+    def at(self, place: str = "") -> Iterator[None]:
+        """Name the file and a place, such as a node, in the errors of a block. Raises SpecError for what is no glTF."""
+        where = f"{self.path}: {place}: " if place else f"{self.path}: "
+        try:
+            yield
+        except SpecError as error:
+            raise SpecError(where + str(error).removeprefix(f"{self.path}: ")) from error
+        except KeyError as error:
+            raise SpecError(f"{where}is not valid glTF: {error} is missing, or no value that glTF has") from error
+        except (IndexError, TypeError, AttributeError, ValueError) as error:
+            raise SpecError(f"{where}is not valid glTF: {error}") from error
 
     def all(self, kind: str) -> list[Node]:
         """The entries of one array of the document, such as meshes."""
         entries: list[Node] = self.document.get(kind, [])
+        if not isinstance(entries, list):
+            raise SpecError(f"{self.path}: {kind} is {entries!r}; it must be a list")
         return entries
+
+    def entry(self, kind: str, number: int, entries: Sequence[Node] | None = None) -> Node:
+        """One entry of an array of the document, or of others of that kind."""
+        entries = self.all(kind) if entries is None else entries
+        if not isinstance(number, int) or not 0 <= number < len(entries):
+            raise SpecError(f"{self.path}: names {kind}[{number!r}], and the file has {len(entries)} {kind}")
+        return entries[number]
 
     def report(self, entry: Node, effect: Effect, place: str) -> None:
         """Say which extensions of an entry, and of all in it, are not carried over."""
@@ -92,7 +120,8 @@ class GltfFile:
 
     def _buffer(self, number: int) -> bytes:
         if number not in self._buffers:
-            entry = self.all("buffers")[number]
+            entry = self.entry("buffers", number)
+            self.report(entry, "geometry", f"buffer {number}")
             data = self._bytes_of(entry, number)
             if len(data) < entry["byteLength"]:
                 raise SpecError(
@@ -121,9 +150,10 @@ class GltfFile:
             reason = error.strerror or str(error)
             raise SpecError(f"{self.path}: {what}: {name!r} cannot be read: {reason}; put it there") from error
 
-    def _view(self, number: int) -> tuple[bytes, int]:
+    def _view(self, number: int, effect: Effect = "geometry") -> tuple[bytes, int]:
         """The bytes of a buffer view, and its stride."""
-        view = self.all("bufferViews")[number]
+        view = self.entry("bufferViews", number)
+        self.report(view, effect, f"buffer view {number}")
         start, data = view.get("byteOffset", 0), self._buffer(view["buffer"])
         end = start + view["byteLength"]
         if end > len(data):
@@ -132,7 +162,8 @@ class GltfFile:
 
     def array(self, number: int) -> NDArray[Any]:
         """The values of an accessor, (N, width): integers as they are, unless normalised to floats."""
-        accessor = self.all("accessors")[number]
+        accessor = self.entry("accessors", number)
+        self.report(accessor, "geometry", f"accessor {number}")
         width, count = _WIDTHS[accessor["type"]], accessor["count"]
         kind = np.dtype(_TYPES[accessor["componentType"]])
         values = self._strided(accessor, kind, count, width)
@@ -142,6 +173,16 @@ class GltfFile:
                                   sparse["count"], 1)  # fmt: skip
             values[where[:, 0]] = self._strided(sparse["values"], kind, sparse["count"], width)
         return normalised(values) if accessor.get("normalized") else values
+
+    def attribute(self, number: int, name: str, count: int, widths: Collection[int]) -> NDArray[Any]:
+        """The values of an accessor (count, width) that is an attribute, whose width is one of some."""
+        values = self.array(number)
+        if len(values) != count:
+            raise SpecError(f"{self.path}: {name} has {len(values)} values where there are {count}; export it anew")
+        if values.shape[1] not in widths:
+            allowed = " or ".join(map(str, widths))
+            raise SpecError(f"{self.path}: {name} has {values.shape[1]} numbers a value; glTF has {allowed}")
+        return values
 
     def _strided(self, entry: Node, kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
         """Values in a buffer view (count, width); zeros without one."""
@@ -157,9 +198,10 @@ class GltfFile:
 
     def image(self, number: int) -> tuple[str, bytes]:
         """The name and the encoded bytes of an image."""
-        entry = self.all("images")[number]
+        entry = self.entry("images", number)
+        self.report(entry, "colour", f"image {number}")
         if "bufferView" in entry:
-            return entry.get("name", f"image_{number}"), self._view(entry["bufferView"])[0]
+            return entry.get("name", f"image_{number}"), self._view(entry["bufferView"], "colour")[0]
         uri = entry["uri"]
         named = entry.get("name") or ("" if uri.startswith("data:") else Path(unquote(uri)).stem)
         return named or f"image_{number}", self._read(uri, f"image {number}")
@@ -169,6 +211,14 @@ def extension(entry: Node, name: str) -> Node:
     """What an extension says of an entry."""
     found: Node = entry.get("extensions", {}).get(name, {})
     return found
+
+
+def numbers(entry: Node, key: str, default: Sequence[float]) -> Floats:
+    """What an entry has under a key: as many numbers as its default. Raises ValueError for anything else."""
+    values = np.array(entry.get(key, default))
+    if values.dtype.kind not in "if" or values.shape != np.shape(default) or not np.isfinite(values).all():
+        raise ValueError(f"{key} is {entry.get(key)!r}; it must be {len(default)} numbers")
+    return values.astype(np.float64)
 
 
 def normalised(values: NDArray[Any]) -> NDArray[np.float64]:

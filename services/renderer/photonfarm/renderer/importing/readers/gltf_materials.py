@@ -17,8 +17,8 @@ from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.imported import Ids
 from photonfarm.renderer.importing.meshes import Floats
 from photonfarm.renderer.importing.readers import images
-from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node, extension
-from photonfarm.renderer.importing.readers.gltf_textures import Kind, Map, Reach, Textures, uv_set
+from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node, extension, numbers
+from photonfarm.renderer.importing.readers.gltf_textures import TRANSFORM, Kind, Map, Reach, Textures, uv_set
 
 _OLD = "KHR_materials_pbrSpecularGlossiness"
 _CLEARCOAT, _SPECULAR = "KHR_materials_clearcoat", "KHR_materials_specular"
@@ -26,6 +26,8 @@ _CLEARCOAT, _SPECULAR = "KHR_materials_clearcoat", "KHR_materials_specular"
 _RED, _GREEN, _BLUE, _ALPHA = (slice(i, i + 1) for i in range(4))
 _RGB, _RGBA = slice(0, 3), slice(0, 4)
 _WHITE = (1.0, 1.0, 1.0, 1.0)
+
+_NOTHING = Map(np.zeros((1, 1, 1), np.float32))
 
 CUTOFF = 0.5
 """glTF's default of `alphaCutoff`."""
@@ -65,7 +67,7 @@ class Materials:
 
     def entry(self, number: int | None) -> Node:
         """A material of the file; None is that of what has none."""
-        return _UNNAMED if number is None else self.file.all("materials")[number]
+        return _UNNAMED if number is None else self.file.entry("materials", number)
 
     def uv_sets(self, number: int | None) -> list[int]:
         """The sets of texture coordinates that a material's images use, that of its colour first."""
@@ -117,7 +119,7 @@ class Materials:
 
     def _light(self, entry: Node, look: Look, opacity: Map | None, made: str) -> Element | None:
         strength = extension(entry, "KHR_materials_emissive_strength").get("emissiveStrength", 1.0)
-        factor = [strength * part for part in entry.get("emissiveFactor", (0, 0, 0))]
+        factor = (strength * numbers(entry, "emissiveFactor", (0, 0, 0))).tolist()
         glow = self.textures.map(entry.get("emissiveTexture"), factor, _RGB, colour=True)
         if opacity is not None:  # Mitsuba's lights shine where their material lets light through
             opacity = self.textures.beside(glow, opacity, "light", "emissiveTexture", self.place(look))
@@ -147,26 +149,33 @@ class Materials:
 
     def _put_surface(self, place: Element, entry: Node, look: Look, made: str) -> None:
         parts = self._parts(entry, look)
+        if parts["metallic"].values.min() >= 1:
+            parts["spec_trans"] = _NOTHING  # light does not pass through metal
         passes = parts["spec_trans"].values.max() > 0
         volume = extension(entry, "KHR_materials_volume")
         thick = volume.get("thicknessFactor", 0.0) > 0
         if passes and thick and "attenuationDistance" in volume and np.min(volume.get("attenuationColor", 1)) < 1:
             self._lose("KHR_materials_volume", "light is not absorbed inside", look)
-        clear = all(parts[name].found is None for name in ("base_color", "roughness", "spec_trans"))
+        plain = all(parts[name].found is None for name in ("base_color", "roughness", "metallic", "spec_trans"))
+        clear = passes and plain and parts["roughness"].values.max() == 0 and not look.painted
         eta = self._eta(entry, bool(passes), look)
-        if passes and clear and parts["roughness"].values.max() == 0 and not look.painted:
-            place.set("type", "dielectric" if thick else "thindielectric")
-            elements.put_value(place, "int_ior", eta)
-            tint = (parts["spec_trans"].values * parts["base_color"].values[..., _RGB]).ravel()
-            elements.put_value(place, "specular_transmittance", [math.sqrt(x) if thick else float(x) for x in tint])
-            return
-        if passes and not thick:
+        if passes and not thick and not clear:
             meaning = "what is thin and rough, or has images, refracts as what is solid"
             self.file.changes.note(meaning, self.place(look), name="KHR_materials_transmission")
         if not passes:
             place.set("type", "twosided")
             place = SubElement(place, "bsdf")
         place = self._put_normal_map(place, entry, look, made)
+        if clear:
+            if "clearcoat" in parts:
+                self._lose(_CLEARCOAT, "clear glass has no coat of its own", look)
+            parts, place = _put_glass(place, parts, thick, eta)
+        if parts:
+            self._put_principled(place, parts, eta, look, made)
+
+    def _put_principled(self, place: Element, parts: dict[str, Map], eta: float, look: Look, made: str) -> None:
+        if "clearcoat" in parts:
+            self.file.changes.note("is that of `principled`, which is similar", self.place(look), name=_CLEARCOAT)
         if parts["metallic"].values.min() < 1:
             meaning = "reflects up to a tenth more than glTF says, as Mitsuba's `principled` does at grazing angles"
             self.file.changes.note(meaning, self.place(look))
@@ -200,7 +209,7 @@ class Materials:
 
     def _converted(self, colour: Map, gloss: Node, look: Look) -> dict[str, Map]:
         """The parameters of `principled` for specular-glossiness, texel by texel."""
-        factor = (*gloss.get("specularFactor", _WHITE[:3]), gloss.get("glossinessFactor", 1.0))
+        factor = (*numbers(gloss, "specularFactor", _WHITE[:3]), gloss.get("glossinessFactor", 1.0))
         specular = self.textures.map(gloss.get("specularGlossinessTexture"), factor, _RGBA, colour=True)
         beside = self.textures.beside(colour, specular, "colour", _OLD, self.place(look))
         base, metal = from_specular_glossiness(colour.values[..., _RGB], beside.values[..., _RGB])
@@ -218,14 +227,13 @@ class Materials:
         rough = self.textures.map(coat.get("clearcoatRoughnessTexture"), factor, _GREEN)
         if "clearcoatNormalTexture" in coat:
             self._lose("clearcoatNormalTexture", "the coat has the normals of what is under it", look)
-        self.file.changes.note("is that of `principled`, which is similar", self.place(look), name=_CLEARCOAT)
         gloss = replace(rough, values=((0.1 - rough.values**2) / 0.099).clip(0, 1))
         return {"clearcoat": strength, "clearcoat_gloss": gloss}
 
     def _eta(self, entry: Node, passes: bool, look: Look) -> float:
         """The index of refraction; `KHR_materials_specular` changes it where no light passes through."""
         ior, gloss = extension(entry, "KHR_materials_ior").get("ior", 1.5), extension(entry, _SPECULAR)
-        colour = np.array(gloss.get("specularColorFactor", (1, 1, 1)), np.float64)
+        colour = numbers(gloss, "specularColorFactor", (1, 1, 1))
         reflectance = min(((ior - 1) / (ior + 1)) ** 2 * colour.mean(), 1.0) * gloss.get("specularFactor", 1.0)
         root = math.sqrt(min(reflectance, 0.99))
         tinted = np.ptp(colour) > 0 or any(name.endswith("Texture") for name in gloss)
@@ -241,6 +249,10 @@ class Materials:
         scale = found.get("scale", 1.0)
         if normals.found is None or scale == 0:
             return place
+        moved = extension(normals.found, TRANSFORM)
+        if moved.get("rotation", 0) or min(moved.get("scale", (1, 1))) < 0:
+            meaning = "a normal map that is turned or mirrored by it keeps the directions of its texture coordinates"
+            self.file.changes.note(meaning, self.place(look), name=TRANSFORM)
         values = normals.values
         if scale != 1:
             vectors = (2 * values - 1) * np.array([scale, scale, 1], np.float32)
@@ -253,6 +265,25 @@ class Materials:
 
     def _lose(self, name: str, meaning: str, look: Look) -> None:
         self.file.changes.lose("colour", name, meaning, self.place(look))
+
+
+def _put_glass(place: Element, parts: dict[str, Map], thick: bool, eta: float) -> tuple[dict[str, Map], Element]:
+    """Put clear glass; what is left of the surface beside it, which may be nothing, and its place.
+
+    glTF mixes a metal and a dielectric, and the latter's inside of what passes light and of what is diffuse.
+    """
+    passes, metal, colour = (parts[name].values.ravel() for name in ("spec_trans", "metallic", "base_color"))
+    share, rest, beside = float(passes[0] * (1 - metal[0])), dict[str, Map](), place
+    if share < 1:
+        place.set("type", "blendbsdf")
+        elements.put_value(place, "weight", share)
+        beside = SubElement(SubElement(place, "bsdf", type="twosided"), "bsdf")
+        place = SubElement(place, "bsdf")
+        rest = parts | {"spec_trans": _NOTHING, "metallic": Map(parts["metallic"].values / (1 - share))}
+    place.set("type", "dielectric" if thick else "thindielectric")
+    elements.put_value(place, "int_ior", eta)
+    elements.put_value(place, "specular_transmittance", [math.sqrt(x) if thick else float(x) for x in colour[_RGB]])
+    return rest, beside
 
 
 def from_specular_glossiness(diffuse: images.Image, specular: images.Image) -> tuple[images.Image, images.Image]:
@@ -272,9 +303,9 @@ def _base(entry: Node) -> tuple[Node | None, tuple[float, ...]]:
     """The image of a material's colour, and its factor."""
     if _OLD in entry.get("extensions", {}):
         gloss = extension(entry, _OLD)
-        return gloss.get("diffuseTexture"), gloss.get("diffuseFactor", _WHITE)
+        return gloss.get("diffuseTexture"), tuple(numbers(gloss, "diffuseFactor", _WHITE))
     surface = entry.get("pbrMetallicRoughness", {})
-    return surface.get("baseColorTexture"), surface.get("baseColorFactor", _WHITE)
+    return surface.get("baseColorTexture"), tuple(numbers(surface, "baseColorFactor", _WHITE))
 
 
 def _references(entry: Node) -> Iterator[Node]:

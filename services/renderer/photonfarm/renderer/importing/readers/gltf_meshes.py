@@ -21,6 +21,12 @@ _LISTS, _STRIPS, _FANS = 4, 5, 6
 
 _OTHERS = ("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP")
 
+_WIDTHS = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "TEXCOORD": (2,), "COLOR": (3, 4), "JOINTS": (4,),
+           "WEIGHTS": (4,)}  # fmt: skip
+"""How many numbers attributes have; those of other names have no effect."""
+
+_NOT_PLAIN = "only a plain colour of metallic-roughness is multiplied by colours of vertices, which are left out"
+
 ONE_COLOUR = 2e-3
 """Colours of vertices that differ by no more are one colour."""
 
@@ -61,11 +67,12 @@ class Meshes:
         self.file.report(primitive, "geometry", place)
         mode = primitive.get("mode", _LISTS)
         if mode not in (_LISTS, _STRIPS, _FANS) or "POSITION" not in attributes:
-            name = _OTHERS[mode] if mode < len(_OTHERS) else "POSITION"
+            names = {**dict(enumerate(_OTHERS)), **dict.fromkeys((_LISTS, _STRIPS, _FANS), "POSITION")}
+            name = names.get(mode, f"mode {mode}")
             self.file.changes.lose("geometry", name, "points, lines and what has no positions have no surface", place)
             return []
         self._refuse_compressed(primitive)
-        values = {name: self._attribute(primitive, name, weights) for name in attributes}
+        values = {name: self._attribute(primitive, name, weights) for name in attributes if _stem(name) in _WIDTHS}
         mesh = Mesh(values["POSITION"], self._faces(primitive, mode, len(values["POSITION"])), values.get("NORMAL"))
         mesh = replace(mesh, uv=self._uv(values, primitive.get("material"), mesh, place))
         mesh, look = self._coloured(mesh, values.get("COLOR_0"), primitive.get("material"), place)
@@ -73,26 +80,31 @@ class Meshes:
 
     def _refuse_compressed(self, primitive: Node) -> None:
         names = COMPRESSED & set(primitive.get("extensions", ()))
-        position = self.file.all("accessors")[primitive["attributes"]["POSITION"]]
+        position = self.file.entry("accessors", primitive["attributes"]["POSITION"])
         if names and not {"bufferView", "sparse"} & set(position):
             raise SpecError(f"{self.file.path}: a mesh is in {', '.join(names)}, which is not read; export it without")
 
     def _attribute(self, primitive: Node, name: str, weights: Sequence[float]) -> Floats:
         """An attribute (V, width) with its morph targets."""
-        values = self.file.array(primitive["attributes"][name])
+        attributes, widths = primitive["attributes"], _WIDTHS[_stem(name)]
+        count = self.file.entry("accessors", attributes["POSITION"])["count"]
+        values = self.file.attribute(attributes[name], name, count, widths)
         if name.startswith(("COLOR", "WEIGHTS")):
             values = normalised(values)  # integers mean nothing else here, whether they say so or not
         values = values.astype(np.float64)
         for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
             if weight and name in target:
-                change = self.file.array(target[name])
+                widths = (3,) if name == "TANGENT" else (values.shape[1],)  # whose fourth number is a sign
+                change = self.file.attribute(target[name], f"{name} of a morph target", count, widths)
                 values[:, : change.shape[1]] += weight * change
         return values
 
     def _faces(self, primitive: Node, mode: int, vertices: int) -> NDArray[np.uint32]:
         order = np.arange(vertices) if "indices" not in primitive else self.file.array(primitive["indices"])[:, 0]
+        if "indices" in primitive and order.dtype.kind != "u":
+            raise SpecError(f"{self.file.path}: indices are of {order.dtype}; they must be unsigned integers")
         if order.size and order.max() >= vertices:
-            raise SpecError(f"{self.file.path}: a mesh names vertex {order.max()}, and has {vertices}")
+            raise SpecError(f"{self.file.path}: indices name vertex {order.max()}, and POSITION has {vertices}")
         return _triangles(order.astype(np.uint32), mode)
 
     # -------------------------------------------------------------------------------------------------- materials
@@ -129,7 +141,7 @@ class Meshes:
             return mesh, Look(number, tint=tuple(mean.tolist()))
         (has_image, factor), tint = self.materials.colour(number), (1.0, 1.0, 1.0, float(mean[3]))
         if has_image:
-            self.file.changes.lose("colour", "COLOR_0", "colours of vertices do not multiply an image", place)
+            self.file.changes.lose("colour", "COLOR_0", _NOT_PLAIN, place)
             return mesh, Look(number, tint=tint)
         return replace(mesh, colours=(colours[:, :3] * factor[:3]).clip(0, 1)), Look(number, tint=tint, painted=True)
 
@@ -159,7 +171,8 @@ class Meshes:
         """The transforms of the vertices of a skin to the world (V, 4, 4)."""
         if "skin" not in at.node or "JOINTS_0" not in values:
             return None
-        skin = self.file.all("skins")[at.node["skin"]]
+        skin = self.file.entry("skins", at.node["skin"])
+        self.file.report(skin, "geometry", f"node {at.name!r}")
         if not all(joint in self.worlds for joint in skin["joints"]):
             self.file.changes.lose("geometry", "skin", "joints are not in the scene; it stands as modelled", at.name)
             return None
@@ -172,6 +185,11 @@ class Meshes:
             for joint, weight in zip(values[name].T, values[name.replace("JOINTS", "WEIGHTS")].T, strict=True):
                 moves += weight[:, None, None] * matrices[joint.astype(int)]
         return moves / np.where(moves[:, 3:, 3:] == 0, 1, moves[:, 3:, 3:])
+
+
+def _stem(name: str) -> str:
+    """The name of an attribute without its number."""
+    return name.split("_", 1)[0]
 
 
 def _skinned(mesh: Mesh, moves: Floats) -> Mesh:

@@ -19,6 +19,7 @@ from photonfarm.renderer.importing.changes import Effect
 from photonfarm.renderer.importing.meshes import Floats
 from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node, extension
+from photonfarm.shared.core.errors import SpecError
 
 Kind = Literal["raw", "colour", "light"]
 
@@ -27,7 +28,7 @@ Reach = Floats
 
 _WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
 _NEAREST = 9728
-_TRANSFORM = "KHR_texture_transform"
+TRANSFORM = "KHR_texture_transform"
 _FORMATS = ("EXT_texture_webp", "EXT_texture_avif", "MSFT_texture_dds")
 
 KEPT = 3
@@ -64,14 +65,25 @@ class Textures:
         return Map(image[..., channels] * factors, found)
 
     def _image(self, found: Node, colour: bool) -> images.Image | None:
-        texture = self.file.all("textures")[found["index"]]
-        sources = [extension(texture, name).get("source") for name in _FORMATS] + [texture.get("source")]
-        source = next((each for each in sources if each is not None), None)
-        if source is None:
+        texture, place = self.file.entry("textures", found["index"]), f"texture {found['index']}"
+        sources = {name: extension(texture, name).get("source") for name in _FORMATS} | {"": texture.get("source")}
+        sources = {name: source for name, source in sources.items() if source is not None}
+        if not sources:
             name = ", ".join(texture.get("extensions", ())) or "source"
             meaning = "a texture has no image that is read, so that its factor stands alone"
-            self.file.changes.lose("colour", name, meaning, f"texture {found['index']}")
+            self.file.changes.lose("colour", name, meaning, place)
             return None
+        self.file.report(texture, "colour", place)
+        self.file.report(self._sampler(found), "colour", place)
+        *preferred, last = sources.items()
+        for name, source in preferred:
+            try:
+                return self._decode(source, colour)
+            except SpecError:
+                self.file.changes.note("cannot be decoded, and the texture's other image is taken", place, name=name)
+        return self._decode(last[1], colour)
+
+    def _decode(self, source: int, colour: bool) -> images.Image:
         if (source, colour) not in self._decoded:
             if len(self._decoded) == KEPT:
                 self._decoded.pop(next(iter(self._decoded)))
@@ -91,11 +103,11 @@ class Textures:
         return Map(other.values[rows][:, columns], other.found)
 
     def _lie(self, found: Node) -> tuple[Node, Node, int]:
-        return self._sampler(found), extension(found, _TRANSFORM), uv_set(found)
+        return self._sampler(found), extension(found, TRANSFORM), uv_set(found)
 
     def _sampler(self, found: Node) -> Node:
-        number = self.file.all("textures")[found["index"]].get("sampler")
-        return {} if number is None else self.file.all("samplers")[number]
+        number = self.file.entry("textures", found["index"]).get("sampler")
+        return {} if number is None else self.file.entry("samplers", number)
 
     def put(self, parent: Element, name: str, made: Map, kind: Kind, stem: str, reach: Reach) -> None:
         """Add a property of a material: a number, a colour or an image."""
@@ -121,7 +133,7 @@ class Textures:
         What is clamped along one axis gets a border as wide as its coordinates reach; what is mirrored along one
         becomes an image and its mirror image, which repeat.
         """
-        matrix, sampler = _uv_matrix(extension(found, _TRANSFORM)), self._sampler(found)
+        matrix, sampler = _uv_matrix(extension(found, TRANSFORM)), self._sampler(found)
         modes = [_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT")]
         if modes[0] == modes[1]:
             return values, modes[0], matrix
@@ -143,7 +155,7 @@ class Textures:
 
 def uv_set(found: Node) -> int:
     """The set of texture coordinates by which an image lies."""
-    return int(extension(found, _TRANSFORM).get("texCoord", found.get("texCoord", 0)))
+    return int(extension(found, TRANSFORM).get("texCoord", found.get("texCoord", 0)))
 
 
 def _uv_matrix(transform: Node) -> Floats:

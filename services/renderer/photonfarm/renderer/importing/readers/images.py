@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,9 @@ Image = NDArray[np.float32]
 """Linear or encoded values (H, W, C), in [0, 1] but for light."""
 
 _OF_FLOATS = (b"\x76\x2f\x31\x01", b"#?", b"PF", b"Pf")
+_STREAM = re.compile(r'"?MemoryStream\[[^\]]*\]"?')
+"""What Mitsuba says in place of a file's name."""
+
 """How files of OpenEXR, Radiance and PFM begin."""
 
 
@@ -26,6 +30,7 @@ def decoded(data: bytes, what: str, *, raw: bool = False) -> Image:
     cannot be decoded.
     """
     from PIL import Image as Pillow
+    from PIL import UnidentifiedImageError
 
     is_light = data.startswith(_OF_FLOATS)
     try:
@@ -34,8 +39,10 @@ def decoded(data: bytes, what: str, *, raw: bool = False) -> Image:
         else:
             with Pillow.open(io.BytesIO(data)) as image:
                 values, is_light = _by_pillow(image), image.mode == "F"
+    except UnidentifiedImageError as error:  # whose message is an address in memory
+        raise SpecError(f"{what}: is not a readable image: its format is not known") from error
     except (OSError, ValueError, SyntaxError, RuntimeError, Pillow.DecompressionBombError) as error:
-        raise SpecError(f"{what}: is not a readable image: {error}") from error
+        raise SpecError(f"{what}: is not a readable image: {_STREAM.sub('it', str(error))}") from error
     if is_light and not raw:
         values[..., :3] = encoded(values[..., :3])
     return values

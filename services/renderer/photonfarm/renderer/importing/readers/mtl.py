@@ -36,8 +36,7 @@ _CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
 _OF_XYZ = ((3.2404542, -1.5371385, -0.4985314), (-0.969266, 1.8760108, 0.041556), (0.0556434, -0.2040259, 1.0572252))
 """Linear sRGB of CIE XYZ (IEC 61966-2-1)."""
 
-ROUNDING = 1e-3
-"""How far numbers go beyond their bounds by rounding alone."""
+WHITE = (1.0, 1.0, 1.0)
 
 
 def statements(file: Path) -> Iterator[tuple[int, str, str]]:
@@ -144,17 +143,19 @@ class Material:
             values = []
         values = values * len(otherwise) if len(values) == 1 else values
         if len(values) != len(otherwise) or not all(map(math.isfinite, values)):
-            raise SpecError(
-                f"{self.file}: line {line}: material {self.name!r}: {word} = {rest!r} is no number, or three"
-            )
+            place = f"{self.file}: line {line}: material {self.name!r}"
+            raise SpecError(f"{place}: {word} = {rest!r} is no number, or three")
         return [float(part) for part in np.array(_OF_XYZ) @ values] if form == "xyz" else values
 
     def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
-        """The numbers of a line from 0 to `most`, to which others are cut, which changes the `effect`."""
+        """The numbers of a line from 0 to `most`, to which others are cut; black is white where `otherwise` is."""
         values = self.colour(key, otherwise)
         made: list[float] = np.clip(values, 0, most).tolist()
-        if np.abs(np.subtract(made, values)).max() > ROUNDING:
+        if np.abs(np.subtract(made, values)).max() > 1e-3:  # more than rounding
             self.say((effect, f"is cut to what lies between 0 and {most:g}"), self.lines[key][1])
+        if tuple(otherwise) == WHITE and max(made) <= 0:
+            self.say((None, "is black where black is not meant, and is taken for white"), self.lines[key][1])
+            return list(WHITE)
         return made
 
     def image(self, key: str) -> Image | None:
@@ -225,10 +226,6 @@ class Image:
             base, gain, _ = self.triple("mm", 1.0)
             values[..., :3] = (base + gain * values[..., :3]).clip(0)
         return values
-
-    def lies_as(self, other: Image) -> bool:
-        """Whether both lie in the same way on a surface."""
-        return all(self.options.get(name) == other.options.get(name) for name in ("s", "o", "clamp"))
 
     def put_place(self, bitmap: Element) -> None:
         """Add where a texture lies and how far it reaches. MTL's v goes upwards, and Mitsuba's downwards."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
@@ -12,7 +12,7 @@ import numpy as np
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.readers import images
-from photonfarm.renderer.importing.readers.mtl import RELIEFS, ROUNDING, Image, Material, Meaning
+from photonfarm.renderer.importing.readers.mtl import RELIEFS, WHITE, Image, Material, Meaning
 
 _PRINCIPLED = {"pr": ("roughness", 0.5), "pm": ("metallic", 0.0), "ps": ("sheen", 0.0), "pc": ("clearcoat", 0.0),
                "aniso": ("anisotropic", 0.0)}  # fmt: skip
@@ -38,10 +38,9 @@ _UNKNOWN: Meaning = ("colour", "is no known statement of MTL, and is left out")
 GLASS, MIRRORS = (4, 6, 7, 9), (3, 5, 8)
 """The models of illumination that are glass, and those that reflect the scene."""
 
-_NO_MODEL: Meaning = (None, "is no known model of illumination, and is taken for 2")
-_UNUSUAL: dict[float, Meaning] = {
+_UNUSUAL: dict[float, Meaning | None] = {
     0: (None, "has its colour without light in some programs, and is lit here"),
-    **dict.fromkeys(range(1, 10)),
+    **dict.fromkeys(map(float, range(1, 10))),
     10: ("colour", "is seen here, and not its shadows alone"),
 }
 
@@ -51,9 +50,7 @@ GREY = (0.7, 0.7, 0.7)
 SHINES = 0.02
 """Gloss is modelled from this specular reflectance on."""
 
-_BLACK, _WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-
-Change = Callable[[images.Image], images.Image]
+Change = Callable[[images.Image], images.Image] | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,24 +69,19 @@ class Surface:
             if key not in _CARRIED:
                 material.say(_LOST.get(key, _UNKNOWN), word)
         illum = material.number("illum", 2)
-        if meaning := _UNUSUAL.get(illum, _NO_MODEL):
+        if meaning := _UNUSUAL.get(illum, (None, "is no known model of illumination, and is taken for 2")):
             material.say(meaning, f"illum {illum:g}")
         opacity, stencil = self._opacity(illum), material.image("map_d") or material.image("map_tr")
         passes = stencil is not None or opacity < 1
-        tint = material.cut("tf", _WHITE) if passes else _WHITE
-        if max(tint) <= 0:
-            material.say((None, "is black where light passes through, and is taken for white"), "Tf")
-            tint = list(_WHITE)
+        tint = material.cut("tf", WHITE) if passes else WHITE
         if illum in GLASS and opacity == 1:
             material.say((None, "is of glass, and opaque here by its d or Tr"), f"illum {illum:g}")
         elif illum in GLASS and not self._has_image:
             top.set("type", "thindielectric")
             elements.put_value(top, "int_ior", max(material.number("ni", 1.5), 1.01))
             elements.put_value(top, "specular_transmittance", tint)
-            material.say((None, "becomes clear glass without a thickness, of its Ni and Tf"), "illum")
-            if (light := self._light(1, None)) is not None:
-                material.say((None, "shines in full on glass, where d and Tr say how clear it is"), "Ke")
-            return light
+            material.say((None, "becomes clear glass without a thickness, of Ni and Tf; Ke shines in full"), "illum")
+            return self._light(1, None)
         if passes:
             top.set("type", "mask")
             if min(tint) < 1:
@@ -106,19 +98,19 @@ class Surface:
     def _light(self, opacity: float, stencil: Image | None) -> Element | None:
         """What it emits, by `Ke` and an image: Mitsuba's lights shine where their material lets light through."""
         material, image = self.material, self.material.image("map_ke")
-        ke = np.array(material.cut("ke", _BLACK if image is None else _WHITE, math.inf, "light"), np.float32)
-        if image is not None and not ke.any():
-            material.say((None, "is black beside an image, and is taken for white"), "Ke")
-            ke = np.ones(3, np.float32)
+        ke = np.array(material.cut("ke", WHITE if image else (0.0, 0.0, 0.0), math.inf, "light"), np.float32)
         values = ke[None, None] if image is None else images.linear(image.values()[..., :3]) * ke
-        if not values.any():
-            return None
-        alpha = np.full((1, 1), opacity) if stencil is None else self._alpha(stencil.values(raw=True), opacity)
-        if image is not None and stencil is not None and not image.lies_as(stencil):
+        alpha = np.full((1, 1), opacity, np.float32)
+        if stencil is not None and values.any():
+            alpha = self._alpha(stencil.values(raw=True), opacity)
+        if image and stencil and any(image.options.get(o) != stencil.options.get(o) for o in ("s", "o", "clamp")):
             material.say(("light", "lies unlike the image of opacity, whose mean is taken"), "map_Ke")
             alpha = alpha.mean(keepdims=True)
-        size = np.maximum(values.shape, (*alpha.shape, 3))
-        values, image = _scaled(values, size) * _scaled(alpha[..., None], size), image or stencil
+        size = np.maximum(values.shape[:2], alpha.shape)  # each is stretched to it
+        a, b = (np.ix_(*(np.arange(size[i]) * each.shape[i] // size[i] for i in (0, 1))) for each in (values, alpha))
+        values, image = values[a] * alpha[b][..., None], image or stencil
+        if not values.any():
+            return None
         if image is None:
             return elements.area_light(values.ravel().tolist())
         emitter, file = Element("emitter", type="area"), self.stem.with_name(f"{self.stem.name}_light.exr")
@@ -126,8 +118,9 @@ class Surface:
         return emitter
 
     def _alpha(self, values: images.Image, opacity: float) -> images.Image:
-        """Its opacity (H, W), given the image of it."""
-        return np.float32(opacity) * abs(("map_d" not in self.material.lines) - _grey(values)).clip(0, 1)
+        """Its opacity (H, W), given the image of it: that image's own opacity where it has some, or its brightness."""
+        grey = values[..., 3] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2)
+        return np.float32(opacity) * abs(("map_d" not in self.material.lines) - grey.clip(0, 1))
 
     @property
     def _has_image(self) -> bool:
@@ -182,14 +175,14 @@ class Surface:
             normals = up + factor * (2 * values[..., :3] - 1 - up)
             return normals / np.linalg.norm(normals, axis=2, keepdims=True) / 2 + np.float32(0.5)
 
-        if min(image.triple("s", 1.0)) < 0:
+        if min(image.triple("s", 1.0)[:2]) < 0:
             self.material.say((None, "mirrors the image, and not the directions in it"), f"{self.material.relief} -s")
         place.set("type", "normalmap")
         self._put_image(place, "normalmap", image, change if strength != 1 or self.mirrored else None, raw=True)
         return SubElement(place, "bsdf")
 
     def _put_gloss(self, place: Element, illum: float) -> None:
-        material, ks = self.material, self.material.cut("ks", _BLACK)
+        material, ks = self.material, self.material.colour("ks")
         alpha = max(math.sqrt(2 / (max(material.number("ns", 30.0), 0.0) + 2)), 0.02)
         if _PBR & set(material.lines):
             self._put_principled(place)
@@ -198,11 +191,11 @@ class Surface:
             self._put_colour(place, "reflectance")
         elif illum in MIRRORS:
             place.set("type", "blendbsdf")
-            elements.put_value(place, "weight", max(ks))
+            elements.put_value(place, "weight", max(material.cut("ks", ks)))
             self._put_colour(SubElement(place, "bsdf", type="diffuse"), "reflectance")
             mirror = SubElement(place, "bsdf", type="roughconductor")
             elements.put_value(mirror, "material", "none")
-            elements.put_value(mirror, "specular_reflectance", [part / max(ks) for part in ks])
+            elements.put_value(mirror, "specular_reflectance", [max(part, 0) / max(ks) for part in ks])
             elements.put_value(mirror, "alpha", alpha)
             material.say((None, "reflects as a metal does, and leaves the rest to Kd"), "Ks")
         elif self.coloured:  # Mitsuba's plastic needs a mean of its colour, and cannot take that of vertices
@@ -211,7 +204,7 @@ class Surface:
             place.set("type", "roughplastic")
             elements.put_value(place, "alpha", alpha)
             if min(ks) < max(ks):
-                elements.put_value(place, "specular_reflectance", [part / max(ks) for part in ks])
+                elements.put_value(place, "specular_reflectance", [max(part, 0) / max(ks) for part in ks])
             self._put_colour(place, "diffuse_reflectance")
             material.say((None, "becomes the gloss of plastic, as Phong's has no exact counterpart"), "Ks")
 
@@ -232,17 +225,9 @@ class Surface:
         if max(material.colour("ks")) > SHINES:
             material.say((None, "becomes the gloss of `principled`"), "Ks")
 
-    def _kd(self) -> Sequence[float]:
-        """Its colour; black stands for white beside an image, as some programs write it."""
-        beside = self.coloured or self.material.image("map_kd") is not None
-        kd = self.material.cut("kd", _WHITE if beside else GREY)
-        if not beside or max(kd) > 0:
-            return kd
-        self.material.say((None, "is black beside an image or colours of vertices, and is taken for white"), "Kd")
-        return _WHITE
-
     def _put_colour(self, place: Element, name: str) -> None:
-        kd, image = self._kd(), self.material.image("map_kd")
+        image = self.material.image("map_kd")
+        kd = self.material.cut("kd", WHITE if self.coloured or image else GREY)
         if image is not None:
             tint = None if min(kd) >= 1 else lambda values: images.tinted(values, kd)
             self._put_image(place, name, image, tint)
@@ -254,28 +239,15 @@ class Surface:
             if "kd" not in self.material.lines and self.material.lines:
                 self.material.say((None, "is not there; the surface is grey"), "Kd")
 
-    def _put_image(
-        self, place: Element, name: str, image: Image, change: Change | None = None, *, raw: bool = False
-    ) -> None:  # fmt: skip
+    def _put_image(self, place: Element, name: str, image: Image, change: Change = None, *, raw: bool = False) -> None:
         file = image.file
         if change is not None or not image.is_plain:
             values = image.values(raw=raw)
             values = change(values) if change is not None else values[..., :3]
-            if not raw and values.max() > 1 + ROUNDING:
+            if not raw and values.max() > 1.001:
                 self.material.say(("colour", "goes beyond 1, which no surface reflects, and is cut"), "map_Kd")
             file = images.save(values.clip(0, 1), self.stem.with_name(f"{self.stem.name}_{name}.png"))
         image.put_place(elements.put_bitmap(place, name, file, raw=raw))
-
-
-def _grey(values: images.Image) -> images.Image:
-    """The one channel that a scalar image means: its opacity where it has that, or its brightness."""
-    return values[..., 3] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2)
-
-
-def _scaled(values: images.Image, size: Sequence[int]) -> images.Image:
-    """An image of another size, each texel that of the same place."""
-    rows, columns = (np.arange(size[axis]) * values.shape[axis] // size[axis] for axis in (0, 1))
-    return values[rows][:, columns]
 
 
 def _are_normals(values: images.Image) -> bool:

@@ -15,7 +15,7 @@ from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.imported import Ids, ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh, unit
 from photonfarm.renderer.importing.readers import images
-from photonfarm.renderer.importing.readers.mtl import Material, Meaning, read_libraries, statements
+from photonfarm.renderer.importing.readers.mtl import WHITE, Material, Meaning, read_libraries, statements
 from photonfarm.renderer.importing.readers.mtl_surfaces import Surface
 from photonfarm.renderer.importing.readers.polygons import Ints, smooth_normals, triangles
 from photonfarm.shared.core.errors import SpecError
@@ -230,11 +230,10 @@ def _mesh(corner: Ints, tables: _Tables, material: Material) -> Mesh:
         material.say((None, "colours of vertices are left out beside the image"), "v")
     if coloured and image is None and not np.isfinite(colour).all():
         material.say((None, "some vertices have no colour, and are white"), "v")
-    kd = np.array(material.cut("kd", (1.0, 1.0, 1.0)))
     return Mesh(
         points[v],
         which.reshape(-1, 3).astype(np.uint32),
         normals[vn] if (vn >= 0).any() else None,
         np.where(np.isfinite(uv), uv, 0) if material.has_images or (vt >= 0).any() else None,
-        np.nan_to_num(colour, nan=1) * (kd if kd.any() else 1) if coloured and image is None else None,
+        np.nan_to_num(colour, nan=1) * material.cut("kd", WHITE) if coloured and image is None else None,
     )

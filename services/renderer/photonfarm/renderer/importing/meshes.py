@@ -52,7 +52,7 @@ class Mesh:
         """
         across = self._across()
         known: NDArray[np.bool_] = np.isfinite(across).all(axis=1)
-        flat: NDArray[np.bool_] = np.linalg.norm(across, axis=1) == 0
+        flat = np.asarray(np.linalg.norm(across, axis=1) == 0)
         mesh = self if (known & ~flat).all() else self.part(known & ~flat)
         if not known.all():
             meaning = "faces with corners that are no numbers are missing"

@@ -178,6 +178,53 @@ def test_points_and_lines_are_losses_of_geometry(gltf: Any, read: Read) -> None:
     assert list(scene.meshes) == ["Mode4"]
 
 
+def test_skins_know_joints_that_are_hidden(gltf: Any, read: Read) -> None:
+    joints, weights = np.zeros((3, 4), "|u1"), np.array([[1, 0, 0, 0]] * 3, "<f4")
+    mesh = gltf.mesh(*TRIANGLE, JOINTS_0=gltf.array(joints, "VEC4"), WEIGHTS_0=gltf.array(weights, "VEC4"))
+    gltf.node("Skinned", mesh, skin=0)
+    gltf.node("Rig", mesh, children=[2], extensions={"KHR_node_visibility": {"visible": False}})
+    gltf.node("Bone", translation=[5, 0, 0])
+    gltf.document["scenes"][0]["nodes"] = [0, 1]
+    gltf.document["skins"] = [{"joints": [2]}]
+    scene = read(gltf.write())
+    assert list(scene.meshes) == ["Skinned"]
+    assert scene.meshes["Skinned"].vertices[:, 0].tolist() == [5, 6, 5]
+    assert losses(scene) == []
+
+
+@pytest.mark.parametrize(("inner", "outer"), [(0, np.pi / 4), (0.2, 0.5), (0.3, 0.31), (0, np.pi / 2)])
+def test_spots_fade_as_the_extension_recommends(
+    gltf: Any, quad: Callable[..., Path], loaded: Loaded, inner: float, outer: float
+) -> None:
+    spot = {"type": "spot", "intensity": 3, "spot": {"innerConeAngle": inner, "outerConeAngle": outer}}
+    gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [spot]}}
+    gltf.node("Lamp", extensions={"KHR_lights_punctual": {"light": 0}})
+    scene, made = loaded(quad())
+    angles = np.linspace(0, 0.99 * outer, 50)
+    reference = mi.Interaction3f()
+    reference.p = mi.Point3f(np.sin(angles) * 0.6, np.sin(angles) * 0.8, -np.cos(angles))
+    lit = np.array(made.emitters()[0].sample_direction(reference, mi.Point2f(0.5))[1])[0]
+    fade = (np.cos(angles) - np.cos(outer)) / (np.cos(inner) - np.cos(outer))
+    assert np.abs(lit - 3 * fade.clip(0, 1) ** 2).max() < 0.02 * 3
+    assert losses(scene) == []
+
+
+@pytest.mark.parametrize(
+    ("light", "lost"),
+    [
+        ({"intensity": -3}, "intensity"),
+        ({"color": [-1, 1, 1]}, "intensity"),
+        ({"type": "spot", "spot": {"outerConeAngle": 0}}, "outerConeAngle"),
+    ],
+)
+def test_lights_that_no_light_can_be_are_losses(
+    gltf: Any, quad: Callable[..., Path], read: Read, light: Any, lost: str
+) -> None:
+    gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"} | light]}}
+    gltf.node("Lamp", extensions={"KHR_lights_punctual": {"light": 0}})
+    assert losses(read(quad())) == [("light", lost)]
+
+
 # ------------------------------------------------------------------------------------------------------- extensions
 
 
@@ -209,6 +256,20 @@ def test_extensions_that_are_not_read_are_named_by_what_they_sit_on(
         ("light", "EXT_lights_image_based"), ("light", "EXT_of_light"), ("light", "area"), ("geometry", "EXT_of_node"),
         ("geometry", "EXT_of_primitive"), ("colour", "KHR_materials_unlit"), ("colour", "KHR_materials_sheen"),
     }  # fmt: skip
+
+
+def test_extensions_of_images_and_numbers_are_named_where_they_are_used(
+    gltf: Any, quad: Callable[..., Path], read: Read
+) -> None:
+    quad(pbrMetallicRoughness={"baseColorTexture": gltf.image(FOUR, "four.png")})
+    gltf.document["samplers"], gltf.document["textures"][0]["sampler"] = [{}], 0
+    for kind in ("textures", "samplers", "images", "accessors", "bufferViews"):
+        gltf.document[kind][0]["extensions"] = {f"EXT_{kind}": {}}
+    gltf.document["images"].append({"uri": "unused.png", "extensions": {"EXT_unused": {}}})
+    effects = {"textures": "colour", "samplers": "colour", "images": "colour"}
+    kinds = ("accessors", "bufferViews", "images", "samplers", "textures")
+    found = losses(read(gltf.write()))
+    assert sorted(found, key=lambda loss: loss[1]) == [(effects.get(k, "geometry"), f"EXT_{k}") for k in kinds]
 
 
 @pytest.mark.parametrize("fallback", [True, False])
@@ -315,3 +376,33 @@ def test_what_cannot_be_read_is_named(
     break_it(tmp_path)
     with pytest.raises(SpecError, match=named):
         read(path)
+
+
+def first(kind: str, **entries: Any) -> Callable[[Any], None]:
+    return lambda gltf: gltf.document[kind][0].update(entries)
+
+
+@pytest.mark.parametrize(
+    ("break_it", "named"),
+    [
+        (first("nodes", mesh=7), r"node 'Quad': names meshes\[7\], and the file has 1 meshes"),
+        (first("nodes", mesh=-1), r"node 'Quad': names meshes\[-1\]"),
+        (first("nodes", rotation=[0, 0, 0, 0]), "node 'Quad': .*rotation"),
+        (first("nodes", translation=[float("nan"), 0, 0]), "node 'Quad': .*translation"),
+        (first("nodes", extensions={"KHR_lights_punctual": {"light": 4}}), r"node 'Quad': names lights\[4\]"),
+        (first("materials", emissiveFactor=[1, 1]), "material 'paint': .*emissiveFactor"),
+        (first("accessors", count=2), "node 'Quad': TEXCOORD_0 has 2 values where there are 4"),
+        (first("accessors", type="SCALAR"), "node 'Quad': TEXCOORD_0 has 1 numbers a value"),
+        (lambda gltf: gltf.document["meshes"][0]["primitives"][0].update(material=3), r"node 'Quad': names materials"),
+        (lambda gltf: gltf.document["accessors"][-1].update(componentType=5126), "node 'Quad': indices"),
+        (lambda gltf: gltf.document["meshes"][0]["primitives"][0].update(mode=7), "no triangles.*\n.*mode 7"),
+        (lambda gltf: gltf.document.update(extensionsRequired="FOO"), "extensionsRequired .*must be a list"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_is_told_with_its_node_and_its_key(
+    gltf: Any, quad: Callable[..., Path], read: Read, break_it: Callable[[Any], None], named: str
+) -> None:
+    quad()
+    break_it(gltf)
+    with pytest.raises(SpecError, match=named):
+        read(gltf.write())

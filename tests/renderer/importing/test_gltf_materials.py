@@ -113,6 +113,53 @@ def test_what_light_passes_is_glass_with_its_refractive_index(
     assert mi.has_flag(made.shapes()[0].bsdf().flags(), mi.BSDFFlags.Transmission)
 
 
+@pytest.mark.parametrize(
+    ("passes", "metal", "front", "back"), [(1, 0, 1, 1), (0.5, 0, 0.5, 0.5), (0.5, 0.5, 0.25, 0.25), (1, 1, 0, 0)]
+)
+def test_clear_glass_is_as_much_of_a_surface_as_light_passes(
+    quad: Callable[..., Path], loaded: Loaded, passes: float, metal: float, front: float, back: float
+) -> None:
+    surface = {"roughnessFactor": 0, "metallicFactor": metal}
+    _, scene = loaded(quad(pbrMetallicRoughness=surface,
+                           extensions={"KHR_materials_transmission": {"transmissionFactor": passes}}))  # fmt: skip
+    for z, share in ((1, front), (-1, back)):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f([0.3] * 4096, 0.4, z), mi.Vector3f(0, 0, -z)))
+        numbers = (
+            mi.Float(np.random.default_rng(1).random(4096)),
+            mi.Point2f(np.random.default_rng(2).random((2, 4096))),
+        )
+        sample, weight = si.bsdf().sample(mi.BSDFContext(), si, *numbers)
+        through = np.array(mi.Frame3f.cos_theta(sample.wo)) * np.array(mi.Frame3f.cos_theta(si.wi)) < 0
+        thin_pane = 2 * 0.04 / 1.04  # what its two sides reflect
+        assert (np.array(weight)[0] * through).mean() == pytest.approx(share * (1 - thin_pane), abs=0.03)
+
+
+def test_clear_glass_has_its_normal_map_and_says_that_it_has_no_coat(
+    gltf: Any, quad: Callable[..., Path], read: Read
+) -> None:
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 1}, "KHR_materials_clearcoat": {"clearcoatFactor": 1}}
+    normals = gltf.image(np.full((2, 2, 3), (128, 128, 255)), "normal.png")
+    turned = normals | {"extensions": {"KHR_texture_transform": {"rotation": 1}}}
+    surface = {"roughnessFactor": 0, "metallicFactor": 0}
+    scene = read(quad(pbrMetallicRoughness=surface, extensions=glass, normalTexture=turned))
+    assert of_type(of_type(scene.root, "normalmap"), "thindielectric") is not None
+    assert [(change.effect, change.name) for change in scene.changes] == [
+        (None, "KHR_texture_transform"), ("colour", "KHR_materials_clearcoat")]  # fmt: skip
+
+
+def test_an_image_that_cannot_be_decoded_gives_way_to_its_fallback(
+    gltf: Any, quad: Callable[..., Path], loaded: Loaded, tmp_path: Path
+) -> None:
+    found = gltf.image(FOUR, "four.png")
+    (tmp_path / "four.avif").write_bytes(b"of the future")
+    gltf.document["images"].append({"uri": "four.avif"})
+    gltf.document["textures"][0]["extensions"] = {"EXT_texture_avif": {"source": 1}}
+    scene, made = loaded(quad(pbrMetallicRoughness={"baseColorTexture": found, "metallicFactor": 0}))
+    assert colour_at(made, 0.75, 0.75) == [0, 1, 0]
+    assert "EXT_texture_avif" in [change.name for change in scene.changes]
+    assert losses(scene) == []
+
+
 def test_what_is_masked_is_opaque_or_not(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:
     pixels = np.dstack([FOUR, np.array([[0, 100], [200, 255]])])
     surface = {"baseColorTexture": gltf.image(pixels, "leaf.png"), "metallicFactor": 0}
@@ -183,6 +230,7 @@ def test_what_is_masked_away_by_its_factor_is_not_there(gltf: Any, quad: Callabl
     scene = read(gltf.write())
     assert list(scene.meshes) == ["Other"]
     assert losses(scene) == []
+    assert ["node 'Quad'"] in [change.places for change in scene.changes if change.name == "alphaMode"]
 
 
 def test_light_leaves_only_what_is_not_masked_away(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:

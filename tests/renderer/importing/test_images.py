@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.importing.readers import images
+from photonfarm.shared.core.errors import SpecError
 
 
 def written(values: np.ndarray, kind: str) -> bytes:
@@ -53,6 +55,17 @@ def test_images_of_every_depth_have_their_values(kind: str) -> None:
     assert image.shape == (1, 2, 4)
     assert np.allclose(image[0, :, :3], [[0.25] * 3, [0.75] * 3], atol=0.06)
     assert (image[..., 3] == 1).all()
+
+
+@pytest.mark.parametrize(
+    "data",
+    [b"", b"no image", b"#?RADIANCE", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 8\nabc", b"PF\n3 3\n-1\nabc",
+     b"\x76\x2f\x31\x01\x02\0\0\0"],
+)  # fmt: skip
+def test_what_is_no_image_or_cut_off_is_told_without_addresses_and_temporary_files(data: bytes) -> None:
+    with pytest.raises(SpecError, match=r"^it: is not a readable image: ") as raised:
+        images.decoded(data, "it")
+    assert not re.search(r"0x|MemoryStream|/tmp", str(raised.value))
 
 
 def test_images_keep_their_depth_when_they_are_written(tmp_path: Path) -> None:

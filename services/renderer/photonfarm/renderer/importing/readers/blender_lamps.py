@@ -33,7 +33,7 @@ PARTS = 16
 SHARP = math.radians(1.0)
 """A sun that is no wider is one direction; a wider one is a disc of the sky."""
 
-WIDEST, TEXELS, CORNERS = math.radians(89.5), 512, 64
+WIDEST, TEXELS, CORNERS = math.radians(89.5), 1024, 64
 
 STEEP = math.radians(80)
 """Wider cones have finer images, as their tangents are large."""
@@ -162,7 +162,7 @@ class Lamps:
     ) -> None:
         """Add spots at offsets (N, 3) that share an intensity; `profile`: its share at tangents (x, y) off the axis."""
         made = self._ids.make(lamp["name"], "lamp")
-        file = cone_image(profile, cut, self._scratch / f"{made}.exr")
+        file = cone_image(profile, cut, self._scratch / f"{made}.png")
         axis, up = -_frame(matrix)[:, 2], _frame(matrix)[:, 1]
         for place in places:
             spot = self._emitter("spot", lamp["name"])
@@ -189,9 +189,9 @@ class Lamps:
 
 def cone_image(profile: Profile, cut: float, file: Path) -> Path:
     """The image of a spot within an angle; `profile`: its share at tangents (x, y) off the axis."""
-    texels = TEXELS if cut < STEEP else 4 * TEXELS
+    texels = TEXELS if cut < STEEP else 2 * TEXELS
     y, x = np.meshgrid(*[math.tan(cut) * (2 * (np.arange(texels) + 0.5) / texels - 1)] * 2, indexing="ij")
-    return images.save_radiance(np.repeat(profile(x, y)[..., None], 3, 2).astype(np.float32), file)
+    return images.save(profile(x, y).astype(np.float32), file)
 
 
 def put_cone(spot: Element, cut: float, file: Path) -> None:

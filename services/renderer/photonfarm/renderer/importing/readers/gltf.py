@@ -214,7 +214,7 @@ class _Reader:
             cosine, edge = 1 / np.sqrt(1 + x * x + y * y), np.cos(outer)
             return np.clip((cosine - edge) / max(1e-3, np.cos(inner) - edge), 0, 1) ** 2
 
-        file = self.materials.textures.scratch / f"{emitter.get('id')}_cone.exr"
+        file = self.materials.textures.scratch / f"{emitter.get('id')}_cone.png"
         put_cone(emitter, cut, cone_image(profile, cut, file))
 
 

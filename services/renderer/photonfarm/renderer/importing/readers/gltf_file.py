@@ -65,18 +65,14 @@ class GltfFile:
         self.document, self._binary = _opened(path)
         self._buffers: dict[int, bytes] = {}
         with self.at():
-            self._check()
-
-    def _check(self) -> None:
-        version = str(self.document.get("asset", {}).get("version", ""))
-        if not version.startswith("2."):
-            raise SpecError(f"{self.path}: is glTF of version {version or 'unknown'!r}; only version 2 is read")
-        refused = ", ".join(str(name) for name in self.all("extensionsRequired") if name not in READ | HARMLESS)
-        if refused:
-            raise SpecError(f"{self.path}: extensionsRequired has {refused}, which is not read; export without it")
-        for name in self.document.get("extensions", ()):
-            if name not in READ | HARMLESS:
-                self.changes.note("what the file as a whole has of it is not read", name=name)
+            version = str(self.document.get("asset", {}).get("version", "unknown"))
+            if not version.startswith("2."):
+                raise SpecError(f"is glTF of version {version!r}; only version 2 is read")
+            refused = ", ".join(sorted({str(name) for name in self.all("extensionsRequired")} - READ - HARMLESS))
+            if refused:
+                raise SpecError(f"extensionsRequired has {refused}, which is not read; export without it")
+            for name in sorted(set(self.document.get("extensions", ())) - READ - HARMLESS):
+                changes.note("what the file as a whole has of it is not read", name=name)
 
     @contextmanager
     def at(self, place: str = "") -> Iterator[None]:
@@ -86,23 +82,22 @@ class GltfFile:
             yield
         except SpecError as error:
             raise SpecError(where + str(error).removeprefix(f"{self.path}: ")) from error
-        except KeyError as error:
-            raise SpecError(f"{where}is not valid glTF: {error} is missing, or no value that glTF has") from error
-        except (IndexError, TypeError, AttributeError, ValueError) as error:
-            raise SpecError(f"{where}is not valid glTF: {error}") from error
+        except (KeyError, IndexError, TypeError, AttributeError, ValueError) as error:
+            missing = " is missing, or no value that glTF has" if isinstance(error, KeyError) else ""
+            raise SpecError(f"{where}is not valid glTF: {error}{missing}") from error
 
     def all(self, kind: str) -> list[Node]:
         """The entries of one array of the document, such as meshes."""
         entries: list[Node] = self.document.get(kind, [])
         if not isinstance(entries, list):
-            raise SpecError(f"{self.path}: {kind} is {entries!r}; it must be a list")
+            raise SpecError(f"{kind} is {entries!r}; it must be a list")
         return entries
 
     def entry(self, kind: str, number: int, entries: Sequence[Node] | None = None) -> Node:
         """One entry of an array of the document, or of others of that kind."""
         entries = self.all(kind) if entries is None else entries
         if not isinstance(number, int) or not 0 <= number < len(entries):
-            raise SpecError(f"{self.path}: names {kind}[{number!r}], and the file has {len(entries)} {kind}")
+            raise SpecError(f"names {kind}[{number!r}], and the file has {len(entries)} {kind}")
         return entries[number]
 
     def report(self, entry: Node, effect: Effect, place: str) -> None:
@@ -124,9 +119,7 @@ class GltfFile:
             self.report(entry, "geometry", f"buffer {number}")
             data = self._bytes_of(entry, number)
             if len(data) < entry["byteLength"]:
-                raise SpecError(
-                    f"{self.path}: buffer {number} is cut off: it has {len(data)} bytes and needs {entry['byteLength']}"
-                )
+                raise SpecError(f"buffer {number} is cut off: it has {len(data)} bytes and needs {entry['byteLength']}")
             self._buffers[number] = data
         return self._buffers[number]
 
@@ -137,7 +130,7 @@ class GltfFile:
             return self._binary
         compressed = ", ".join(entry.get("extensions", ()))
         why = f"{compressed} has its data, which is not read" if compressed else "the file has no binary chunk for it"
-        raise SpecError(f"{self.path}: buffer {number} has no uri, and {why}; export the file without compression")
+        raise SpecError(f"buffer {number} has no uri, and {why}; export the file without compression")
 
     def _read(self, uri: str, what: str) -> bytes:
         if uri.startswith("data:"):
@@ -148,7 +141,7 @@ class GltfFile:
             return (self.path.parent / name).read_bytes()
         except OSError as error:
             reason = error.strerror or str(error)
-            raise SpecError(f"{self.path}: {what}: {name!r} cannot be read: {reason}; put it there") from error
+            raise SpecError(f"{what}: {name!r} cannot be read: {reason}; put it there") from error
 
     def _view(self, number: int, effect: Effect = "geometry") -> tuple[bytes, int]:
         """The bytes of a buffer view, and its stride."""
@@ -157,7 +150,7 @@ class GltfFile:
         start, data = view.get("byteOffset", 0), self._buffer(view["buffer"])
         end = start + view["byteLength"]
         if end > len(data):
-            raise SpecError(f"{self.path}: buffer {view['buffer']} has {len(data)} bytes; view {number} needs {end}")
+            raise SpecError(f"buffer {view['buffer']} has {len(data)} bytes; view {number} needs {end}")
         return data[start:end], view.get("byteStride", 0)
 
     def array(self, number: int) -> NDArray[Any]:
@@ -178,10 +171,10 @@ class GltfFile:
         """The values of an accessor (count, width) that is an attribute, whose width is one of some."""
         values = self.array(number)
         if len(values) != count:
-            raise SpecError(f"{self.path}: {name} has {len(values)} values where there are {count}; export it anew")
+            raise SpecError(f"{name} has {len(values)} values where there are {count}; export it anew")
         if values.shape[1] not in widths:
             allowed = " or ".join(map(str, widths))
-            raise SpecError(f"{self.path}: {name} has {values.shape[1]} numbers a value; glTF has {allowed}")
+            raise SpecError(f"{name} has {values.shape[1]} numbers a value; glTF has {allowed}")
         return values
 
     def _strided(self, entry: Node, kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
@@ -193,7 +186,7 @@ class GltfFile:
         step = stride or width * kind.itemsize
         needed = offset + (count - 1) * step + width * kind.itemsize
         if count and len(data) < needed:
-            raise SpecError(f"{self.path}: buffer view {view} has {len(data)} bytes, and an accessor needs {needed}")
+            raise SpecError(f"buffer view {view} has {len(data)} bytes, and an accessor needs {needed}")
         return np.ndarray((count, width), kind, data, offset, (step, kind.itemsize)).copy()
 
     def image(self, number: int) -> tuple[str, bytes]:

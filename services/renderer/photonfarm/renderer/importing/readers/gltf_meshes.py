@@ -19,7 +19,8 @@ from photonfarm.shared.core.errors import SpecError
 _LISTS, _STRIPS, _FANS = 4, 5, 6
 """The modes of primitives that are triangles."""
 
-_OTHERS = ("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP")
+_NAMES = dict(enumerate(("POINTS", "LINES", "LINE_LOOP", "LINE_STRIP", *["POSITION"] * 3)))
+"""What is missing or no triangles, by the mode."""
 
 _WIDTHS = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "TEXCOORD": (2,), "COLOR": (3, 4), "JOINTS": (4,),
            "WEIGHTS": (4,)}  # fmt: skip
@@ -67,8 +68,7 @@ class Meshes:
         self.file.report(primitive, "geometry", place)
         mode = primitive.get("mode", _LISTS)
         if mode not in (_LISTS, _STRIPS, _FANS) or "POSITION" not in attributes:
-            names = {**dict(enumerate(_OTHERS)), **dict.fromkeys((_LISTS, _STRIPS, _FANS), "POSITION")}
-            name = names.get(mode, f"mode {mode}")
+            name = _NAMES.get(mode, f"mode {mode}")
             self.file.changes.lose("geometry", name, "points, lines and what has no positions have no surface", place)
             return []
         self._refuse_compressed(primitive)
@@ -82,7 +82,7 @@ class Meshes:
         names = COMPRESSED & set(primitive.get("extensions", ()))
         position = self.file.entry("accessors", primitive["attributes"]["POSITION"])
         if names and not {"bufferView", "sparse"} & set(position):
-            raise SpecError(f"{self.file.path}: a mesh is in {', '.join(names)}, which is not read; export it without")
+            raise SpecError(f"a mesh is in {', '.join(names)}, which is not read; export it without")
 
     def _attribute(self, primitive: Node, name: str, weights: Sequence[float]) -> Floats:
         """An attribute (V, width) with its morph targets."""
@@ -102,9 +102,9 @@ class Meshes:
     def _faces(self, primitive: Node, mode: int, vertices: int) -> NDArray[np.uint32]:
         order = np.arange(vertices) if "indices" not in primitive else self.file.array(primitive["indices"])[:, 0]
         if "indices" in primitive and order.dtype.kind != "u":
-            raise SpecError(f"{self.file.path}: indices are of {order.dtype}; they must be unsigned integers")
+            raise SpecError(f"indices are of {order.dtype}; they must be unsigned integers")
         if order.size and order.max() >= vertices:
-            raise SpecError(f"{self.file.path}: indices name vertex {order.max()}, and POSITION has {vertices}")
+            raise SpecError(f"indices name vertex {order.max()}, and POSITION has {vertices}")
         return _triangles(order.astype(np.uint32), mode)
 
     # -------------------------------------------------------------------------------------------------- materials

@@ -66,8 +66,8 @@ class Textures:
 
     def _image(self, found: Node, colour: bool) -> images.Image | None:
         texture, place = self.file.entry("textures", found["index"]), f"texture {found['index']}"
-        sources = {name: extension(texture, name).get("source") for name in _FORMATS} | {"": texture.get("source")}
-        sources = {name: source for name, source in sources.items() if source is not None}
+        entries = [(name, extension(texture, name)) for name in _FORMATS] + [("", texture)]
+        sources = [(name, entry["source"]) for name, entry in entries if "source" in entry]
         if not sources:
             name = ", ".join(texture.get("extensions", ())) or "source"
             meaning = "a texture has no image that is read, so that its factor stands alone"
@@ -75,13 +75,12 @@ class Textures:
             return None
         self.file.report(texture, "colour", place)
         self.file.report(self._sampler(found), "colour", place)
-        *preferred, last = sources.items()
-        for name, source in preferred:
+        for name, source in sources[:-1]:
             try:
                 return self._decode(source, colour)
             except SpecError:
                 self.file.changes.note("cannot be decoded, and the texture's other image is taken", place, name=name)
-        return self._decode(last[1], colour)
+        return self._decode(sources[-1][1], colour)
 
     def _decode(self, source: int, colour: bool) -> images.Image:
         if (source, colour) not in self._decoded:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-import re
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,6 @@ Image = NDArray[np.float32]
 """Linear or encoded values (H, W, C), in [0, 1] but for light."""
 
 _OF_FLOATS = (b"\x76\x2f\x31\x01", b"#?", b"PF", b"Pf")
-_STREAM = re.compile(r'"?MemoryStream\[[^\]]*\]"?')
-"""What Mitsuba says in place of a file's name."""
-
 """How files of OpenEXR, Radiance and PFM begin."""
 
 
@@ -42,7 +39,7 @@ def decoded(data: bytes, what: str, *, raw: bool = False) -> Image:
     except UnidentifiedImageError as error:  # whose message is an address in memory
         raise SpecError(f"{what}: is not a readable image: its format is not known") from error
     except (OSError, ValueError, SyntaxError, RuntimeError, Pillow.DecompressionBombError) as error:
-        raise SpecError(f"{what}: is not a readable image: {_STREAM.sub('it', str(error))}") from error
+        raise SpecError(f"{what}: is not a readable image: {error}") from error
     if is_light and not raw:
         values[..., :3] = encoded(values[..., :3])
     return values
@@ -53,11 +50,13 @@ def _by_mitsuba(data: bytes) -> Image:
 
     from photonfarm.renderer.scene.loading import threads_to_read_with
 
-    stream = mi.MemoryStream(len(data))
-    stream.write(data)
-    stream.seek(0)
-    with threads_to_read_with():
-        image = mi.Bitmap(stream)
+    with tempfile.NamedTemporaryFile() as file, threads_to_read_with():  # its streams of memory have no end
+        file.write(data)
+        file.flush()
+        try:
+            image = mi.Bitmap(mi.FileStream(file.name))
+        except RuntimeError as error:
+            raise ValueError(str(error).replace(f'"{file.name}": ', "")) from error
         made = image.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, image.srgb_gamma())
     return np.array(made, np.float32)
 

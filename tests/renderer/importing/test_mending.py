@@ -47,6 +47,30 @@ def test_a_tiny_scene_is_enlarged_and_so_are_its_lights(gltf: Any, loaded: Loade
     assert float(intensity.get("value", "").split(",")[0]) == pytest.approx(extent**2, rel=1e-5)
 
 
+@pytest.mark.parametrize("flips", [False, True])
+def test_a_mesh_of_mitsuba_keeps_its_side_when_normals_are_mended(tmp_path: Path, loaded: Loaded, flips: bool) -> None:
+    import mitsuba as mi
+
+    bad = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(
+        f"property float {name}\n" for name in ("x", "y", "z", "nx", "ny", "nz")
+    )
+    corners = "0 0 0 0 0 0\n1 0 0 0 0 1\n0 1 0 0 0 1\n3 0 1 2\n"
+    (tmp_path / "bad.ply").write_text(
+        f"{bad}element face 1\nproperty list uchar int vertex_index\nend_header\n{corners}"
+    )
+    flip = '<boolean name="flip_normals" value="true"/>' if flips else ""
+    flat = '<shape type="rectangle"><transform name="to_world"><scale value="0"/></transform></shape>'
+    (tmp_path / "it.xml").write_text(
+        f'<scene version="3.0.0">{flat}<shape type="ply" id="Bad"><string name="filename" value="bad.ply"/>{flip}'
+        '</shape><emitter type="constant"/></scene>'
+    )
+    scene, made = loaded(tmp_path / "it.xml")
+    assert "faces whose normals are zero or no numbers get their own (Bad: 1 of 1)" in changed(scene)
+    assert [shape.id() for shape in made.shapes()] == ["Bad"]
+    hit = made.ray_intersect(mi.Ray3f(mi.Point3f(0.2, 0.2, 5), mi.Vector3f(0, 0, -1)))
+    assert float(np.array(hit.sh_frame.n).ravel()[2]) == (-1 if flips else 1)
+
+
 def test_what_lies_far_from_the_rest_is_a_loss_of_the_rest_which_is_rounded(tmp_path: Path, loaded: Loaded) -> None:
     far = "\n".join(f"v {x + 85227.4} {y + 446522.1} 17" for x, y in ((0, 0), (4, 0), (4, 3), (0, 3)))
     file = tmp_path / "it.obj"

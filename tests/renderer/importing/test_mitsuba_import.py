@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.readers import mitsuba_instances
+from photonfarm.renderer.importing.readers import mitsuba_instances, mitsuba_ply
 from photonfarm.renderer.importing.readers.images import save_radiance
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.files import SceneFile
@@ -121,6 +121,23 @@ def test_bitmaps_of_0_6_are_read_as_they_say(
     assert not list(scene.changes)
 
 
+def test_textures_of_0_6_are_moved_and_named_as_they_say(
+    write: Callable[..., Path], loaded: Loaded, tmp_path: Path
+) -> None:
+    Image.fromarray(np.array([[0, 255]], np.uint8)).save(tmp_path / "it.png")
+    named = '<string name="filename" value="it.png"/><string name="filterType" value="nearest"/>'
+    content = f"""<shape type="rectangle"><bsdf type="diffuse"><texture type="scale" id="S" name="reflectance">
+        <texture type="bitmap" id="T">{named}<float name="voffset" value="1"/></texture></texture></bsdf></shape>"""
+    for number, name in enumerate("ST"):
+        content += f"""<shape type="rectangle"><transform name="toWorld"><translate x="{4 * number + 4}"/></transform>
+        <bsdf type="diffuse"><ref name="reflectance" id="{name}"/></bsdf></shape>"""
+    scene, made = loaded(write(content, "0.6.0"))
+    assert [reflectance(made, x, 0)[0] for x in (-0.5, 0.5, 4.5, 8.5)] == pytest.approx([0, 1, 1, 1])
+    matrix = scene.root.find("texture/transform/matrix")
+    assert matrix is not None
+    assert matrix.get("value", "").split()[6:8] == ["0", "1"]  # v · 1 + 1
+
+
 def test_light_of_0_6_has_its_colour_and_level(write: Callable[..., Path], loaded: Loaded) -> None:
     for written, expected in (
         ('<spectrum name="radiance" value="2"/>', [2, 2, 2]),  # Mitsuba 3: 2.4, 1.9, 1.8
@@ -178,21 +195,32 @@ MIXTURE = """<bsdf type="mixturebsdf"><string name="weights" value=".5, .2"/><bs
     [
         ('<bsdf type="conductor"/>', "0.201005, 0.92375, 1.10222", None),  # copper
         ('<bsdf type="roughdielectric"><string name="distribution" value="phong"/></bsdf>', "beckmann", "distribution"),
-        ('<bsdf type="ward"><float name="alphaU" value=".2"/></bsdf>', "alpha = [0.2]", "ward"),
+        ('<bsdf type="ward"><float name="alphaU" value=".2"/><float name="alphaV" value=".2"/></bsdf>',
+         "alpha = [0.2]", "ward"),
         ('<bsdf type="roughdiffuse"><float name="alpha" value=".3"/></bsdf>', "SmoothDiffuse", "roughdiffuse"),
         ('<bsdf type="coating"><bsdf type="diffuse"><srgb name="reflectance" value=".5"/></bsdf></bsdf>',
          "diffuse_reflectance = SRGBReflectanceSpectrum[ value = [[0.214041, 0.214041, 0.214041]]", "coating"),
         ('<bsdf type="conductor"><spectrum name="eta" value="1.5"/><spectrum name="k" value="400:3, 700:3"/></bsdf>',
          "1.5, 1.5, 1.5", None),
+        ('<bsdf type="phong"><rgb name="specularReflectance" value=".9 .5 .1"/></bsdf>', "0.9, 0.5, 0.1", "phong"),
+        ('<bsdf type="coating"><rgb name="specularReflectance" value=".6 .5 .1"/><bsdf type="diffuse"/></bsdf>',
+         "0.6, 0.5, 0.1", "coating"),
+        ('<texture type="checkerboard" id="T"/><texture type="scale" id="S"><float name="scale" value=".25"/>'
+         '<ref id="T"/></texture><bsdf type="bumpmap"><ref id="S"/><bsdf type="diffuse"/></bsdf>',
+         "scale = 0.25", None),
+        ('<texture type="bitmap" id="T"><string name="filename" value="n.png"/><float name="gamma" value="1"/>'
+         '</texture><bsdf type="normalmap"><ref id="T"/><bsdf type="diffuse"/></bsdf>', "NormalMap", None),
         (MIXTURE, "weight = UniformSpectrum[value=[0.5]]", None),
         ('<bsdf type="bumpmap"><texture type="scale"><float name="scale" value=".25"/><texture type="checkerboard"/>'
          '</texture><bsdf type="diffuse"/></bsdf>', "scale = 0.25", None),
     ],
 )  # fmt: skip
 def test_materials_of_0_6_have_its_defaults_or_are_the_nearest(
-    write: Callable[..., Path], loaded: Loaded, written: str, described: str, said: str | None
+    write: Callable[..., Path], loaded: Loaded, tmp_path: Path, written: str, described: str, said: str | None
 ) -> None:
-    scene, made = loaded(write(f'<shape type="rectangle" id="Plate">{written}</shape>', "0.6.0"))
+    Image.fromarray(np.full((2, 2, 3), (128, 128, 255), np.uint8)).save(tmp_path / "n.png")
+    textures, bsdf, rest = written.partition("<bsdf")
+    scene, made = loaded(write(f'{textures}<shape type="rectangle" id="Plate">{bsdf}{rest}</shape>', "0.6.0"))
     assert described in " ".join(str(made.shapes()[0].bsdf()).split())
     assert [change.name for change in scene.changes if change.effect is None] == ([said] if said else [])
     assert not [change for change in scene.changes if change.effect]
@@ -212,6 +240,12 @@ def test_materials_of_0_6_have_its_defaults_or_are_the_nearest(
         ('<emitter type="collimated"/>', "light", "collimated"),
         ('<emitter type="envmap"><string name="filename" value="grey.png"/><float name="gamma" value="1"/></emitter>',
          "light", "gamma"),
+        ('<shape type="disk"><bsdf type="phong"><texture name="exponent" type="checkerboard"/></bsdf></shape>',
+         "colour", "exponent"),
+        ('<shape type="disk"><bsdf type="ward"><float name="alphaU" value=".2"/></bsdf></shape>', "colour", "alphaV"),
+        ('<shape type="disk"><bsdf type="mask"><rgb name="opacity" value=".9 .1 .1"/><bsdf type="diffuse"/></bsdf>'
+         "</shape>",
+         "colour", "opacity"),
         ('<shape type="heightfield"/>', "geometry", "heightfield"),
         ('<shape type="sphere"><subsurface type="dipole"/></shape>', "colour", "subsurface"),
         ('<shape type="obj"><string name="filename" value="it.obj"/></shape>', "colour", "mtllib"),
@@ -285,6 +319,42 @@ def test_instances_become_shapes_where_they_stand(write: Callable[..., Path], lo
     assert [float(shape.bbox().max[0]) for shape in made.shapes()] == [4, 2]
 
 
+@pytest.mark.parametrize(
+    ("kind", "inside", "step"),
+    [
+        ("sphere", "", '<scale x="-1"/>'),
+        ("sphere", '<boolean name="flip_normals" value="true"/>', '<scale y="-2"/>'),
+        ("sphere", '<point name="center" x=".1" y="0" z="0"/>', '<scale x="2"/>'),
+        ("cylinder", '<point name="p0" x="-1" y="0" z="0"/>', '<scale y="3"/><rotate z="1" angle="10"/>'),
+        ("cylinder", '<point name="p0" x="-1" y="0" z="0"/>', '<scale x="-1"/>'),
+        ("disk", "", '<scale x="2" z="-1"/>'),
+        ("rectangle", "", '<scale x="-1"/>'),
+        ("cube", "", '<scale x="-1"/>'),
+        ("cube", '<boolean name="face_normals" value="true"/>', '<scale x="-1"/>'),
+        ("ply", "", '<scale x="-1"/>'),
+        ("obj", "", '<scale x="-1"/>'),
+        ("obj", '<boolean name="face_normals" value="true"/>', '<scale z="-1"/>'),
+    ],
+)
+def test_instances_have_the_surface_and_the_front_that_mitsuba_gives_them(
+    write: Callable[..., Path], loaded: Loaded, tmp_path: Path, kind: str, inside: str, step: str
+) -> None:
+    (tmp_path / "it.obj").write_text("v -1 -1 0\nv 1 -1 0\nv 0 1 0\nf 1 2 3\n")
+    header = "ply\nformat ascii 1.0\nelement vertex 3\n" + "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "element face 1\nproperty list uchar int vertex_index\nend_header\n"
+    (tmp_path / "it.ply").write_text(header + "-1 -1 0\n1 -1 0\n0 1 0\n3 0 1 2\n")
+    named = f'<string name="filename" value="it.{kind}"/>' if kind in ("obj", "ply") else ""
+    path = write(f"""<shape type="shapegroup" id="Group"><shape type="{kind}">{named}{inside}</shape></shape>
+      <shape type="instance"><ref id="Group"/><transform name="to_world">{step}</transform></shape>""")
+    scene, made = loaded(path)
+    meant = mi.load_file(str(path))
+    hit, expected = (each.ray_intersect(mi.Ray3f([-0.3, 0.2, 9], [0, 0, -1])) for each in (made, meant))
+    assert not [change for change in scene.changes if change.effect]
+    assert np.array(hit.p).ravel() == pytest.approx(np.array(expected.p).ravel(), abs=2e-3)
+    assert np.array(hit.sh_frame.n).ravel() == pytest.approx(np.array(expected.sh_frame.n).ravel(), abs=0.02)
+    assert np.array(hit.uv).ravel() == pytest.approx(np.array(expected.uv).ravel(), abs=0.02)
+
+
 def test_names_values_and_paths_are_resolved_by_mitsuba(
     write: Callable[..., Path], loaded: Loaded, tmp_path: Path
 ) -> None:
@@ -353,11 +423,62 @@ def test_the_camera_says_where_the_room_is_and_which_axis_is_up(write: Callable[
         ),
         ('<include filename="scene.xml"/>', "line 2: .* includes itself"),
         ("&gone;", "undefined entity: line 2.*gone"),
+        (
+            '<shape type="sphere"/><emitter type="constant"/>\n<emitter type="sunsky"/>',
+            "line 2: .* and .*line 3: .*keep one .*sunsky",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(write: Callable[..., Path], loaded: Loaded, content: str, named: str) -> None:
     with pytest.raises(SpecError, match=named):
         loaded(write(content))
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        ('<bsdf type="coating"><float name="intIOR" value="1.7"/></bsdf>', "line 2: .*no material under"),
+        ('<bsdf type="diffuse"><texture type="scale" name="reflectance"/></bsdf>', "line 2: .*no texture to scale"),
+        ('<transform name="toWorld"><lookat origin="0 0 5" target="0 0"/></transform>', "line 2: .*target.* 2 numbers"),
+        ('<transform name="toWorld"><lookAt target="0 0 0" up="0 1 0"/></transform>', "line 2: .*'origin' .*0 numbers"),
+        ('<emitter type="area"/></shape><emitter type="sun"/><emitter type="sky"/><shape type="disk">',
+         "line 2: .* and .*line 2: .*keep one"),
+    ],
+)  # fmt: skip
+def test_what_is_wrong_in_0_6_is_named(write: Callable[..., Path], loaded: Loaded, content: str, named: str) -> None:
+    with pytest.raises(SpecError, match=named):
+        loaded(write(f'<shape type="rectangle">{content}</shape>', "0.6.0"))
+
+
+@pytest.mark.parametrize("entity", ['<shape type="&s;"/>', '<shape type="sphere">&s;</shape>'])
+def test_entities_of_other_files_are_refused(tmp_path: Path, loaded: Loaded, entity: str) -> None:
+    path = tmp_path / "scene.xml"
+    path.write_text(f'<!DOCTYPE scene SYSTEM "s.dtd" [<!ENTITY t "cube">]><scene version="3.0.0">\n{entity}</scene>')
+    with pytest.raises(SpecError, match="line 2: entity 's'"):
+        loaded(path)
+    path.write_text(path.read_text().replace(entity, '<shape type="&t;" id="a&gt;b"/>'))
+    assert len(loaded(path)[1].shapes()) == 1
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_faces_of_vertices_that_are_not_there_are_named(
+    write: Callable[..., Path], loaded: Loaded, tmp_path: Path, binary: bool
+) -> None:
+    header = f"ply\nformat {'binary_little_endian' if binary else 'ascii'} 1.0\nelement vertex 4\n"
+    header += "".join(f"property float {axis}\n" for axis in "xyz")
+    header += "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    corners = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
+    path = write('<shape type="ply"><string name="filename" value="it.ply"/></shape>')
+    for last in (3, 4):
+        faces = [[0, 1, 2, 3], [0, 1, last]]
+        packed = b"".join(bytes([len(face)]) + np.array(face, "<i4").tobytes() for face in faces)
+        rows = [*corners.tolist(), *([len(face), *face] for face in faces)]
+        body = "\n".join(" ".join(map(str, row)) for row in rows).encode()
+        (tmp_path / f"{last}.ply").write_bytes(header.encode() + (corners.tobytes() + packed if binary else body))
+    assert mitsuba_ply.fault(tmp_path / "3.ply") == ""
+    (tmp_path / "4.ply").rename(tmp_path / "it.ply")
+    with pytest.raises(SpecError, match=r"line 2: <shape>.*it\.ply: face 1 names vertex 4, and it has 4"):
+        loaded(path)
 
 
 def test_settings_of_the_renderer_are_said_where_they_mean_another_picture(

@@ -7,6 +7,9 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder
 from xml.parsers import expat
 
+_TAG = re.compile(rb"""<[^\s>"']+(?:[^>"']|"[^"]*"|'[^']*')*>""")
+"""A tag as it is written, with its attributes."""
+
 
 class Located(Element):
     """An element and the line of its file that it begins in."""
@@ -24,6 +27,8 @@ def parse(path: Path) -> Located:
     """The root of an XML file; raises OSError, or ParseError for what is no XML and for content that lies elsewhere."""
     builder = TreeBuilder(element_factory=Located)
     parser = expat.ParserCreate()
+    data = path.read_bytes()
+    known = {"lt", "gt", "amp", "quot", "apos"}
 
     def refuse(name: str, *_: object) -> int:
         raise ParseError(
@@ -32,13 +37,17 @@ def parse(path: Path) -> Located:
         )
 
     def start(tag: str, attributes: dict[str, str]) -> None:
+        written = _TAG.match(data, parser.CurrentByteIndex) if b"<!DOCTYPE" in data else None
+        for name in re.findall(rb"&([^#;\s][^;\s]*);", written[0]) if written else ():
+            if name.decode() not in known:  # expat leaves it out without a word
+                refuse(name.decode())
         element = builder.start(tag, attributes)
         if isinstance(element, Located):
             element.line = parser.CurrentLineNumber
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
+    parser.EntityDeclHandler = lambda name, *_: known.add(name)
     parser.ExternalEntityRefHandler = parser.SkippedEntityHandler = refuse
-    data = path.read_bytes()
     try:
         parser.Parse(data, True)
     except expat.ExpatError as error:

@@ -110,10 +110,14 @@ def make_normals_usable(scene: ImportedScene, loaded: Any) -> bool:
         normals = np.array(each.vertex_normals_buffer(), np.float32).reshape(-1, 3)
         if (np.abs(normals).max(axis=1, initial=0) > 0).all():  # false for NaN
             continue
-        element = shapes[each.id()]
-        scene.meshes[each.id()] = of_shape(each).usable(each.id(), scene.changes)
+        mended, element, mesh = True, shapes[each.id()], of_shape(each).usable(each.id(), scene.changes)
+        if not len(mesh.faces):
+            scene.root.remove(element)
+            continue
+        scene.meshes[each.id()] = mesh
         element[:] = [part for part in element if part.tag in ("ref", "bsdf", "emitter")]
         element.set("type", "ply")
         elements.put_value(element, "filename", "")
-        mended = True
+        if mesh.normals is None:
+            elements.put_value(element, "face_normals", True)
     return mended

@@ -51,7 +51,7 @@ class Mesh:
         its faces get their own.
         """
         across = self._across()
-        known: NDArray[np.bool_] = np.isfinite(across).all(axis=1)
+        known = np.asarray(np.isfinite(across).all(axis=1))
         flat = np.asarray(np.linalg.norm(across, axis=1) == 0)
         mesh = self if (known & ~flat).all() else self.part(known & ~flat)
         if not known.all():
@@ -135,7 +135,23 @@ def of_shape(shape: Any) -> Mesh:
         uv = np.array(shape.vertex_texcoords_buffer(), np.float64).reshape(-1, 2)
     if shape.has_attribute("vertex_color"):
         colours = np.array(mi.traverse(shape)["vertex_color"], np.float64).reshape(-1, 3)
-    return Mesh(vertices, faces, normals, uv, colours)
+    mesh = Mesh(vertices, faces, normals, uv, colours)
+    if not _is_turned(shape, mesh):
+        return mesh
+    return replace(mesh, faces=faces[:, ::-1], normals=None if normals is None else -normals)
+
+
+def _is_turned(shape: Any, mesh: Mesh) -> bool:
+    """Whether Mitsuba has the fronts of a shape on the other side, by `flip_normals` or as it is mirrored."""
+    import mitsuba as mi
+
+    across = mesh._across()
+    face = int(np.nan_to_num(np.linalg.norm(across, axis=1)).argmax())
+    middle, normal = mesh.vertices[mesh.faces[face]].mean(axis=0), unit(across[face])
+    origin = middle + 1e-3 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))) * normal
+    alone = mi.load_dict({"type": "scene", shape.id(): shape})  # another key would rename it
+    hit = alone.ray_intersect(mi.Ray3f(mi.Point3f(*origin.tolist()), mi.Vector3f(*(-normal).tolist())))
+    return bool(np.array(hit.n, np.float64).ravel() @ normal < 0)
 
 
 def write_ply(mesh: Mesh, file: Path) -> Path:

@@ -38,9 +38,10 @@ the point of view is inside of a thing, and not of a room."""
 PART = 0.6
 """What is a smaller part of the scene, or shows more backs of surfaces, is a room only if something is in it."""
 
-GROUND, AROUND, RISES = 0.25, 1.5, 0.75
-"""There is ground where rays from above meet that share of the lowest level; outdoors reaches so many times the size of
-what stands there beyond it, and is at least so high, as a share of its lengths, that cameras look down on it."""
+GROUND, THICK, AROUND, RISES = 0.25, 0.25, 1.5, 0.75
+"""There is ground where rays from above meet that share of one level, and not higher than the second share of all that
+is there, as ground may be a slab; outdoors reaches so many times the size of what stands there beyond it, and is at
+least so high, as a share of its lengths, that cameras look down on it."""
 
 NEAR_FLOOR = 0.03
 """Flat surfaces within this share of the room's height are the floor, or lie on it."""
@@ -98,7 +99,7 @@ def find_room(
     """
     rng = np.random.default_rng(0)
     low, high = extent_of(surfaces)
-    if camera is not None and ((camera < low) | (camera > high)).any():
+    if camera is not None and (((camera < low) | (camera > high)).any() or _in_solid(scene, frame, camera[None])[0]):
         camera = None
     viewpoints = _best_viewpoint(scene, frame, low, high, rng, others) if camera is None else camera[None]
     seen = []
@@ -125,16 +126,23 @@ def outdoors(scene: Any, surfaces: Surfaces, frame: Frame) -> Room:
     steps = np.stack(np.meshgrid(*(np.arange(32) + 0.5,) * 2, indexing="ij"), axis=-1).reshape(-1, 2) / 32
     above = np.column_stack([low[:2] + steps * (high - low)[:2], np.full(len(steps), high[2] + 10 * level)])
     met = above[:, 2] - trace(scene, frame, above, np.tile([0.0, 0.0, -1.0], (len(above), 1)))[0]
-    near = np.abs(met - low[2]) < level
-    if near.mean() < GROUND:
+    levels = np.sort(met[met < low[2] + THICK * (high[2] - low[2]) + level])
+    share = (np.searchsorted(levels, levels + 2 * level) - np.arange(len(levels))) / len(met)
+    if share.max(initial=0) < GROUND:
         return Room(low, high, has_ceiling=False, is_stage=True)
-    floor = float(np.median(met[near]))
+    lowest = levels[np.argmax(share >= GROUND)]
+    floor = float(np.median(met[(met >= lowest) & (met < lowest + 2 * level)]))
     rising = surfaces.corners[surfaces.corners[:, :, 2].max(axis=1) > floor + level].reshape(-1, 3)
     first, last = (rising.min(axis=0), rising.max(axis=0)) if len(rising) else (low, high)
     reach = AROUND * float((last - first).max())
     low, high = np.maximum(low, first - reach), np.minimum(high, last + reach)
     low[2], high[2] = floor, max(last[2], floor + RISES * float(np.sqrt((high - low)[:2].prod())))
     return Room(low, high, has_ceiling=False, subject=(np.array([*first[:2], floor]), last))
+
+
+def _in_solid(scene: Any, frame: Frame, points: Points) -> NDArray[np.bool_]:
+    """Which points (N, 3) are in a solid, (N,)."""
+    return np.asarray(surroundings(scene, frame.world(points).astype(np.float32)).solid != NONE)
 
 
 def _best_viewpoint(
@@ -147,7 +155,7 @@ def _best_viewpoint(
     distance, back = (values.reshape(len(grid), -1) for values in (hits.distance, hits.is_back))
     met = np.isfinite(distance)
     enclosed = met.mean(axis=1)
-    solid = surroundings(scene, frame.world(grid).astype(np.float32)).solid != NONE
+    solid = _in_solid(scene, frame, grid)
     enclosed[solid & ((back & met).sum(axis=1) > PART * met.sum(axis=1))] = -1
     for room in others:
         enclosed[((grid > room.low) & (grid < room.high)).all(axis=1)] = -1

@@ -34,10 +34,8 @@ _PROPERTIES: dict[tuple[str, str], str | None] = {
     ("directional", "intensity"): "irradiance",
     ("envmap", "intensity_scale"): "scale",
     ("diffuse", "diffuse_reflectance"): "reflectance",
-    ("ward", "alpha_u"): "alpha",
     **dict.fromkeys(
-        [("ward", "alpha_v"), ("ward", "variant"), ("ward", "specular_reflectance"), ("phong", "specular_reflectance"),
-         ("roughdiffuse", "alpha"), ("roughdiffuse", "use_fast_approx"),
+        [("ward", "variant"), ("roughdiffuse", "alpha"), ("roughdiffuse", "use_fast_approx"),
          ("bitmap", "cache"), ("bitmap", "max_anisotropy"), ("envmap", "cache"), ("obj", "collapse"),
          ("sky", "resolution"), ("sun", "resolution"), ("sunsky", "resolution")]
     ),
@@ -104,8 +102,8 @@ class Upgrade:
         elif name == "distribution" and part.get("value", "").lower() in ("as", "phong"):
             part.set("value", "beckmann")  # Walter et al. 2007: of the same α, they are about as wide
             self.changes.note("became 'beckmann', of the same width", elements.place(node), name="distribution")
-        elif part.tag == "lookat" and not part.get("up"):
-            part.set("up", _any_up(part))
+        elif part.tag == "lookat":
+            _look(part)
         elif name == "ext_eta" and part.get("value") in ("air", "vacuum", "1", "1.0"):
             node.remove(part)
         elif (colour := of_old(part)) is not None:
@@ -129,6 +127,18 @@ class Upgrade:
     def lose(self, effect: Effect, name: str, meaning: str, node: Element) -> None:
         """Say what is lost of an element."""
         self.changes.lose(effect, self.names.get(name, name), meaning, elements.place(node))
+
+
+def _look(step: Element) -> None:
+    """Its three vectors, which were nine numbers before 0.4; raises ValueError for one that is not of three numbers."""
+    for key in ("origin", "target", "up"):
+        if f"{key[0]}x" in step.attrib:
+            step.set(key, " ".join(step.attrib.pop(f"{key[0]}{axis}", "") for axis in "xyz"))
+        count = len(numbers_of(step.get(key, "")))
+        if count != 3 and (key != "up" or count):
+            raise ValueError(f"{key!r} of <lookat> has {count} numbers, and needs three: x, y and z")
+    if not step.get("up"):
+        step.set("up", _any_up(step))
 
 
 def _any_up(step: Element) -> str:
@@ -157,7 +167,7 @@ def _texture(_: Upgrade, texture: Element) -> None:
     both = _taken(texture, "uvscale", "1")
     scale = {axis: _taken(texture, f"{uv}scale", both) for axis, uv in zip("xy", "uv", strict=True)}
     offset = {axis: _taken(texture, f"{uv}offset", "0") for axis, uv in zip("xy", "uv", strict=True)}
-    if {*scale.values(), *offset.values()} != {"0", "1"}:
+    if {*scale.values()} != {"1"} or {*offset.values()} != {"0"}:
         SubElement(texture, "transform", name="to_uv").extend([Element("scale", scale), Element("translate", offset)])
 
 
@@ -186,17 +196,30 @@ def _bitmap(upgrade: Upgrade, texture: Element) -> None:
 def _scaled_texture(upgrade: Upgrade, texture: Element) -> None:
     """The texture or the colour that was scaled; a height's factor becomes that of its bump map."""
     factor = np.array(numbers_of(_taken(texture, "scale", "1")))
-    inner, parent = texture[0], elements.parents(upgrade.root)[texture]
-    if parent.get("type") == "bumpmap":
-        elements.put_value(parent, "scale", float(factor.mean()))
-    elif inner.tag == "rgb":
+    if not len(texture):
+        raise ValueError("it has no texture to scale; put one in")
+    inner, above = texture[0], elements.parents(upgrade.root)
+    users = [ref for ref in upgrade.root.iter("ref") if ref.get("id") == texture.get("id", "")]
+    around = [above[user] for user in users] + [above[texture]] * (above[texture] is not upgrade.root)
+    for bump in [user for user in around if user.get("type") == "bumpmap"]:
+        elements.put_value(bump, "scale", float(factor.mean()))
+        around.remove(bump)
+    if inner.tag == "rgb":
         inner.set("value", elements.numbers((factor * numbers_of(inner.get("value", ""))).tolist()))
-    elif (factor != 1).any():
+    elif (factor != 1).any() and around:
         upgrade.lose("colour", "scale", "a factor of a texture is left out: Mitsuba 3 has none", texture)
     inner.attrib.pop("name", None)
-    kept = ("name",) if inner.tag == "ref" else ("name", "id")
-    inner.attrib.update({key: text for key, text in texture.attrib.items() if key in kept})
+    if users and inner.tag != "rgb":
+        inner.attrib.setdefault("id", texture.get("id", ""))
+    for user in users:
+        made = Element("ref", id=inner.get("id", "")) if inner.tag != "rgb" else elements.copied(inner)
+        made.attrib.update({key: text for key, text in user.attrib.items() if key == "name"})
+        above[user][list(above[user]).index(user)] = made
+    inner.attrib.update({key: text for key, text in texture.attrib.items() if key == "name"})
+    parent = above[texture]
     parent[list(parent).index(texture)] = inner
+    if parent is upgrade.root and inner.tag != "texture":
+        parent.remove(inner)
 
 
 def _obj(upgrade: Upgrade, shape: Element) -> None:
@@ -212,21 +235,48 @@ def _conductor(_: Upgrade, bsdf: Element) -> None:
         elements.put_value(bsdf, "material", "Cu")
 
 
-def _phong(_: Upgrade, bsdf: Element) -> None:
+def _width(upgrade: Upgrade, bsdf: Element, name: str, otherwise: str) -> float:
+    """A number that says how wide a lobe is, taken out; a texture of them is lost, as one width is all a lobe has."""
+    found = elements.child(bsdf, name)
+    if found is not None and found.tag in ("texture", "ref"):
+        upgrade.lose("colour", name, f"its texture became {otherwise}, the default: Mitsuba 3 has a number here", bsdf)
+        bsdf.remove(found)
+    return float(_taken(bsdf, name, otherwise))
+
+
+def _phong(upgrade: Upgrade, bsdf: Element) -> None:
     """Walter et al. 2007: a Phong lobe of exponent n is about as wide as a Beckmann lobe of α = √(2 / (n + 2))."""
-    elements.put_value(bsdf, "alpha", math.sqrt(2 / (float(_taken(bsdf, "exponent", "30")) + 2)))
+    elements.put_value(bsdf, "alpha", math.sqrt(2 / (_width(upgrade, bsdf, "exponent", "30") + 2)))
+
+
+def _ward(upgrade: Upgrade, bsdf: Element) -> None:
+    """One width of the lobe in place of one along u and one along v."""
+    along_u, along_v = (_width(upgrade, bsdf, f"alpha_{axis}", "0.1") for axis in "uv")
+    if along_u != along_v:
+        said = f"{along_u:g} along u and {along_v:g} along v became one width: the nearest in Mitsuba 3 has no other"
+        upgrade.lose("colour", "alphaV", said, bsdf)
+    elements.put_value(bsdf, "alpha", math.sqrt(along_u * along_v))
+
+
+def _mask(upgrade: Upgrade, bsdf: Element) -> None:
+    """An opacity by colour is lost: Mitsuba 3 has one for all."""
+    opacity = elements.child(bsdf, "opacity")
+    if opacity is not None and opacity.tag == "rgb" and len({*numbers_of(opacity.get("value", ""))}) > 1:
+        upgrade.lose("colour", "opacity", "became grey: Mitsuba 3 has one opacity for all colours", bsdf)
 
 
 def _coating(upgrade: Upgrade, bsdf: Element) -> None:
     """A coat on a diffuse material is plastic; of others, what lies under the coat stays."""
-    under = next(node for node in bsdf if node.tag == "bsdf" or (node.tag == "ref" and not node.get("name")))
+    inside = (node for node in bsdf if node.tag == "bsdf" or (node.tag == "ref" and not node.get("name")))
+    if (under := next(inside, None)) is None:
+        raise ValueError("it has no material under its coat; put one in")
     bsdf.remove(under)
     same = (node for node in upgrade.root.iter("bsdf") if under.tag == "ref" and node.get("id") == under.get("id"))
     found, kind = next(same, under), bsdf.get("type", "")
     if found.get("type") == "diffuse":
-        bsdf.extend(elements.copied(part) for part in found)
-        for part in bsdf:
+        for part in map(elements.copied, found):
             part.set("name", part.get("name", "").replace("reflectance", "diffuse_reflectance"))
+            bsdf.append(part)
         bsdf.set("type", kind.replace("coating", "plastic"))
         upgrade.changes.note("on a diffuse material became plastic", elements.place(bsdf), name=kind)
     else:
@@ -238,7 +288,7 @@ def _mixture(_: Upgrade, bsdf: Element) -> None:
     """Blends of two, one in another; what the weights leave of 1 is absorbed, as in 0.6."""
     weights = numbers_of(_taken(bsdf, "weights", ""))
     mixed = [node for node in bsdf if node.tag in ("bsdf", "ref")]
-    if len(weights) != len(mixed):
+    if len(weights) != len(mixed) or not mixed:
         raise ValueError(f"it has {len(weights)} weights for {len(mixed)} materials")
     black = Element("bsdf", type="diffuse")
     elements.put_value(black, "reflectance", (0.0, 0.0, 0.0))
@@ -257,9 +307,11 @@ def _blend(bsdf: Element, parts: list[tuple[float, Element]]) -> None:
     bsdf.set("type", "blendbsdf")
 
 
-def _normalmap(_: Upgrade, bsdf: Element) -> None:
-    for node in bsdf.findall("texture"):
-        node.set("name", "normalmap")
+def _normalmap(upgrade: Upgrade, bsdf: Element) -> None:
+    textures = {node.get("id") for node in upgrade.root.iter("texture")} - {None}
+    for node in bsdf:
+        if node.tag == "texture" or (node.tag == "ref" and node.get("id") in textures):
+            node.set("name", "normalmap")
 
 
 def _sky(upgrade: Upgrade, emitter: Element) -> None:
@@ -289,6 +341,7 @@ def _sky(upgrade: Upgrade, emitter: Element) -> None:
 _UPGRADES: dict[str, Callable[[Upgrade, Element], None]] = {
     "bitmap": _bitmap, "ldrtexture": _bitmap, "checkerboard": _texture,
     "scale": _scaled_texture, "obj": _obj, "conductor": _conductor, "roughconductor": _conductor, "phong": _phong,
+    "ward": _ward, "mask": _mask,
     "coating": _coating, "roughcoating": _coating, "mixturebsdf": _mixture, "normalmap": _normalmap,
     "sky": _sky, "sun": _sky, "sunsky": _sky,
 }  # fmt: skip

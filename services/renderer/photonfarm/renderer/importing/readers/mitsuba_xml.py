@@ -14,7 +14,13 @@ import numpy as np
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import Changes, listed
 from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
-from photonfarm.renderer.importing.readers import mitsuba_files, mitsuba_instances, mitsuba_old, mitsuba_parts
+from photonfarm.renderer.importing.readers import (
+    mitsuba_files,
+    mitsuba_instances,
+    mitsuba_old,
+    mitsuba_parts,
+    mitsuba_ply,
+)
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.located_xml import Located, line_of
@@ -24,6 +30,9 @@ _TAGS = {"PhaseFunction": "phase", "ReconstructionFilter": "rfilter"}
 
 _OF_FILES = ("bitmap", "envmap", "obj", "ply", "serialized")
 """The plugins that are nothing without a file; Mitsuba crashes on a bitmap that names none."""
+
+_AROUND = ("constant", "envmap", "sunsky", "timed_sunsky")
+"""The emitters that light a scene from all around."""
 
 _FULL = ("path", "bdpt", "ptracer", "volpath", "volpathmis", "volpath_simple", "mlt", "pssmlt", "erpt", "photonmapper",
          "ppm", "sppm", "vpl", "adaptive", "irrcache", "prb", "prb_basic", "prb_projective")  # fmt: skip
@@ -44,8 +53,9 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     scene.camera, scene.up = _camera(scene.root)
     _drop_settings(scene.root, scene.changes)
     mitsuba_parts.mend(scene.root, scene.changes)
-    mitsuba_instances.expand(scene.root, scene.changes)
+    _want_one_environment(scene.root)
     _find_files(scene.root, files)
+    mitsuba_instances.expand(scene.root, scene.changes, scratch)
     _name_shapes(scene)
     if scene.root.find("shape") is None:
         raise SpecError(f"{path}: has no shape that photonfarm can render")
@@ -127,6 +137,16 @@ def _drop_settings(root: Element, changes: Changes) -> None:
             changes.note("cameras are perspective here", elements.place(node), name=kind)
 
 
+def _want_one_environment(root: Element) -> None:
+    """Raise SpecError for two lights all around, which Mitsuba 3 does not add."""
+    found = [elements.place(node) for node in root.findall("emitter") if node.get("type") in _AROUND]
+    if len(found) > 1:
+        raise SpecError(
+            f"{' and '.join(found)} light the scene from all around, which in Mitsuba 3 one light can; keep one "
+            '(a sun and a sky are one as <emitter type="sunsky"/>)'
+        )
+
+
 def _find_files(root: Element, files: mitsuba_files.Files) -> None:
     """Make the names of files absolute; raises SpecError for one that is not there, or not named where it must be."""
     for node in root.iter():
@@ -141,6 +161,11 @@ def _find_files(root: Element, files: mitsuba_files.Files) -> None:
                 f"{beside}: line {line_of(node)}: file {name!r} is not there; put it there, or take its place out"
             )
         node.set(key, str(file))
+    for node in root.iter("shape"):
+        named = elements.child(node, "filename")
+        file = Path("" if named is None else named.get("value", ""))
+        if node.get("type") == "ply" and (fault := mitsuba_ply.fault(file)):
+            raise SpecError(f"{elements.place(node)}: {file}: {fault}; write the mesh anew")
 
 
 def _name_shapes(scene: ImportedScene) -> None:

@@ -25,7 +25,7 @@ Lamp = dict[str, Any]
 Profile = Callable[[Floats, Floats], Floats]
 
 AXES = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""From Blender's coordinates, z up, to glTF's, y up."""
+"""The map of Blender's coordinates, z up, to glTF's, y up."""
 
 PARTS = 16
 """Spots with a radius, and areas of a small spread, become so many spots, which have no extent in Mitsuba."""

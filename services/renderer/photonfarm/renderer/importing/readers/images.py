@@ -20,6 +20,10 @@ _OF_FLOATS = (b"\x76\x2f\x31\x01", b"#?", b"PF", b"Pf")
 """How files of OpenEXR, Radiance and PFM begin."""
 
 
+RGB_OF_XYZ = np.array([[3.24048, -1.53715, -0.498535], [-0.969256, 1.87599, 0.041556], [0.055648, -0.204043, 1.05731]])
+"""Linear sRGB of CIE XYZ (ITU-R BT.709's primaries)."""
+
+
 def decoded(data: bytes, what: str, *, raw: bool = False) -> Image:
     """An encoded image of any depth as RGBA (H, W, 4), its values as they are stored; profiles of colour are ignored.
 

@@ -14,8 +14,6 @@ from photonfarm.renderer.importing.readers import images
 Colour = NDArray[np.float64]
 """Linear sRGB, (3,)."""
 
-_RGB_OF_XYZ = np.array([[3.24048, -1.53715, -0.498535], [-0.969256, 1.87599, 0.041556], [0.055648, -0.204043, 1.05731]])
-
 
 def of_old(node: Element) -> Colour | None:
     """The colour of an element of Mitsuba 0.6, None for what is none; raises ValueError for numbers that are none.
@@ -42,7 +40,7 @@ def of_old(node: Element) -> Colour | None:
         raise ValueError(f"{text!r} has {len(numbers)} numbers, and a colour has one or three")
     values = np.broadcast_to(np.array(numbers), 3)
     if node.tag == "xyz":
-        return _RGB_OF_XYZ @ values
+        return images.RGB_OF_XYZ @ values
     return images.linear(values.astype(np.float32)).astype(np.float64) if node.tag == "srgb" else values
 
 

@@ -33,9 +33,6 @@ RELIEFS = ("norm", "map_bump", "bump")
 
 _CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
 
-_OF_XYZ = ((3.2404542, -1.5371385, -0.4985314), (-0.969266, 1.8760108, 0.041556), (0.0556434, -0.2040259, 1.0572252))
-"""Linear sRGB of CIE XYZ (IEC 61966-2-1)."""
-
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -145,7 +142,7 @@ class Material:
         if len(values) != len(otherwise) or not all(map(math.isfinite, values)):
             place = f"{self.file}: line {line}: material {self.name!r}"
             raise SpecError(f"{place}: {word} = {rest!r} is no number, or three")
-        return [float(part) for part in np.array(_OF_XYZ) @ values] if form == "xyz" else values
+        return [float(part) for part in images.RGB_OF_XYZ @ values] if form == "xyz" else values
 
     def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
         """The numbers of a line from 0 to `most`, to which others are cut; black is white where `otherwise` is."""

@@ -50,7 +50,7 @@ def emitters(tmp_path: Path) -> Callable[..., list[Any]]:
         scene = ImportedScene()
         lamps = Lamps(scene, tmp_path)
         lamps.put(LAMP | numbers)
-        lamps.put_sky(None)
+        lamps.put_sky([0.0, 0.0, 0.0])
         scene.write_meshes(tmp_path)
         elements.write(scene.root, tmp_path / "lamp.xml")
         with threads_to_read_with():
@@ -121,7 +121,10 @@ def test_an_area_shines_down_by_its_area_in_the_world(
     emitters: Callable[..., Any], shape: str, area: float, normalize: bool
 ) -> None:
     scaled = np.diag([2.0, -3.0, 1, 1]).tolist()
-    (light,) = emitters(kind="AREA", shape=shape, normalize=normalize, matrix=scaled)
+    for matrix in (STRAIGHT_DOWN, scaled):
+        (light,) = emitters(kind="AREA", shape=shape, normalize=normalize, matrix=matrix)
+        axes = np.array(mi.traverse(light.get_shape())["to_world"].matrix).reshape(4, 4)[:3, :3]
+        assert np.linalg.det(axes) > 0  # the corners of its triangles are those of its front
     assert float(light.get_shape().surface_area()[0]) == pytest.approx(6 * area, rel=1e-4)
     radiance = np.array(mi.traverse(light)["radiance.value"]).ravel()
     assert radiance == pytest.approx(np.array([4, 2, 0]) / np.pi / (6 * area if normalize else 1), rel=1e-4)
@@ -254,6 +257,10 @@ for name, flag in (("Hidden", "hide_render"), ("Eye", "hide_viewport")):
     scene.collection.objects.link(made)
 hair = bpy.data.hair_curves.new("Fur")
 scene.collection.objects.link(bpy.data.objects.new("Fur", hair))
+bpy.ops.mesh.primitive_plane_add(size=1, location=(50, 0, 0))
+rug = bpy.context.object
+rug.name, rug.show_instancer_for_render = "Rug", False
+rug.modifiers.new("fur", "PARTICLE_SYSTEM").particle_system.settings.type = "HAIR"
 scene.unit_settings.scale_length = 0.01
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
 """
@@ -276,6 +283,7 @@ def test_all_that_blender_draws_is_there_and_what_is_missing_is_named(tmp_path: 
     assert ball.face_count() == 6 * 16 * 2  # as for renders, not for the window
     said = {(change.effect, change.name): change.places for change in made.changes}
     assert said["geometry", "CURVES"] == ["object 'Fur'"]
+    assert said["geometry", "HAIR"] == ["object 'Rug'"]
     assert (None, "scale_length") in said
 
 
@@ -308,8 +316,26 @@ surface(2, "constant", "ShaderNodeBsdfDiffuse", [("ShaderNodeRGB", "Color")])
 surface(3, "cloudy", "ShaderNodeBsdfPrincipled", [("ShaderNodeTexNoise", "Base Color")])
 surface(4, "waxen", "ShaderNodeBsdfPrincipled", Subsurface_Weight=0.5)
 surface(5, "cloth", "ShaderNodeBsdfSheen")
+surface(10, "velvet", "ShaderNodeBsdfPrincipled", Sheen_Weight=0.5)
+surface(11, "brushed", "ShaderNodeBsdfPrincipled", Anisotropic=0.5, Metallic=1)
+surface(12, "tinted", "ShaderNodeBsdfPrincipled", Specular_Tint=(1, 0.2, 0.2, 1))
+surface(13, "varnished", "ShaderNodeBsdfPrincipled", Coat_Weight=1, Coat_Tint=(1, 0.6, 0.2, 1))
 surface(6, "none", "")
 surface(7, "glass", "ShaderNodeBsdfGlass", Roughness=0, IOR=1.4)
+surface(8, "leaf", "ShaderNodeBsdfPrincipled", [("ShaderNodeTexImage", "Base Color")])
+image = bpy.data.images.new("leaf", 2, 2, alpha=True)
+image.pixels = [0.5, 0.5, 0.5, 1, 0.5, 0.5, 0.5, 0] * 2
+image.pack()
+tree = bpy.data.materials["leaf"].node_tree
+of = {node.type: node for node in tree.nodes}
+of["TEX_IMAGE"].image = image
+tree.links.new(of["TEX_IMAGE"].outputs["Alpha"], of["BSDF_PRINCIPLED"].inputs["Alpha"])
+surface(9, "grouped", "")
+tree = bpy.data.materials["grouped"].node_tree
+group = tree.nodes.new("ShaderNodeGroup")
+group.node_tree = bpy.data.node_groups.new("Group", "ShaderNodeTree")
+group.node_tree.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
+tree.links.new(group.outputs[0], tree.get_output_node("CYCLES").inputs["Surface"])
 world = bpy.data.worlds.new("World")
 world.use_nodes = True
 tree = world.node_tree
@@ -317,6 +343,7 @@ background = tree.get_output_node("CYCLES").inputs["Surface"].links[0].from_node
 direction = tree.nodes.new("ShaderNodeTexCoord")
 tree.links.new(direction.outputs["Generated"], background.inputs["Color"])
 bpy.context.scene.world = world
+bpy.context.scene.view_settings.exposure = 1.5
 bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
 """
 
@@ -338,12 +365,97 @@ def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Pa
         hit = scene.ray_intersect(mi.Ray3f([1.1, -3 * direction, 0.1], [0, direction, 0]))
         assert np.array(hit.emitter(scene).eval(hit)).ravel() == pytest.approx([4, 2, 1], rel=1e-5)
     assert "Dielectric" in str(down(7).bsdf())
+    for x, opacity in ((-0.35, 1), (0.15, 0)):  # of an image's own alpha
+        passing = np.array(down(8 + x).bsdf().eval_null_transmission(down(8 + x))).ravel()
+        assert passing == pytest.approx(1 - opacity, abs=0.01)
     assert {(change.name, *change.places) for change in made.changes if change.effect == "colour"} == {
         ("Noise Texture", "material 'cloudy'"),
         ("Subsurface Weight", "material 'waxen'"),
         ("Sheen BSDF", "material 'cloth'"),
+        ("Sheen Weight", "material 'velvet'"),
+        ("Anisotropic", "material 'brushed'"),
+        ("Specular Tint", "material 'tinted'"),
+        ("Coat Tint", "material 'varnished'"),
+        ("Group", "material 'grouped'"),
     }
+    assert {"Blender's (x, y, z) is (x, z, −y) here", "the view's exposure of +1.5 stops is left out; photonfarm "
+            "sets its own"} <= {change.meaning for change in made.changes}  # fmt: skip
     for axis, colour in (((1, 0, 0), (1, 0, 0)), ((0, 1, 0), (0, 0, 1)), ((0, 0, -1), (0, 1, 0))):
         sky = mi.SurfaceInteraction3f()
         sky.wi = -mi.Vector3f(*axis)  # glTF's y is Blender's z, and its -z Blender's y
         assert np.array(scene.environment().eval(sky)).ravel() == pytest.approx(colour, abs=0.02)
+
+
+EXCHANGED = """
+import bpy, sys
+bpy.ops.wm.read_factory_settings(use_empty=True)
+scene = bpy.context.scene
+scene.world = bpy.data.worlds.new("World")
+scene.world.use_nodes = True
+scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (0.5, 0.75, 1, 1)
+for x, name in ((0, "Sofa"), (4, "Chair"), (8, "Rug")):
+    bpy.ops.mesh.primitive_cube_add(location=(x, 0, 1))
+    bpy.context.object.name = name
+bpy.ops.object.light_add(type=sys.argv[-2], location=(0, 0, 3))
+bpy.context.object.name = "Bulb"
+bpy.ops.object.camera_add(location=(1, 2, 3))
+write = bpy.ops.export_scene.fbx if sys.argv[-1].endswith("fbx") else bpy.ops.wm.usd_export
+write(filepath=sys.argv[-1])
+"""
+
+
+@needs_blender
+@pytest.mark.slow
+def test_usd_has_its_names_its_camera_and_its_sky(tmp_path: Path, loaded: Loaded) -> None:
+    run(EXCHANGED, tmp_path, "AREA", str(tmp_path / "it.usdc"))
+    made, scene = loaded(tmp_path / "it.usdc")
+    assert {shape.id() for shape in scene.shapes()} == {"Sofa", "Chair", "Rug", "Bulb"}
+    assert made.camera == pytest.approx((1, 3, -2))
+    sky = mi.SurfaceInteraction3f()
+    sky.wi = mi.Vector3f(0, -1, 0)
+    assert np.array(scene.environment().eval(sky)).ravel() == pytest.approx((0.5, 0.75, 1), abs=0.01)
+    assert not [change for change in made.changes if change.effect]
+
+
+USD = """#usda 1.0
+(
+    upAxis = "Y"
+)
+def Xform "Sofa"
+{
+    def Cube "mesh"
+    {
+    }
+}
+def CylinderLight "Tube"
+{
+}
+"""
+
+
+@needs_blender
+@pytest.mark.slow
+def test_lights_of_usd_and_fbx_that_blender_takes_for_points_are_a_loss(tmp_path: Path, loaded: Loaded) -> None:
+    (tmp_path / "it.usda").write_text(USD)
+    run(EXCHANGED, tmp_path, "AREA", str(tmp_path / "area.fbx"))
+    run(EXCHANGED, tmp_path, "POINT", str(tmp_path / "point.fbx"))
+    for name, lost in (("it.usda", ["CylinderLight"]), ("area.fbx", ["LightType"]), ("point.fbx", [])):
+        made, scene = loaded(tmp_path / name)
+        assert [change.name for change in made.changes if change.effect] == lost
+        assert "Sofa" in {shape.id() for shape in scene.shapes()}
+
+
+@needs_blender
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [("it.blend", b"", "is empty$"), ("it.blend", b"glTF", r"is no \.blend file that Blender [\d.]+ reads: [^\n]+$"),
+     ("it.usd", b"glTF", r"is no \.usd file "), ("it.fbx", b"glTF", r"is no \.fbx file ")],
+)  # fmt: skip
+def test_a_file_that_blender_cannot_open_is_told_in_a_sentence(
+    tmp_path: Path, name: str, content: bytes, said: str
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(SpecError, match=said) as error:
+        blender.read(tmp_path / name, tmp_path, lambda _: None)
+    assert "Error" not in str(error.value)

@@ -109,32 +109,25 @@ def test_a_glb_is_the_same_scene(gltf: Any, quad: Callable[..., Path], read: Rea
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4"), np.array([[0, 1, 2]], "<u4")
 
 
-def test_morph_targets_have_the_weights_of_the_node_or_else_of_the_mesh(gltf: Any, loaded: Loaded) -> None:
+def test_morph_targets_are_losses_of_geometry_where_they_have_weights(gltf: Any, read: Read) -> None:
     mesh = gltf.mesh(*TRIANGLE)
     target = {"POSITION": gltf.array(np.array([[0, 0, 0], [2, 0, 0], [0, 0, 0]], "<f4"), "VEC3")}
     gltf.document["meshes"][mesh]["primitives"][0]["targets"] = [target, {}]
-    gltf.document["meshes"][mesh]["weights"] = [0.5, 0]
-    gltf.node("OfMesh", mesh)
-    gltf.node("OfNode", mesh, weights=[1, 0])
-    scene, made = loaded(gltf.write())
-    assert [float(shape.bbox().max.x) for shape in made.shapes()] == [2, 3]
-    assert losses(scene) == []
+    gltf.node("AtRest", mesh, weights=[0, 0])
+    assert losses(read(gltf.write())) == []
+    gltf.node("Bent", mesh, weights=[0.5, 0])
+    assert losses(read(gltf.write())) == [("geometry", "weights")]
 
 
-def test_skins_stand_as_their_joints_place_them(gltf: Any, loaded: Loaded) -> None:
-    joints = gltf.array(np.array([[0, 1, 0, 0]] * 3, "|u1"), "VEC4")
-    weights = gltf.array(np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0.5, 0.5, 0, 0]], "<f4"), "VEC4")
-    mesh = gltf.mesh(*TRIANGLE, JOINTS_0=joints, WEIGHTS_0=weights)
-    back = np.eye(4, dtype="<f4")
-    back[3, 0] = -1  # column-major: one to the left
-    inverse = gltf.array(np.stack([np.eye(4, dtype="<f4"), back]).reshape(2, 16), "MAT4")
-    gltf.node("Skinned", mesh, skin=0, translation=[100, 0, 0])  # which a skin ignores
-    gltf.node("Root", translation=[0, 0, 2])
-    gltf.node("Tip", translation=[4, 0, 0])
-    gltf.document["skins"] = [{"joints": [1, 2], "inverseBindMatrices": inverse}]
-    scene, _ = loaded(gltf.write())
-    assert np.allclose(scene.meshes["Skinned"].vertices, [[0, 0, 2], [4, 0, 0], [1.5, 1, 1]])
-    assert losses(scene) == []
+def test_skins_are_losses_of_geometry_and_stand_as_modelled(gltf: Any, read: Read) -> None:
+    joints, weights = np.zeros((3, 4), "|u1"), np.array([[1, 0, 0, 0]] * 3, "<f4")
+    mesh = gltf.mesh(*TRIANGLE, JOINTS_0=gltf.array(joints, "VEC4"), WEIGHTS_0=gltf.array(weights, "VEC4"))
+    gltf.node("Skinned", mesh, skin=0, translation=[0, 0, 2])
+    gltf.node("Bone", translation=[5, 0, 0])
+    gltf.document["skins"] = [{"joints": [1]}]
+    scene = read(gltf.write())
+    assert scene.meshes["Skinned"].vertices.tolist() == [[0, 0, 2], [1, 0, 2], [0, 1, 2]]
+    assert losses(scene) == [("geometry", "skin")]
 
 
 def test_nodes_that_are_not_visible_are_not_there_with_all_below_them(gltf: Any, read: Read) -> None:
@@ -178,20 +171,6 @@ def test_points_and_lines_are_losses_of_geometry(gltf: Any, read: Read) -> None:
     assert list(scene.meshes) == ["Mode4"]
 
 
-def test_skins_know_joints_that_are_hidden(gltf: Any, read: Read) -> None:
-    joints, weights = np.zeros((3, 4), "|u1"), np.array([[1, 0, 0, 0]] * 3, "<f4")
-    mesh = gltf.mesh(*TRIANGLE, JOINTS_0=gltf.array(joints, "VEC4"), WEIGHTS_0=gltf.array(weights, "VEC4"))
-    gltf.node("Skinned", mesh, skin=0)
-    gltf.node("Rig", mesh, children=[2], extensions={"KHR_node_visibility": {"visible": False}})
-    gltf.node("Bone", translation=[5, 0, 0])
-    gltf.document["scenes"][0]["nodes"] = [0, 1]
-    gltf.document["skins"] = [{"joints": [2]}]
-    scene = read(gltf.write())
-    assert list(scene.meshes) == ["Skinned"]
-    assert scene.meshes["Skinned"].vertices[:, 0].tolist() == [5, 6, 5]
-    assert losses(scene) == []
-
-
 @pytest.mark.parametrize(("inner", "outer"), [(0, np.pi / 4), (0.2, 0.5), (0.3, 0.31), (0, np.pi / 2)])
 def test_spots_fade_as_the_extension_recommends(
     gltf: Any, quad: Callable[..., Path], loaded: Loaded, inner: float, outer: float
@@ -223,6 +202,14 @@ def test_lights_that_no_light_can_be_are_losses(
     gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"} | light]}}
     gltf.node("Lamp", extensions={"KHR_lights_punctual": {"light": 0}})
     assert losses(read(quad())) == [("light", lost)]
+
+
+def test_the_units_of_blenders_lamps_are_said(gltf: Any, quad: Callable[..., Path], read: Read) -> None:
+    gltf.document["asset"]["generator"] = "Khronos glTF Blender I/O v5.0.21"
+    assert not [change for change in read(quad()).changes if "683" in str(change)]
+    gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
+    (said,) = [change for change in read(gltf.write()).changes if "683" in str(change)]
+    assert (said.effect, said.name) == (None, "KHR_lights_punctual")
 
 
 # ------------------------------------------------------------------------------------------------------- extensions
@@ -339,6 +326,24 @@ def test_images_wrap_differently_along_both_axes(case: Callable[[str], Path], lo
 # ---------------------------------------------------------------------------------------------------- what is wrong
 
 
+def test_images_that_are_not_there_leave_their_factors(
+    gltf: Any, quad: Callable[..., Path], loaded: Loaded, tmp_path: Path
+) -> None:
+    surface = {"baseColorTexture": gltf.image(FOUR, "four.png"), "baseColorFactor": [0.5, 0.25, 0.75, 1]}
+    path = quad(pbrMetallicRoughness=surface)
+    (tmp_path / "four.png").unlink()
+    scene, made = loaded(path)
+    assert colour_at(made, 0.5, 0.5) == pytest.approx([0.5, 0.25, 0.75])
+    assert losses(scene) == [("colour", "images")]
+
+
+def test_corners_that_are_infinite_are_the_cause_that_is_named_first(gltf: Any, read: Read) -> None:
+    corners = np.array([[0, 0, 0], [np.inf, 0, 0], [0, -np.inf, np.inf]], "<f4")
+    gltf.node("Broken", gltf.mesh(corners, TRIANGLE[1], gltf.material("paint")))
+    with pytest.raises(SpecError, match="rendered\n  geometry differs: NaN"):
+        read(gltf.write())
+
+
 def without(name: str) -> Callable[[Path], None]:
     return lambda folder: (folder / name).unlink()
 
@@ -355,10 +360,12 @@ def changed(**entries: Any) -> Callable[[Path], None]:
     ("break_it", "named"),
     [
         (without("room.bin"), "room.bin"),
-        (without("four.png"), "four.png"),
         (lambda folder: (folder / "room.bin").write_bytes(b"1234"), "needs"),
         (lambda folder: (folder / "four.png").write_bytes(b"no image"), "image 0"),
         (lambda folder: (folder / "room.gltf").write_text("{"), "room.gltf"),
+        (lambda folder: (folder / "room.gltf").write_text(""), "room.gltf: is empty"),
+        (lambda folder: (folder / "room.gltf").write_text("v 0 0 0"), "is no glTF: it is neither JSON nor binary"),
+        (lambda folder: (folder / "room.gltf").write_bytes(b"\xce{"), "is no glTF: it is neither JSON nor binary"),
         (changed(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
         (changed(extensionsRequired=["EXT_of_the_future"]), "EXT_of_the_future"),
         (changed(buffers=[{"byteLength": 4, "extensions": {"KHR_meshopt_compression": {"fallback": True}}}]),
@@ -367,6 +374,7 @@ def changed(**entries: Any) -> Callable[[Path], None]:
         (changed(asset={"version": "1.0"}), "1.0"),
         (changed(meshes=[]), "room.gltf"),
         (changed(nodes=[], scenes=[{"nodes": []}]), "room.gltf"),
+        (changed(scenes=[]), "room.gltf: has no scene, so nothing is to be rendered"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_read_is_named(
@@ -397,6 +405,9 @@ def first(kind: str, **entries: Any) -> Callable[[Any], None]:
         (lambda gltf: gltf.document["accessors"][-1].update(componentType=5126), "node 'Quad': indices"),
         (lambda gltf: gltf.document["meshes"][0]["primitives"][0].update(mode=7), "no triangles.*\n.*mode 7"),
         (lambda gltf: gltf.document.update(extensionsRequired="FOO"), "extensionsRequired .*must be a list"),
+        (first("meshes", primitives={"mode": 4}), r"meshes\[0\].primitives is .*must be a list"),
+        (first("meshes", primitives=[{"attributes": []}]), r"meshes\[0\].primitives\[0\].attributes .*be an object"),
+        (first("materials", extensions={"KHR_materials_specular": "x"}), "KHR_materials_specular .*be an object"),
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_told_with_its_node_and_its_key(

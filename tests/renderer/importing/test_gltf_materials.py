@@ -69,6 +69,13 @@ def test_green_of_a_normal_map_tilts_upwards_in_the_image(
     assert up > 3 * down
 
 
+def test_what_is_opaque_is_seen_from_both_sides(quad: Callable[..., Path], loaded: Loaded) -> None:
+    _, scene = loaded(quad(pbrMetallicRoughness={"metallicFactor": 0}))
+    for side in (1, -1):
+        si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0.5, 0.25, side), mi.Vector3f(0, 0, -side)))
+        assert np.array(si.bsdf().eval(mi.BSDFContext(), si, si.wi)).mean() > 0.1
+
+
 def test_emission_has_its_strength_and_its_mesh_the_normals_of_its_faces(quad: Callable[..., Path], read: Read) -> None:
     strength = {"KHR_materials_emissive_strength": {"emissiveStrength": 8}}
     (shape,) = read(quad(emissiveFactor=[1, 0.5, 0], extensions=strength)).root.findall("shape")
@@ -97,7 +104,12 @@ def test_an_image_of_emission_keeps_values_above_one(gltf: Any, quad: Callable[.
             0,
             "dielectric",
         ),
-        ({"KHR_materials_transmission": {"transmissionFactor": 0.7}}, 0.4, "principled"),
+        ({"KHR_materials_transmission": {"transmissionFactor": 0.7}}, 0.4, "principledthin"),
+        (
+            {"KHR_materials_transmission": {"transmissionFactor": 0.7}, "KHR_materials_volume": {"thicknessFactor": 1}},
+            0.4,
+            "principled",
+        ),
     ],
 )
 def test_what_light_passes_is_glass_with_its_refractive_index(
@@ -107,22 +119,22 @@ def test_what_light_passes_is_glass_with_its_refractive_index(
     extensions = extensions | {"KHR_materials_ior": {"ior": 1.7}}
     scene, made = loaded(quad(pbrMetallicRoughness=surface, extensions=extensions))
     glass = of_type(scene.root, kind)
-    ior = child(glass, "eta" if kind == "principled" else "int_ior")
+    ior = child(glass, "eta" if "principled" in kind else "int_ior")
     assert ior is not None
     assert ior.get("value") == "1.7"
     assert mi.has_flag(made.shapes()[0].bsdf().flags(), mi.BSDFFlags.Transmission)
 
 
 @pytest.mark.parametrize(
-    ("passes", "metal", "front", "back"), [(1, 0, 1, 1), (0.5, 0, 0.5, 0.5), (0.5, 0.5, 0.25, 0.25), (1, 1, 0, 0)]
+    ("passes", "metal", "rough", "share"), [(1, 0, 0, 1), (0.5, 0, 0, 0.5), (0.9, 0, 0.2, 0.9), (1, 1, 0, 0)]
 )
-def test_clear_glass_is_as_much_of_a_surface_as_light_passes(
-    quad: Callable[..., Path], loaded: Loaded, passes: float, metal: float, front: float, back: float
+def test_thin_glass_is_as_much_of_a_surface_as_light_passes(
+    quad: Callable[..., Path], loaded: Loaded, passes: float, metal: float, rough: float, share: float
 ) -> None:
-    surface = {"roughnessFactor": 0, "metallicFactor": metal}
+    surface = {"roughnessFactor": rough, "metallicFactor": metal, "baseColorFactor": [1, 0.25, 1, 1]}
     _, scene = loaded(quad(pbrMetallicRoughness=surface,
                            extensions={"KHR_materials_transmission": {"transmissionFactor": passes}}))  # fmt: skip
-    for z, share in ((1, front), (-1, back)):
+    for z in (1, -1):
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f([0.3] * 4096, 0.4, z), mi.Vector3f(0, 0, -z)))
         numbers = (
             mi.Float(np.random.default_rng(1).random(4096)),
@@ -131,7 +143,15 @@ def test_clear_glass_is_as_much_of_a_surface_as_light_passes(
         sample, weight = si.bsdf().sample(mi.BSDFContext(), si, *numbers)
         through = np.array(mi.Frame3f.cos_theta(sample.wo)) * np.array(mi.Frame3f.cos_theta(si.wi)) < 0
         thin_pane = 2 * 0.04 / 1.04  # what its two sides reflect
-        assert (np.array(weight)[0] * through).mean() == pytest.approx(share * (1 - thin_pane), abs=0.03)
+        for channel, tint in ((0, 1), (1, 0.25)):
+            passed = (np.array(weight)[channel] * through).mean()
+            assert passed == pytest.approx(share * tint * (1 - thin_pane), abs=0.03)
+
+
+def test_thin_glass_that_is_metal_in_part_is_a_loss(quad: Callable[..., Path], read: Read) -> None:
+    glass = {"KHR_materials_transmission": {"transmissionFactor": 1}}
+    scene = read(quad(pbrMetallicRoughness={"metallicFactor": 0.5}, extensions=glass))
+    assert losses(scene) == [("colour", "KHR_materials_transmission")]
 
 
 def test_clear_glass_has_its_normal_map_and_says_that_it_has_no_coat(

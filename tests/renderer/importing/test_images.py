@@ -77,3 +77,9 @@ def test_images_keep_their_depth_when_they_are_written(tmp_path: Path) -> None:
     ):
         file = images.save(values, tmp_path / "it.png")
         assert np.abs(images.decoded(file.read_bytes(), "it")[..., :3] - values).max() < most
+
+
+def test_images_are_read_beyond_the_limit_of_pillow() -> None:
+    from PIL import Image
+
+    assert Image.MAX_IMAGE_PIXELS is None

@@ -12,11 +12,10 @@ import trimesh
 from pydantic import TypeAdapter
 
 from photonfarm.renderer.importing.loading import load
-from photonfarm.renderer.importing.proposal import pieces
-from photonfarm.renderer.importing.proposal.floor_plan import largest_rectangle
-from photonfarm.renderer.importing.proposal.names import group_name, is_furniture, is_shell
-from photonfarm.renderer.importing.proposal.proposed import Proposal, propose
-from photonfarm.renderer.importing.proposal.surfaces import Frame
+from photonfarm.renderer.importing.proposal import surfaces
+from photonfarm.renderer.importing.proposal.groups import group_name, is_furniture, is_shell
+from photonfarm.renderer.importing.proposal.proposed import Proposal, largest_rectangle, propose
+from photonfarm.renderer.importing.proposal.surfaces import Box, Frame
 from photonfarm.renderer.importing.readers import reader_of
 from photonfarm.renderer.scene.surroundings import surroundings
 from photonfarm.shared.core.models import Name
@@ -42,7 +41,7 @@ def proposal(boxes: Path, tmp_path_factory: pytest.TempPathFactory) -> Any:
 @pytest.fixture(autouse=True)
 def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A third of the points on surfaces, which is quicker."""
-    monkeypatch.setattr(pieces, "SAMPLES_PER_CELL", 1.3)
+    monkeypatch.setattr(surfaces, "SAMPLES_PER_CELL", 1.3)
 
 
 @pytest.fixture
@@ -81,19 +80,16 @@ def test_the_room_is_found_and_all_that_stands_in_it_also_two_chairs_of_one_mesh
         assert len(set(found.shape[found.thing == number])) == 1
 
 
-@pytest.mark.parametrize(("name", "count"), [("Stool.2", 1), ("Basket", 2)])
-def test_parts_of_one_name_are_one_thing_without_touching_and_a_sheet_is_none(
-    gltf: Any, tmp_path: Path, name: str, count: int
-) -> None:
+def test_a_box_in_another_one_is_a_thing_of_its_own_and_a_sheet_is_none(gltf: Any, tmp_path: Path) -> None:
     shell = trimesh.creation.box(bounds=[[0, 0, 0], [5, 2.6, 4]])
     outer = trimesh.creation.box(bounds=[[3, 0, 2], [3.6, 0.6, 2.6]])
     inner = trimesh.creation.box(bounds=[[3.1, 0, 2.1], [3.5, 0.5, 2.5]])
     sheet = trimesh.creation.box(bounds=[[1, 0, 1], [1.01, 0.8, 1.6]])
     shell.invert()
-    for own, mesh in (("Shell", shell), ("Stool.1", outer), (name, inner), ("Sheet", sheet)):
+    for own, mesh in (("Shell", shell), ("Stool", outer), ("Basket", inner), ("Sheet", sheet)):
         gltf.node(own, gltf.mesh(mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")))
     found, _ = proposed(gltf.write(), tmp_path)
-    assert len(found.movables) == count
+    assert sorted(movable.thing.name for movable in found.movables) == ["Basket", "Stool"]
 
 
 def test_things_stay_inside_the_room_on_the_floor_wherever_they_may_be(proposal: Any) -> None:
@@ -102,7 +98,7 @@ def test_things_stay_inside_the_room_on_the_floor_wherever_they_may_be(proposal:
         half = movable.thing.size[:2] / 2
         assert (movable.box.low[:2] - half >= found.room.low[:2] - 1e-6).all()
         assert (movable.box.high[:2] + half <= found.room.high[:2] + 1e-6).all()
-        assert movable.box.low[2] == movable.box.high[2] == movable.at[2] == pytest.approx(0, abs=1e-6)
+        assert movable.box.low[2] == movable.box.high[2] == movable.thing.at[2] == pytest.approx(0, abs=1e-6)
         assert (movable.box.high[:2] > movable.box.low[:2]).all()
 
 
@@ -142,8 +138,8 @@ def test_a_lamp_moves_along_the_ceiling_where_it_hangs(
     (lamp,) = [movable for movable in found.movables if movable.thing.emits]
     assert lamp.thing.name == name.replace(" ", "-")
     assert lamp.thing.hangs
-    assert lamp.at == pytest.approx([(low[0] + high[0]) / 2, (low[2] + high[2]) / 2, high[1]], abs=1e-3)
-    assert lamp.box.low[2] == lamp.box.high[2] == lamp.at[2]
+    assert lamp.thing.at == pytest.approx([(low[0] + high[0]) / 2, (low[2] + high[2]) / 2, high[1]], abs=1e-3)
+    assert lamp.box.low[2] == lamp.box.high[2] == lamp.thing.at[2]
     assert (lamp.box.high - lamp.box.low)[:2] == pytest.approx([2.5, 2], abs=0.15)
     emitting = [number for number, shape in enumerate(scene.shapes()) if shape.is_emitter()]
     assert set(found.shape[found.thing >= 0]) >= set(emitting)  # both sheets of a lamp with two sides
@@ -167,6 +163,15 @@ def test_a_lamp_moves_with_what_it_stands_on_and_hangs_by(
     assert all(movable.thing.emits for movable in found.movables)
 
 
+def test_a_tube_moves_though_it_is_nearly_as_long_as_the_room(
+    room: None, put: Callable[..., None], gltf: Any, tmp_path: Path
+) -> None:
+    put("Tube", (0.5, 2.5, 1.95), (4.5, 2.56, 2.05), light=8)
+    found, _ = proposed(gltf.write(), tmp_path)
+    (lamp,) = [movable for movable in found.movables if movable.thing.emits]
+    assert (lamp.box.high - lamp.box.low)[:2] == pytest.approx([0.8, 2], abs=0.15)
+
+
 def test_lights_in_walls_in_holes_and_as_large_as_the_ceiling_stay_and_it_is_said_why(
     put: Callable[..., None], gltf: Any, tmp_path: Path
 ) -> None:
@@ -188,6 +193,32 @@ def test_lights_in_walls_in_holes_and_as_large_as_the_ceiling_stay_and_it_is_sai
     assert "hole" in reasons["Downlight"]
     assert "stays" in reasons["Sconce"]
     assert "large" in reasons["Glowing"]
+
+
+@pytest.mark.parametrize("far", [12, 300])
+def test_lights_and_strays_far_above_a_room_without_a_ceiling_do_not_make_it_high(
+    put: Callable[..., None], gltf: Any, tmp_path: Path, far: float
+) -> None:
+    put("Floor", (0, -0.1, 0), (5, 0, 4))
+    for number, (low, high) in enumerate(
+        [((-0.1, 0), (0, 4)), ((5, 0), (5.1, 4)), ((0, -0.1), (5, 0)), ((0, 4), (5, 4.1))]
+    ):
+        put(f"Wall{number}", (low[0], 0, low[1]), (high[0], 2.6, high[1]))
+    put("Table", (2, 0, 1.5), (3.2, 0.75, 2.2))
+    put("Sun", (2, far, 2), (2.5, far + 0.5, 2.5), light=9)
+    put("Stray", (2, far + 1, 2), (2.5, far + 1.5, 2.5))
+    found, _ = proposed(gltf.write(), tmp_path)
+    assert found.room.height < 4
+    assert found.views[0].origin.high[2] < 2.6
+    assert [movable.thing.name for movable in found.movables] == ["Table"]
+
+
+def test_a_ball_has_few_triangles() -> None:
+    import mitsuba as mi
+
+    ball = surfaces.Surfaces.of(mi.load_dict({"type": "scene", "ball": {"type": "sphere"}}), Frame((0, 1, 0)))
+    assert len(ball.shape) < 1000
+    assert ball.area.sum() == pytest.approx(4 * np.pi, rel=0.02)
 
 
 @pytest.mark.parametrize("ground", [5, 500])
@@ -241,7 +272,7 @@ def test_frames_put_the_height_last_and_back(up: tuple[float, float, float]) -> 
     inside = frame.inward(points)
     assert inside[:, 2] == pytest.approx(points @ np.array(up))
     assert frame.world(inside) == pytest.approx(points)
-    low, high = frame.box(inside.min(axis=0), inside.max(axis=0))
+    low, high = frame.box(Box(inside.min(axis=0), inside.max(axis=0)))
     assert low == pytest.approx(points.min(axis=0))
     assert high == pytest.approx(points.max(axis=0))
 

@@ -28,7 +28,7 @@ def parse(path: Path) -> Located:
     builder = TreeBuilder(element_factory=Located)
     parser = expat.ParserCreate()
     data = path.read_bytes()
-    known = {"lt", "gt", "amp", "quot", "apos"}
+    known, has_entities = {"lt", "gt", "amp", "quot", "apos"}, b"<!DOCTYPE" in data
 
     def refuse(name: str, *_: object) -> int:
         raise ParseError(
@@ -37,7 +37,7 @@ def parse(path: Path) -> Located:
         )
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        written = _TAG.match(data, parser.CurrentByteIndex) if b"<!DOCTYPE" in data else None
+        written = _TAG.match(data, parser.CurrentByteIndex) if has_entities else None
         for name in re.findall(rb"&([^#;\s][^;\s]*);", written[0]) if written else ():
             if name.decode() not in known:  # expat leaves it out without a word
                 refuse(name.decode())

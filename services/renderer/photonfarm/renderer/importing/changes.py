@@ -53,11 +53,15 @@ class Changes:
         return iter(self._found.values())
 
     def refuse_unless(self, accepted: Collection[str], source: str) -> None:
-        """Raise SpecError for what changes the picture, unless its name or its effect is accepted."""
-        refused = [c for c in self if c.effect is not None and not {c.name, c.effect, "all"} & set(accepted)]
+        """Raise SpecError for what changes the picture, unless its name or its effect is accepted, in any case."""
+        names = [(change, {change.name.lower(), str(change.effect)}) for change in self if change.effect is not None]
+        given = {each.lower(): each for each in accepted}
+        refused = [change for change, own in names if not {*own, "all"} & given.keys()]
         if not refused:
             return
         lines = "".join(f"\n  {change}" for change in refused)
+        unknown = [each for key, each in given.items() if not any(key in own for _, own in names)]
+        lines += "".join(f"\n  --accept {quote(each)}: nothing of that name differs here" for each in unknown)
         options = " ".join(dict.fromkeys(f"--accept {quote(change.name)}" for change in refused))
         raise SpecError(
             f"{source}: the picture would differ from the file's:{lines}\nMend the file, or import it all the same by "

@@ -47,10 +47,10 @@ def put_matrix(parent: Element, name: str, rows: Sequence[Sequence[float]]) -> N
     SubElement(transform, "matrix", value=" ".join(f"{float(value):.9g}" for row in rows for value in row))
 
 
-def mesh_shape(parent: Element, shape_id: str, file: Path, *, faceted: bool) -> Element:
-    """Add a shape that is a PLY file; a `faceted` one has the normals of its faces."""
+def mesh_shape(parent: Element, shape_id: str, *, faceted: bool) -> Element:
+    """Add a shape whose PLY file is not written yet; a `faceted` one has the normals of its faces."""
     shape = SubElement(parent, "shape", type="ply", id=shape_id)
-    put_value(shape, "filename", str(file))
+    put_value(shape, "filename", "")
     if faceted:
         put_value(shape, "face_normals", True)
     return shape

@@ -52,10 +52,7 @@ class ImportedScene:
             return
         back = f"{made}_back" if light is not None and both_sides and not mesh.encloses() else ""
         for shape_id in filter(None, (made, back)):
-            shape = SubElement(self.root, "shape", type="ply", id=shape_id)
-            elements.put_value(shape, "filename", "")
-            if mesh.normals is None:
-                elements.put_value(shape, "face_normals", True)
+            shape = elements.mesh_shape(self.root, shape_id, faceted=mesh.normals is None)
             SubElement(shape, "ref", id=material)
             if light is not None:
                 shape.append(elements.copied(light))

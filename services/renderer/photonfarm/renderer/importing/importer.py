@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -11,14 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.renderer.importing import elements, readers, splitting
+from photonfarm.renderer.importing import elements, readers
 from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
-from photonfarm.renderer.importing.loading import load
+from photonfarm.renderer.importing.loading import load, shapes_of_things
 from photonfarm.renderer.importing.proposal.proposed import propose
 from photonfarm.renderer.importing.proposal.surfaces import Frame
 from photonfarm.renderer.importing.spec_text import SpecText
-from photonfarm.renderer.importing.writing import write_scene
 from photonfarm.renderer.measure import exposure, free_space
 from photonfarm.renderer.measure.exposure import DarkError
 from photonfarm.shared.core.errors import SpecError, store_errors
@@ -30,6 +31,8 @@ AXES: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0
 
 GENERAL = ("scene", "scene_v3", "model", "untitled", "main", "export")
 """Names of files that say nothing; the folder's name is taken instead."""
+
+MESHES = (".ply", ".obj", ".serialized")
 
 DARKEST = 1e5
 """A higher exposure than this is of a scene whose lights do not reach what is seen."""
@@ -102,20 +105,37 @@ def _import(
     frame = Frame(up or scene.up)
     camera = None if scene.camera is None else frame.inward(np.array(scene.camera))
     proposal = propose(loaded, frame, camera, scene.objects, work.begin)
-    shapes = splitting.shapes_of_things(scene, loaded, proposal.shape, proposal.thing, scratch)
-    written = scratch / "written"
-    written.mkdir()
+    shapes = shapes_of_things(scene, loaded, proposal.shape, proposal.thing)
+    scene.write_meshes(scratch / "meshes")
     work.begin("writing the scene")
-    write_scene(scene, written)
-    (scratch / folder.name).symlink_to(written.resolve(), target_is_directory=True)
+    _write_scene(scene, scratch / folder.name)
     name, file = Ids().make(spec.stem.lstrip("._-"), "scene"), f"{folder.name}/scene.xml"
     shapeless = list(dict.fromkeys(node.get("type", "") for node in scene.root.findall("emitter")))
     text = SpecText(name, file, path.name, frame, proposal, shapes, shapeless, scene.changes, proposal.views[0])
     text = _lit(text, scene, loaded, scratch / spec.name, work)
-    shutil.move(str(written), folder)
+    shutil.move(scratch / folder.name, folder)
     write_whole(spec, text.text())
     load_spec(spec)
     return Imported(spec, folder, scene.changes, text.found())
+
+
+def _write_scene(scene: ImportedScene, folder: Path) -> None:
+    """Write the scene into a folder, with copies of all files that it names, by relative names."""
+    folder.mkdir()
+    names: dict[str, str] = {}
+    taken: Counter[str] = Counter()
+    for node, key in elements.file_names(scene.root):
+        source = Path(node.get(key, ""))
+        if str(source) not in names:
+            kind = "meshes" if source.suffix.lower() in MESHES else "textures"
+            taken[f"{kind}/{source.name.lower()}"] += 1
+            number = taken[f"{kind}/{source.name.lower()}"]
+            name = f"{kind}/{source.stem}{f'_{number}' if number > 1 else ''}{source.suffix}"
+            (folder / kind).mkdir(exist_ok=True)
+            shutil.copyfile(source, folder / name)
+            names[str(source)] = name
+        node.set(key, names[str(source)])
+    elements.write(scene.root, folder / "scene.xml")
 
 
 def _lit(text: SpecText, scene: ImportedScene, loaded: Any, draft: Path, work: WorkLog) -> SpecText:
@@ -161,6 +181,7 @@ def _measured(text: SpecText, draft: Path, least: float, work: WorkLog) -> SpecT
         text.changes.note(f"no place was found from which cameras see what is there; {BY_HAND}")
     work.begin("choosing the exposure by a quick render")
     draft.write_text(text.text(), encoding="utf-8")
+    gc.collect()  # scenes that are collected while Dr.Jit records would end the program
     found = exposure.propose(load_spec(draft), draft.parent, work, least=least).exposure
     if found > DARKEST:
         raise DarkError(f"exposure {found:.3g}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,16 +26,21 @@ class Mesh:
     faces: NDArray[np.uint32]  # (F, 3)
     normals: Floats | None = None  # (V, 3); None: those of the faces
     uv: Floats | None = None  # (V, 2), v downwards, as Mitsuba has it
-    colours: Floats | None = None  # (V, 3), linear reflectance of vertices
+    attributes: dict[str, Floats] = field(default_factory=dict)
+    """(V or F, …) by Mitsuba's names, such as `vertex_color` and `face_tint`: colours are linear reflectances."""
 
     def part(self, faces: NDArray[np.bool_]) -> Mesh:
         """The mesh of some of its faces, a mask (F,)."""
         used, corner = np.unique(self.faces[faces], return_inverse=True)
-        return self._of_vertices(used, corner.reshape(-1, 3).astype(np.uint32))
+        return self._taken(used, faces, corner.reshape(-1, 3))
 
-    def _of_vertices(self, used: NDArray[Any], faces: NDArray[np.uint32]) -> Mesh:
-        normals, uv, colours = (None if x is None else x[used] for x in (self.normals, self.uv, self.colours))
-        return Mesh(self.vertices[used], faces, normals, uv, colours)
+    def _taken(self, vertices: NDArray[Any], faces: NDArray[np.bool_], corners: NDArray[Any]) -> Mesh:
+        """The mesh of some vertices and faces; `corners` are the faces, by the numbers that vertices have then."""
+        normals, uv = (None if values is None else values[vertices] for values in (self.normals, self.uv))
+        attributes = {
+            name: values[faces if name.startswith("face_") else vertices] for name, values in self.attributes.items()
+        }
+        return Mesh(self.vertices[vertices], corners.astype(np.uint32), normals, uv, attributes)
 
     def moved(self, matrix: Floats) -> Mesh:
         """The mesh under an affine map (4, 4); where that mirrors, faces turn so that their fronts stay fronts."""
@@ -74,21 +79,12 @@ class Mesh:
 
     def _with_own_normals(self, flat: NDArray[np.bool_]) -> Mesh:
         """The mesh with corners of their own, and the face's normal on them, for some faces, a mask (F,)."""
-        assert self.normals is not None  # noqa: S101 - the one caller has them
-        smooth, own = self.part(~flat), self._of_vertices(self.faces[flat].ravel(), np.zeros((0, 3), np.uint32))
-        corners = np.arange(3 * int(flat.sum()), dtype=np.uint32).reshape(-1, 3) + len(smooth.vertices)
-        normals = np.repeat(unit(self._across()[flat]), 3, axis=0)
-
-        def joined(a: Floats | None, b: Floats | None) -> Floats | None:
-            return None if a is None or b is None else np.concatenate([a, b])
-
-        return Mesh(
-            np.concatenate([smooth.vertices, own.vertices]),
-            np.concatenate([smooth.faces, corners]),
-            joined(smooth.normals, normals),
-            joined(smooth.uv, own.uv),
-            joined(smooth.colours, own.colours),
-        )
+        count, every, corners = len(self.vertices), np.ones(len(self.faces), np.bool_), self.faces.copy()
+        corners[flat] = count + np.arange(3 * flat.sum()).reshape(-1, 3)
+        mesh = self._taken(np.concatenate([np.arange(count), self.faces[flat].ravel()]), every, corners)
+        if mesh.normals is not None:
+            mesh.normals[count:] = np.repeat(unit(self._across()[flat]), 3, axis=0)
+        return mesh.part(every)
 
     def _across(self) -> Floats:
         """The normals of faces as modelled (F, 3), as long as twice their areas."""
@@ -128,53 +124,36 @@ def of_shape(shape: Any) -> Mesh:
 
     vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     faces = np.array(shape.faces_buffer(), np.uint32).reshape(-1, 3)
-    normals, uv, colours = None, None, None
+    normals, uv = None, None
     if shape.has_vertex_normals():
         normals = np.array(shape.vertex_normals_buffer(), np.float64).reshape(-1, 3)
     if shape.has_vertex_texcoords():
         uv = np.array(shape.vertex_texcoords_buffer(), np.float64).reshape(-1, 2)
-    if shape.has_attribute("vertex_color"):
-        colours = np.array(mi.traverse(shape)["vertex_color"], np.float64).reshape(-1, 3)
-    mesh = Mesh(vertices, faces, normals, uv, colours)
-    if not _is_turned(shape, mesh):
-        return mesh
-    return replace(mesh, faces=faces[:, ::-1], normals=None if normals is None else -normals)
-
-
-def _is_turned(shape: Any, mesh: Mesh) -> bool:
-    """Whether Mitsuba has the fronts of a shape on the other side, by `flip_normals` or as it is mirrored."""
-    import mitsuba as mi
-
-    across = mesh._across()
-    face = int(np.nan_to_num(np.linalg.norm(across, axis=1)).argmax())
-    middle, normal = mesh.vertices[mesh.faces[face]].mean(axis=0), unit(across[face])
-    origin = middle + 1e-3 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0))) * normal
-    alone = mi.load_dict({"type": "scene", shape.id(): shape})  # another key would rename it
-    hit = alone.ray_intersect(mi.Ray3f(mi.Point3f(*origin.tolist()), mi.Vector3f(*(-normal).tolist())))
-    return bool(np.array(hit.n, np.float64).ravel() @ normal < 0)
+    if shape.has_flipped_normals():
+        faces, normals = faces[:, ::-1], None if normals is None else -normals
+    attributes = {}
+    for name, values in mi.traverse(shape):
+        count = {"vertex": len(vertices), "face": len(faces)}.get(name.split("_")[0])
+        if count and shape.has_attribute(name):
+            attributes[name] = np.array(values, np.float64).reshape(count, -1)
+    return Mesh(vertices, faces, normals, uv, attributes)
 
 
 def write_ply(mesh: Mesh, file: Path) -> Path:
-    """Write a mesh, as Mitsuba writes it; colours become the attribute `vertex_color`."""
+    """Write a mesh, as Mitsuba writes it."""
     import mitsuba as mi
 
-    made = mi.Mesh(
-        file.stem,
-        len(mesh.vertices),
-        len(mesh.faces),
-        has_vertex_normals=mesh.normals is not None,
-        has_vertex_texcoords=mesh.uv is not None,
-    )
+    has = {"has_vertex_normals": mesh.normals is not None, "has_vertex_texcoords": mesh.uv is not None}
+    made = mi.Mesh(file.stem, len(mesh.vertices), len(mesh.faces), **has)
     parameters = mi.traverse(made)
-    parameters["vertex_positions"] = mi.Float(mesh.vertices.ravel().astype(np.float32))
+    values = {"vertex_positions": mesh.vertices, "vertex_normals": mesh.normals, "vertex_texcoords": mesh.uv}
+    for name, numbers in values.items():
+        if numbers is not None:
+            parameters[name] = mi.Float(numbers.ravel().astype(np.float32))
     parameters["faces"] = mi.UInt32(mesh.faces.ravel())
-    if mesh.normals is not None:
-        parameters["vertex_normals"] = mi.Float(mesh.normals.ravel().astype(np.float32))
-    if mesh.uv is not None:
-        parameters["vertex_texcoords"] = mi.Float(mesh.uv.ravel().astype(np.float32))
     parameters.update()
-    if mesh.colours is not None:
-        made.add_attribute("vertex_color", 3, mesh.colours.ravel().astype(np.float32).tolist())
+    for name, numbers in mesh.attributes.items():
+        made.add_attribute(name, numbers.shape[1], numbers.ravel().astype(np.float32).tolist())
     file.parent.mkdir(parents=True, exist_ok=True)
     made.write_ply(str(file))
     return file

@@ -12,15 +12,18 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.arrays import floats, integers, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.scene.tessellation import triangles_of
+from photonfarm.renderer.scene.tessellation import SECTIONS, triangles_of
 from photonfarm.shared.core.keys import Stream, make_key
 from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry
 from photonfarm.shared.scene.pointcloud import sample_surface
 
 
-def geometry_of(shapes: list[Any], group_of: Mapping[str, int]) -> Geometry:
-    """The triangles of shapes in the scene's order; `group_of` gives the movable group of a shape id."""
-    parts = [triangles_of(shape) for shape in shapes]
+def geometry_of(shapes: list[Any], group_of: Mapping[str, int], sections: int = SECTIONS) -> Geometry:
+    """The triangles of shapes in the scene's order; `group_of` gives the movable group of a shape id.
+
+    Round shapes get so many `sections` around.
+    """
+    parts = [triangles_of(shape, sections) for shape in shapes]
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + np.uint32(start) for part, start in zip(parts, starts, strict=False)]
     return Geometry(

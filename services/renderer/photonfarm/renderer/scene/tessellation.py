@@ -26,8 +26,11 @@ class Triangles:
     faces: NDArray[np.uint32]  # (F, 3)
 
 
-def triangles_of(shape: Any) -> Triangles:
-    """The triangles of one shape. Raises SpecError for curves, instances, ellipsoids and other unsupported shapes."""
+def triangles_of(shape: Any, sections: int = SECTIONS) -> Triangles:
+    """The triangles of one shape, with so many `sections` around a round one.
+
+    Raises SpecError for curves, instances, ellipsoids and other unsupported shapes.
+    """
     if shape.is_mesh():
         positions = np.array(shape.vertex_positions_buffer(), np.float32)
         faces = np.array(shape.faces_buffer(), np.uint32)
@@ -38,7 +41,7 @@ def triangles_of(shape: Any) -> Triangles:
             f"shape {shape.id()!r} is a {shape.class_name()}; "
             "only meshes, rectangles, cubes, spheres, disks and cylinders can be used"
         )
-    points = make()
+    points = make(sections)
     to_world = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
     vertices = points.reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
     corners = _grid_faces(*points.shape[:2])
@@ -47,30 +50,30 @@ def triangles_of(shape: Any) -> Triangles:
     return Triangles(vertices.astype(np.float32), corners)
 
 
-def _around() -> NDArray[np.float64]:
-    angle = np.linspace(0, 2 * np.pi, SECTIONS + 1)
+def _around(sections: int) -> NDArray[np.float64]:
+    angle = np.linspace(0, 2 * np.pi, sections + 1)
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def _sphere() -> NDArray[np.float64]:
+def _sphere(sections: int) -> NDArray[np.float64]:
     """Unit sphere, rows from the lower pole to the upper."""
-    polar = np.linspace(-np.pi / 2, np.pi / 2, SECTIONS // 2 + 1)
-    circle = _around()
+    polar = np.linspace(-np.pi / 2, np.pi / 2, sections // 2 + 1)
+    circle = _around(sections)
     points = np.empty((len(polar), len(circle), 3))
     points[..., :2] = np.cos(polar)[:, None, None] * circle
     points[..., 2] = np.sin(polar)[:, None]
     return points
 
 
-def _disk() -> NDArray[np.float64]:
+def _disk(sections: int) -> NDArray[np.float64]:
     """Unit disk at z = 0, facing +z: rows from the rim to the centre."""
-    rim = np.pad(_around(), ((0, 0), (0, 1)))
+    rim = np.pad(_around(sections), ((0, 0), (0, 1)))
     return np.stack([rim, np.zeros_like(rim)])
 
 
-def _cylinder() -> NDArray[np.float64]:
+def _cylinder(sections: int) -> NDArray[np.float64]:
     """Unit cylinder without caps, z from 0 to 1."""
-    rim = np.pad(_around(), ((0, 0), (0, 1)))
+    rim = np.pad(_around(sections), ((0, 0), (0, 1)))
     return np.stack([rim, rim + np.array([0, 0, 1])])
 
 

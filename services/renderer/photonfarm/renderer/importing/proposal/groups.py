@@ -2,58 +2,59 @@
 
 from __future__ import annotations
 
+import re
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
 from itertools import count as numbers_from
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.importing.proposal import lamps
-from photonfarm.renderer.importing.proposal.names import group_name, is_furniture, is_shell, stem
-from photonfarm.renderer.importing.proposal.pieces import Labels, Pieces, numbered
 from photonfarm.renderer.importing.proposal.room import Room
-from photonfarm.renderer.importing.proposal.surfaces import Points, Surfaces, bounds
+from photonfarm.renderer.importing.proposal.surfaces import Labels, Pieces, Points, Surfaces, bounds, numbered
 
-CELL = 1 / 150
-"""The distance up to which surfaces touch, as a share of the room's height: 1.8 cm in a room of 2.7 m."""
-
-FLAT, CARPET = 0.03, 0.25
-"""What rises less than the first share of the room's height above the floor, and is longer than the second one, is a
-carpet, and part of the room."""
-
-STANDS = 0.04
-"""What begins below this share of the room's height stands on the floor."""
-
-WALL = 0.03
-"""What has its middle within this share of a side, or beyond it, is part of the wall."""
-
-TALL, WIDE = 0.88, 0.6
-"""What is taller or wider than these shares of the room is part of it."""
-
-SMALL, SLENDER = 0.1, 0.03
-"""What is shorter than this share of the room's height in two directions stands for nothing by itself; of lamps."""
-
-FLOATS = 0.08
-"""What touches nothing belongs to what stands nearer than this share of the room's height."""
-
-WITHIN = 0.5
-"""What has this share of its box within the box of another one of the same name is part of it, as a cushion is."""
-
-BUILT_IN, REACHES = 0.1, 0.02
-"""What shares the first part of its surface with walls, or reaches by the second part of the room beyond its sides, is
-built in, and stays, unless its name is that of furniture."""
-
-NAMING_SHARE = 0.15
-"""A name counts for a thing that has this share of its area under it."""
+# Shares of the room's height, where nothing else is said.
+CELL = 1 / 150  # surfaces touch up to this distance: 1.8 cm in a room of 2.7 m
+FLAT, CARPET = 0.03, 0.25  # what rises less than the first one and is longer than the second one is a carpet, and stays
+STANDS = 0.04  # what begins below this height stands on the floor
+FLOATS = 0.08  # what touches nothing belongs to what stands or hangs nearer than this
+SMALL, SLENDER = 0.1, 0.03  # what is shorter in two directions stands for nothing by itself; of lamps
+SHEET = 0.01  # what is thinner is a sheet
+PLANE = 0.01  # what is nearer to the ceiling lies in its plane
+AT_CEILING = 0.04  # what reaches up to this distance from the ceiling hangs from it
+WALL = 0.03  # of the room: what has its middle within this of a side, or beyond it, is part of the wall
+TALL, WIDE = 0.88, 0.6  # of the room: what is taller or wider is part of it
+HUGE = 1 / 3  # of the ceiling: a light as large is the ceiling
+CLOSED = 0.75  # of the places over a lamp: the ceiling is closed there if as many have a point of its plane
+BUILT_IN = 0.1  # of its surface: what shares as much with walls is built in, unless it has a name of furniture
+REACHES = 0.02  # of the room: so is what reaches as far beyond its sides
+NAMING_SHARE = 0.15  # of its area: a name counts for a thing that has as much under it
 
 BUILDING = 5.0
 """Outdoors, what is longer than this, in the file's units, stays: it is a house rather than furniture."""
 
 MOST = 12
 """The most things, and the most lights, that are proposed to move: the largest."""
+
+_SHELL = re.compile(
+    "wall|floor|ceil|window|door|skirting|baseboard|curtain|drape|blind|roof|ground|beam|column|pillar|stair|radiator|"
+    "carpet|rug|room|shell|pane|sill|moulding|molding|socket|switch"
+)
+
+_FURNITURE = re.compile(
+    "sofa|couch|chair|table|lamp|plant|bed|cabinet|desk|shelf|bookcase|wardrobe|stool|bench|tv|television|speaker|vase|"
+    "pot|ottoman|piano|basket|ball|bear|dresser|drawer|fridge|pouf|cactus|bottle|bowl|cushion"
+)
+
+MOVES = ""
+IN_WALL = "in a wall or window"
+IN_CEILING = "set into the ceiling, which has a hole there"
+LARGE = "as large as the room or its ceiling"
+HELD = "on or in something that stays, or in the air"
+MANY = "as only the largest are proposed to move"
+OUTSIDE = "as nothing is proposed to move where there is no room"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,6 +67,12 @@ class Thing:
     high: Points  # (3,)
     emits: bool
     hangs: bool  # from the ceiling, and does not stand on the floor
+
+    @property
+    def at(self) -> Points:
+        """The middle (3,) of its lower side; of what hangs, of its upper side."""
+        x, y, _ = (self.low + self.high) / 2
+        return np.array([x, y, (self.high if self.hangs else self.low)[2]])
 
     @property
     def size(self) -> Points:
@@ -97,8 +104,8 @@ class _Search:
         middle, near = (pieces.low + pieces.high) / 2, WALL * self.room.size
         beyond = (middle < self.room.low + near) | (middle > self.room.high - near)
         outside: NDArray[np.bool_] = beyond[:, 0] | beyond[:, 1]
-        why = np.where(glows, lamps.why_fixed(pieces.low, pieces.high, self.room, outside), lamps.MOVES)
-        loose = np.where(glows, why == lamps.MOVES, ~self._is_shell(outside))
+        why = np.where(glows, self._why_fixed(outside), MOVES)
+        loose = np.where(glows, why == MOVES, ~self._is_shell(outside))
         group = self._grouped(loose, glows)
         things = []
         for number, built_in in enumerate(self._built_in(group)):
@@ -107,20 +114,29 @@ class _Search:
                 things.append(thing)
             else:
                 why[group == number] = thing
-        things.sort(key=lambda thing: (-self._volume(thing), pieces.shape[thing.pieces].min()))
+        things.sort(key=self._order)
         kept = [thing for emits in (False, True) for thing in [t for t in things if t.emits == emits][:MOST]]
         for thing in things:
             if thing not in kept:
-                why[thing.pieces] = lamps.MANY
+                why[thing.pieces] = MANY
         stays: dict[str, list[str]] = {}
         for name, reason in {self._called(pieces.shape[one]): why[one] for one in np.flatnonzero(glows)}.items():
-            if reason != lamps.MOVES:
+            if reason != MOVES:
                 stays.setdefault(str(reason), []).append(name)
         return Found(_named_apart(kept), stays)
 
-    def _volume(self, thing: Thing) -> float:
-        """Its volume to three digits, so that things that are alike keep the file's order."""
-        return float(f"{np.prod(np.maximum(thing.size, 0.02 * self.room.height)):.3g}")
+    def _why_fixed(self, outside: NDArray[np.bool_]) -> NDArray[Any]:
+        """Why each piece would stay as a light wherever it hangs, or MOVES, (N,); `outside`: in a wall or beyond."""
+        pieces, room = self.pieces, self.room
+        size = pieces.high - pieces.low
+        wide = (size[:, :2].prod(axis=1) > HUGE * room.size[:2].prod()) & (size[:, 2] < 0.5 * room.height)
+        above = (pieces.high[:, 2] > room.high[2] + PLANE * room.height) & room.has_ceiling
+        return np.select([wide, outside, above], [LARGE, IN_WALL, IN_CEILING], MOVES).astype(object)
+
+    def _order(self, thing: Thing) -> tuple[float, int]:
+        """By volume, to three digits, so that things that are alike keep the file's order."""
+        volume = np.maximum(thing.size, 0.02 * self.room.height).prod()
+        return -float(f"{volume:.3g}"), int(self.pieces.shape[thing.pieces].min())
 
     def _called(self, shape: int) -> str:
         return self.names[shape] or self.surfaces.ids[shape]
@@ -129,52 +145,47 @@ class _Search:
         """Which pieces are the room itself, by their names, or by where they are and how large, (N,)."""
         pieces, room = self.pieces, self.room
         called = [f"{shape} {name}" for shape, name in zip(self.surfaces.ids, self.names, strict=True)]
-        named, furniture = (np.array([*map(says, called)])[pieces.shape] for says in (is_shell, is_furniture))
+        named = np.array([*map(is_shell, called)])[pieces.shape]
         size = pieces.high - pieces.low
         above = pieces.low[:, 2] > room.high[2] - 1e-3 * room.height
         flat = (pieces.high[:, 2] < room.floor + FLAT * room.height) & (size[:, :2].max(axis=1) > CARPET * room.height)
-        through = self._stand(pieces.low) & (size[:, 2] > TALL * room.height)
         wide = size[:, :2] > 0.8 * room.size[:2]
         large = (wide.any(axis=1) & (size[:, 2] > 0.6 * room.height)) | wide.all(axis=1)
-        return named | ((outside | above | flat | large | (through & ~furniture)) & ~self._compact()[pieces.shape])
+        return named | ((outside | above | flat | large) & ~self._compact())
 
     def _compact(self) -> NDArray[np.bool_]:
-        """Which shapes are of a named object that is within the room and no part of it as a whole, (S,)."""
-        pieces, room, named = self.pieces, self.room, np.array(self.names)
-        found = np.zeros(len(named), np.bool_)
-        for name in set(self.names) - {""}:
-            own = (named == name)[pieces.shape]
-            low, high = pieces.low[own].min(axis=0, initial=np.inf), pieces.high[own].max(axis=0, initial=-np.inf)
-            middle, near = (low + high) / 2, WALL * room.size
-            inside = ((middle > room.low + near) & (middle < room.high - near))[:2]
-            tall = high[2] - max(low[2], room.floor) > FLAT * room.height
-            found[named == name] = tall and inside.all() and ((high - low)[:2] < WIDE * room.size[:2]).all()
-        return found
+        """Which pieces are of a named object that is within the room and no part of it as a whole, (N,)."""
+        pieces, room, owner = self.pieces, self.room, self._owner()
+        low, high = bounds(owner, int(owner.max()) + 1, pieces.low, pieces.high)
+        middle, near = (low + high) / 2, WALL * room.size
+        inside = ((middle > room.low + near) & (middle < room.high - near))[:, :2].all(axis=1)
+        tall = high[:, 2] - np.maximum(low[:, 2], room.floor) > FLAT * room.height
+        small = ((high - low)[:, :2] < WIDE * room.size[:2]).all(axis=1)
+        return (np.array(self.names)[pieces.shape] != "") & (inside & tall & small)[owner]
+
+    def _owner(self) -> Labels:
+        """The number of each piece's object, (N,)."""
+        return np.unique(self.names, return_inverse=True)[1][self.pieces.shape]
 
     def _grouped(self, loose: NDArray[np.bool_], glows: NDArray[np.bool_]) -> Labels:
         """The groups of loose pieces, −1 for others, (N,)."""
-        owner_of = {name: number for number, name in enumerate(dict.fromkeys(self.names))}
-        owner = np.array([owner_of[name] for name in self.names], np.int64)[self.pieces.shape]
-        group = self.pieces.touching(CELL * self.room.height, loose, owner)
-        for join in (self._touching, lambda group: self._floating(group, glows), self._of_one_name):
-            group = _merged(group, join(group))
-        return group
+        group = self.pieces.touching(CELL * self.room.height, loose, self._owner())
+        group = _merged(group, self._touching(group))
+        return _merged(group, self._floating(group, glows))
 
     def _touching(self, group: Labels) -> Labels:
         """Pairs of groups that touch, unless both stand for themselves."""
-        pairs, _, _ = self.pieces.contacts(CELL * self.room.height, group)
         low, high = self._bounds(group)
-        size = high - low
+        size, cells = high - low, self.pieces.contacts(CELL * self.room.height, group)
+        pairs = np.column_stack(cells[:-1, :-1].nonzero())
         stands = self._stand(low) & (np.minimum(size[:, :2].max(axis=1), size[:, 2]) > SMALL * self.room.height)
         return pairs[~(stands[pairs[:, 0]] & stands[pairs[:, 1]])]
 
     def _floating(self, group: Labels, glows: NDArray[np.bool_]) -> Labels:
         """Pairs of what touches nothing, such as a shade over its lamp, and the nearest that stands or hangs."""
         room, (low, high) = self.room, self._bounds(group)
-        shell = len(low)
-        pairs, _, _ = self.pieces.contacts(CELL * room.height, np.where(group < 0, shell, group))
-        held, shines = np.zeros(shell, np.bool_), np.zeros(shell, np.bool_)
-        held[pairs[pairs[:, 1] == shell, 0]] = True
+        held = self.pieces.contacts(CELL * room.height, group)[:-1, [-1]].toarray().ravel() > 0
+        shines = np.zeros(len(low), np.bool_)
         shines[group[glows & (group >= 0)]] = True
         stands, upper = self._stand(low), low[:, 2] > room.floor + 0.5 * room.height
         ends = np.flatnonzero(stands | (upper & shines) | (held & (high[:, 2] > room.high[2] - STANDS * room.height)))
@@ -187,29 +198,14 @@ class _Search:
                 joined.append((number, others[int(np.argmin(distance))]))
         return np.array(joined, np.int64).reshape(-1, 2)
 
-    def _of_one_name(self, group: Labels) -> Labels:
-        """Pairs of groups that stand, have one name, and of which one is mostly within the box of the other."""
-        low, high = self._bounds(group)
-        size, stands = np.maximum(high - low, 1e-9), np.flatnonzero(self._stand(low))
-        named = {number: stem(self._name(np.flatnonzero(group == number))) for number in stands}
-        pairs = []
-        for one, other in combinations(stands, 2):
-            if named[one] == named[other]:
-                shared = np.maximum(np.minimum(high[one], high[other]) - np.maximum(low[one], low[other]), 0)
-                if (shared / np.minimum(size[one], size[other])).prod() > WITHIN:
-                    pairs.append((one, other))
-        return np.array(pairs, np.int64).reshape(-1, 2)
-
     def _built_in(self, group: Labels) -> NDArray[np.bool_]:
         """Which groups share much of their surface with the room, above the floor, or reach into its walls, (T,)."""
         room, (low, high) = self.room, self._bounds(group)
-        count, above = len(low), room.floor + 2 * STANDS * room.height
-        pairs, times, cells = self.pieces.contacts(CELL * room.height, np.where(group < 0, count, group), above)
-        with_shell = pairs[:, 1] == count
-        shared = np.bincount(pairs[with_shell, 0], times[with_shell], count)[:count]
+        cells = self.pieces.contacts(CELL * room.height, group, room.floor + 2 * STANDS * room.height)
         reach = REACHES * room.size
         reaches = ((low < room.low - reach) | (high > room.high + reach))[:, :2].any(axis=1)
-        return reaches | (shared > BUILT_IN * np.maximum(np.bincount(cells, minlength=count)[:count], 1))
+        shared = cells[:-1, [-1]].toarray().ravel()
+        return reaches | (shared > BUILT_IN * np.maximum(cells.diagonal()[:-1], 1))
 
     def _stand(self, low: Points) -> NDArray[np.bool_]:
         return low[..., 2] < self.room.floor + STANDS * self.room.height
@@ -228,23 +224,49 @@ class _Search:
         stands = bool(self._stand(low)) and low[2] > room.floor - 2 * STANDS * room.height
         is_lamp = bool(len(glow)) and not stands
         others = pieces.sample[~np.isin(pieces.sample_piece, members)] if is_lamp else pieces.sample[:0]
-        hangs = is_lamp and lamps.hangs(low, high, room, others)
-        top = room.high + lamps.PLANE * room.size * [0, 0, hangs]
-        if not ((middle > room.low) & (middle < top)).all():
-            return lamps.IN_WALL
-        if (size[:2] > WIDE * room.size[:2]).any() or size[2] > TALL * room.height:
-            return lamps.LARGE
+        hangs = is_lamp and self._hangs(low, high, others)
+        inside = (middle > room.low) & (middle < room.high + PLANE * room.size * [0, 0, hangs])
+        if not inside.all():
+            return IN_WALL if inside[2] else HELD
+        wide = size[:2] > WIDE * room.size[:2]
+        if (wide.all() if hangs else wide.any()) or size[2] > TALL * room.height:
+            return LARGE
         if hangs:
             flat = float(np.average(pieces.flat[glow], weights=np.maximum(pieces.area[glow], 1e-30)))
-            reason = lamps.why_it_stays(low, high, room, flat, others, CELL * room.height)
+            reason = self._why_it_stays(low, high, flat, others)
             return reason or Thing(name, members, low, high, emits=True, hangs=True)
         least = (SLENDER if len(glow) else SMALL) * room.height
         building = room.subject is not None and size.max() > BUILDING
         if not stands or np.sort(size)[1] < least or building or (built_in and not is_furniture(name)):
-            return lamps.HELD
-        if size.min() < lamps.SHEET * room.height:
-            return lamps.IN_WALL
+            return HELD
+        if size.min() < SHEET * room.height:
+            return IN_WALL
         return Thing(name, members, low, high, bool(len(glow)), hangs=False)
+
+    def _hangs(self, low: Points, high: Points, others: Points) -> bool:
+        """Whether a lamp hangs from the ceiling, by the corners (3,) around it and the points (M, 3) on all else.
+
+        It does in the upper half, too, where nothing is near: on a wire that is not modelled.
+        """
+        room, apart = self.room, FLOATS * self.room.height
+        if not room.has_ceiling or high[2] > room.high[2] - AT_CEILING * room.height:
+            return room.has_ceiling
+        near = ((others > low - apart) & (others < high + apart)).all(axis=1)
+        return bool(low[2] > room.floor + 0.5 * room.height and not near.any())
+
+    def _why_it_stays(self, low: Points, high: Points, flat: float, others: Points) -> str:
+        """Why a lamp that hangs stays, or MOVES; `flat` is the share of its light that shines up or down."""
+        room, size = self.room, high - low
+        if flat < 0.5 and size[:2].min() < SHEET * room.height < size[2]:
+            return IN_WALL
+        if high[2] < room.high[2] - AT_CEILING * room.height:
+            return MOVES
+        side = max(float(size[:2].max()) / 8, 2 * CELL * room.height)
+        count = np.maximum(np.round(size[:2] / side), 1).astype(int)
+        plane = others[np.abs(others[:, 2] - room.high[2]) < PLANE * room.height, :2]
+        place = np.floor((plane - low[:2]) / np.maximum(size[:2], 1e-30) * count).astype(int)
+        place = place[((place >= 0) & (place < count)).all(axis=1)]
+        return MOVES if len(np.unique(place, axis=0)) >= CLOSED * count.prod() else IN_CEILING
 
     def _name(self, members: Labels) -> str:
         """The object or shape that has most of its area; names of furniture before others, and then of lamps."""
@@ -275,3 +297,19 @@ def _named_apart(things: list[Thing]) -> list[Thing]:
         taken.add(name)
         made.append(replace(thing, name=name))
     return made
+
+
+def is_shell(name: str) -> bool:
+    """Whether a name is of the room itself, such as a wall, and of nothing that stands in it."""
+    return _SHELL.search(name.lower()) is not None and not is_furniture(name)
+
+
+def is_furniture(name: str) -> bool:
+    """Whether a name is of a piece of furniture."""
+    return _FURNITURE.search(name.lower()) is not None
+
+
+def group_name(name: str) -> str:
+    """A name as it is, as far as a spec allows it: without accents, and with hyphens for other signs."""
+    plain = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    return re.sub(r"[^A-Za-z0-9_.-]+", "-", plain).strip("-_.")[:60] or "object"

@@ -4,66 +4,109 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from photonfarm.renderer.importing.proposal.floor_plan import FloorPlan, Mask
-from photonfarm.renderer.importing.proposal.groups import CELL, Found, Thing, find_things
-from photonfarm.renderer.importing.proposal.lamps import OUTSIDE, PLANE
-from photonfarm.renderer.importing.proposal.pieces import Pieces
-from photonfarm.renderer.importing.proposal.room import Room, extent_of, find_room, outdoors, trace
-from photonfarm.renderer.importing.proposal.surfaces import Frame, Points, Surfaces
+from photonfarm.renderer.importing.proposal.groups import CELL, OUTSIDE, PLANE, Found, Thing, find_things
+from photonfarm.renderer.importing.proposal.room import NEAR_FLOOR, Room, find_room, outdoors, trace
+from photonfarm.renderer.importing.proposal.surfaces import Box, Frame, Pieces, Points, Surfaces
 from photonfarm.renderer.scene.surroundings import LEAVING, NONE, surroundings
 from photonfarm.shared.core.waiting import Log
 
-RANGE = 0.25
-"""How far a thing may go to each side, as a share of the room, so that arrangements stay sensible."""
+Mask = NDArray[np.bool_]
 
-EYES = (0.5, 0.72)
-"""The heights of cameras, as shares of the room's: 1.35 m to 1.95 m in a room of 2.7 m."""
-
-LOOKS = (0.04, 0.32)
-"""The heights of what cameras look at: furniture, and not the ceiling."""
-
-TOWARDS_MIDDLE = 0.65
-"""What cameras look at is this share of where things may stand, around the middle: so that they show many."""
-
-MARGIN = 0.05
-"""The distance of cameras from what does not move, as a share of the room's shorter side."""
-
-CLEAR = 0.05
-"""The distance of cameras from any surface, as a share of the room's height."""
-
-NEAR = 0.04
-"""What lies lower than this share of the room's height above a thing's lower side is no obstacle: carpets, skirting."""
-
-RECTANGLE = 0.25
-"""The lengths of a ceiling light that is added, as a share of the room's."""
+# Shares of the room's height, where nothing else is said.
+RANGE = 0.25  # of the room: how far a thing may go to each side, so that arrangements stay sensible
+EYES = (0.5, 0.72)  # the heights of cameras: 1.35 m to 1.95 m in a room of 2.7 m
+LOOKS = (0.04, 0.32)  # the heights of what cameras look at: furniture, and not the ceiling
+TOWARDS_MIDDLE = 0.65  # of where things may stand: what cameras look at, around the middle, so that they show many
+MARGIN = 0.05  # of the room's shorter side: the distance of cameras from what does not move
+CLEAR = 0.05  # the distance of cameras from any surface
+NEAR = 0.04  # what lies less above a thing's lower side is no obstacle: carpets, skirting
+RECTANGLE = 0.25  # of the room: the lengths of a ceiling light that is added
+LOWEST = 0.75  # the least height of such a light: lower things are furniture
 
 RADIANCE = (12.0, 11.0, 9.5)
 """The radiance of such a light: a warm white; the exposure follows it."""
 
+CELLS = 96
+"""Cells of the floor plan along the longer side of the room."""
+
 MOST_ROOMS = 4
 """The most rooms that are looked into for something that may move."""
 
-LOWEST = 0.75
-"""The least height of such a light, as a share of the room's: lower things are furniture."""
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FloorPlan:
+    """The grid, and the points on everything that does not move."""
 
-class Box(NamedTuple):
-    """A box in the frame."""
+    room: Room
+    fixed: Points  # (M, 3)
+    flat: Mask  # (M,): which of them lie on what is level
+    cell: float
+    shape: tuple[int, int]
 
-    low: Points  # (3,)
-    high: Points  # (3,)
+    @classmethod
+    def of(cls, pieces: Pieces, room: Room, fixed_pieces: Mask) -> Self:
+        """The plan of a room; `fixed_pieces` (N,) are those that do not move."""
+        cell = float(room.size[:2].max()) / CELLS
+        a, b = (int(n) for n in np.maximum(np.ceil(room.size[:2] / cell), 1))
+        chosen = fixed_pieces[pieces.sample_piece]
+        return cls(room, pieces.sample[chosen], pieces.sample_flat[chosen], cell, (a, b))
+
+    def _marked(self, points: Points) -> Mask:
+        place = np.floor((points[:, :2] - self.room.low[:2]) / self.cell).astype(np.int64)
+        inside = ((place >= 0) & (place < self.shape)).all(axis=1)
+        mask: Mask = np.zeros(self.shape, np.bool_)
+        mask[tuple(place[inside].T)] = True
+        return mask
+
+    def free(self, bottom: float, top: float, half: Points, level: float) -> Mask:
+        """Where the middle of a box of half-lengths `half` (2,) may be: at a floor or ceiling, and nothing in its way.
+
+        `level` is the height of that, which may have small gaps, and does not count if there is next to none.
+        """
+        height = self.fixed[:, 2]
+        blocked = self._marked(self.fixed[(height > bottom) & (height < top)])
+        reach = np.ceil(half / self.cell).astype(int)
+        blocked = ndimage.maximum_filter(blocked, size=tuple(2 * reach + 1), mode="constant", cval=1)
+        there = self._marked(self.fixed[self.flat & (np.abs(height - level) < NEAR_FLOOR * self.room.height)])
+        there |= ndimage.binary_closing(there, iterations=2, border_value=0)
+        free: Mask = ~blocked & (there | (there.mean() <= 0.05))
+        return free
+
+    def box_around(self, free: Mask, point: Points, reach: Points) -> tuple[Points, Points] | None:
+        """The largest free rectangle around the free place nearest to a point, up to `reach` (2,) from it.
+
+        Its corners (2,), which are middles of cells; None if no free place is within reach.
+        """
+        away = np.abs(self.middles - point)
+        near = free & (away <= reach).all(axis=-1)
+        if not near.any():
+            return None
+        nearest = np.argmin(np.where(near, np.hypot(away[..., 0], away[..., 1]), np.inf))
+        first, last = largest_rectangle(near, *(int(n) for n in np.unravel_index(nearest, near.shape)))
+        return self.middles[first], self.middles[last]
+
+    @property
+    def middles(self) -> Points:
+        """The middles of all cells, (A, B, 2)."""
+        return self.room.low[:2] + (np.moveaxis(np.indices(self.shape), 0, -1) + 0.5) * self.cell
+
+    def widest_place(self, free: Mask) -> Points:
+        """The point (2,) that is farthest from whatever is not free."""
+        depth = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1]
+        place: Points = self.middles[np.unravel_index(int(np.argmax(depth)), free.shape)]
+        return place
 
 
 class Movable(NamedTuple):
-    """A thing, and where it may be."""
+    """A thing, and where its `at` may be."""
 
     thing: Thing
-    at: Points  # (3,): the middle of its lower side, where it stands in the file; of what hangs, of its upper side
     box: Box
 
 
@@ -101,23 +144,22 @@ def propose(scene: Any, frame: Frame, camera: Points | None, objects: Mapping[st
     Raises SpecError for a scene of no extent.
     """
     surfaces = Surfaces.of(scene, frame)
-    low, high = extent_of(surfaces)
     log(f"looking for the room and what stands in it, among {len(surfaces.shape)} triangles")
     room, pieces, found = _find(scene, surfaces, frame, camera, objects)
-    moves = np.full(pieces.count, -1, np.int64)
+    moves = np.full(len(pieces.shape), -1, np.int64)
     for number, thing in enumerate(found.things):
         moves[thing.pieces] = number
-    extent = Box(low, high)
-    views = _around(extent, frame, camera)
-    if room.is_stage:
-        light = _light(scene, frame, room, views[0].origin, None)
-        return Proposal(room, extent, [], views, light, found.stays, surfaces.shape, moves[pieces.label])
-    plan = FloorPlan.of(pieces, room, moves < 0)
-    movables = [_movable(thing, plan, room) for thing in found.things]
-    origin = _origin(plan, room, scene, frame)
-    views.insert(0, View(origin, _look_at(movables, room, origin)))
-    light = _light(scene, frame, room, origin, plan)
-    return Proposal(room, extent, movables, views, light, found.stays, surfaces.shape, moves[pieces.label])
+    views = _around(surfaces.main(), frame, camera)
+    plan, movables = None, []
+    if not room.is_stage:
+        plan = FloorPlan.of(pieces, room, moves < 0)
+        movables = [_movable(thing, plan) for thing in found.things]
+        origin = _origin(plan, scene, frame)
+        views.insert(0, View(origin, _look_at(movables, room, origin)))
+    light = _light(scene, frame, room, views[0].origin, plan)
+    return Proposal(
+        room, surfaces.extent, movables, views, light, found.stays, surfaces.shape, moves[pieces.label]
+    )  # fmt: skip
 
 
 def _find(
@@ -166,12 +208,8 @@ def _around(extent: Box, frame: Frame, camera: Points | None) -> list[View]:
 
 def _light(scene: Any, frame: Frame, room: Room, origin: Box, plan: FloorPlan | None) -> Ceiling:
     """A light over the cameras where nothing is in its way, under what is above them."""
-    middle = (origin.low + origin.high)[:2] / 2
-    for share in (RECTANGLE, RECTANGLE / 2, RECTANGLE / 4):
-        size = share * room.size[:2]
-        place = plan and _place(plan, room, middle, size, room.high[2], room.high[2])
-        if place:
-            break
+    middle, size = (origin.low + origin.high)[:2] / 2, RECTANGLE * room.size[:2]
+    place = plan and _place(plan, middle, size, room.high[2], room.high[2], hangs=True)
     first, last = place or (middle, middle)
     middle, reach = (first + last) / 2, (last - first + size) / 2
     steps = np.stack(np.meshgrid(*(np.linspace(-1, 1, 5),) * 2), axis=-1).reshape(-1, 2)
@@ -183,42 +221,42 @@ def _light(scene: Any, frame: Frame, room: Room, origin: Box, plan: FloorPlan | 
 
 
 def _place(
-    plan: FloorPlan, room: Room, middle: Points, size: Points, bottom: float, top: float, *, hangs: bool = True
+    plan: FloorPlan, middle: Points, size: Points, bottom: float, top: float, *, hangs: bool
 ) -> tuple[Points, Points] | None:  # fmt: skip
     """The corners (2,) of where the middle (2,) of something may be, near to where it is; None if nowhere."""
-    clear = NEAR * room.height
+    room, clear = plan.room, NEAR * plan.room.height
     if hangs:
         top = min(top, room.high[2] - PLANE * room.height)
         bottom = min(bottom, top - clear)
     else:
         bottom += clear
-    free = plan.free(bottom, top, size / 2, plan.ceiling if hangs else plan.floor)
+    free = plan.free(bottom, top, size / 2, room.high[2] if hangs else room.floor)
     return plan.box_around(free, middle, RANGE * room.size[:2])
 
 
-def _movable(thing: Thing, plan: FloorPlan, room: Room) -> Movable:
+def _movable(thing: Thing, plan: FloorPlan) -> Movable:
     """Where a thing may be: flat in height, and clear of all that does not move."""
-    middle, height = (thing.low + thing.high)[:2] / 2, (thing.high if thing.hangs else thing.low)[2]
-    place = _place(plan, room, middle, thing.size[:2], thing.low[2], thing.high[2], hangs=thing.hangs)
-    low, high = (np.array([*corner, height]) for corner in place or (middle, middle))
-    return Movable(thing, np.array([*middle, height]), Box(low, high))
+    at = thing.at
+    place = _place(plan, at[:2], thing.size[:2], thing.low[2], thing.high[2], hangs=thing.hangs)
+    low, high = (np.array([*corner, at[2]]) for corner in place or (at[:2], at[:2]))
+    return Movable(thing, Box(low, high))
 
 
-def _origin(plan: FloorPlan, room: Room, scene: Any, frame: Frame) -> Box:
+def _origin(plan: FloorPlan, scene: Any, frame: Frame) -> Box:
     """The largest box at the height of eyes that is free of what does not move, and inside the room."""
+    room = plan.room
     low, high = (room.floor + share * room.height for share in EYES)
-    margin = np.full(2, MARGIN * float(room.size[:2].min()))
-    clear = plan.free(low, high, margin, plan.floor)
-    wishes = [clear & _open(plan, room, scene, frame, (low, high)), clear]
-    free = next((wish for wish in wishes if wish.any()), np.ones(plan.shape, np.bool_))
+    clear = plan.free(low, high, np.full(2, MARGIN * float(room.size[:2].min())), room.floor)
+    wishes = [clear & _open(plan, scene, frame, (low, high)), clear, np.ones_like(clear)]
+    free = next(wish for wish in wishes if wish.any())
     found = plan.box_around(free, plan.widest_place(free), room.size[:2])
-    first, last = found if found is not None else (room.low[:2], room.high[:2])
+    first, last = found or (room.low[:2], room.high[:2])
     return Box(np.array([*first, low]), np.array([*last, high]))
 
 
-def _open(plan: FloorPlan, room: Room, scene: Any, frame: Frame, heights: tuple[float, ...]) -> Mask:
+def _open(plan: FloorPlan, scene: Any, frame: Frame, heights: tuple[float, ...]) -> Mask:
     """Where cameras stand in the open at all heights: inside no solid, not outside, and not behind something."""
-    found = np.ones(plan.shape, np.bool_)
+    found, room = np.ones(plan.shape, np.bool_), plan.room
     for height in heights:
         places = np.concatenate([plan.middles, np.full((*plan.shape, 1), height)], axis=-1)
         around = surroundings(scene, frame.world(places.reshape(-1, 3)).astype(np.float32))
@@ -231,16 +269,31 @@ def _open(plan: FloorPlan, room: Room, scene: Any, frame: Frame, heights: tuple[
 def _look_at(movables: list[Movable], room: Room, origin: Box) -> Box:
     """The box around what stands in the room, wherever it may stand; without any, around the middle of the floor."""
     low, high = (room.floor + share * room.height for share in LOOKS)
-    standing = [m for m in movables if not m.thing.hangs]
+    standing = [(box, thing.size / 2) for thing, box in movables if not thing.hangs]
     if room.subject is not None and not standing:
         lower, upper = room.subject
         beside = np.maximum(0.15 * (upper - lower), LOOKS[0] * room.size)  # so that some of it is in the open, and seen
         return Box(np.maximum(lower - beside, room.low), np.minimum(upper + beside, room.high))
     first, last = origin.low[:2], origin.high[:2]
     if standing:
-        half = np.array([m.thing.size[:2] / 2 for m in standing])
-        first = (np.array([m.box.low[:2] for m in standing]) - half).min(axis=0)
-        last = (np.array([m.box.high[:2] for m in standing]) + half).max(axis=0)
+        first = np.min([box.low - half for box, half in standing], axis=0)[:2]
+        last = np.max([box.high + half for box, half in standing], axis=0)[:2]
     first, last = np.maximum(first, room.low[:2]), np.minimum(last, room.high[:2])
     middle, half = (first + last) / 2, TOWARDS_MIDDLE * (last - first) / 2
     return Box(np.array([*(middle - half), low]), np.array([*(middle + half), high]))
+
+
+def largest_rectangle(free: Mask, row: int, column: int) -> tuple[tuple[int, int], tuple[int, int]]:
+    """The first and last cells of the largest rectangle of free cells that contains a free one."""
+    best, found = 0, ((row, column), (row, column))
+    for first in range(row, -1, -1):
+        for last in range(row, free.shape[0]):
+            blocked = np.flatnonzero(~free[first : last + 1].all(axis=0))
+            left = int(blocked[blocked < column].max(initial=-1)) + 1
+            right = int(blocked[blocked >= column].min(initial=free.shape[1])) - 1
+            if right < column:
+                break
+            area = (last - first + 1) * (right - left + 1)
+            if area > best:
+                best, found = area, ((first, left), (last, right))
+    return found

@@ -9,42 +9,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.importing.proposal.surfaces import Frame, Points, Surfaces
+from photonfarm.renderer.importing.proposal.surfaces import Box, Frame, Points, Surfaces
 from photonfarm.renderer.scene.surroundings import NONE, surroundings
-from photonfarm.shared.core.errors import SpecError
 
-RAYS = 512
-"""The rays from each point of view."""
-
-ROUNDS, VIEWPOINTS = 3, 48
-"""How often the points of view are chosen anew, and how many they are: so that niches are seen too."""
-
-FACING = 0.9
-"""Surfaces count as floor, ceiling or wall up to this cosine between normal and axis."""
-
-SIDE_SHARE = 0.08
-"""The outermost place that has this share of the hits on surfaces that face inwards is a side of the room."""
-
-BEYOND = 0.15
-"""No place is a side beyond which more than this share of all hits lie: there the room is open."""
-
-OPEN_SHARE = 0.5
-"""There is a ceiling if more than this share of steep rays hit something."""
-
-LEVEL, BACKS = 0.5, 0.95
-"""Rays within 30 degrees of the horizon count as level; where more than that share of all hits are backs of surfaces,
-the point of view is inside of a thing, and not of a room."""
-
-PART = 0.6
-"""What is a smaller part of the scene, or shows more backs of surfaces, is a room only if something is in it."""
-
-GROUND, THICK, AROUND, RISES = 0.25, 0.25, 1.5, 0.75
-"""There is ground where rays from above meet that share of one level, and not higher than the second share of all that
-is there, as ground may be a slab; outdoors reaches so many times the size of what stands there beyond it, and is at
-least so high, as a share of its lengths, that cameras look down on it."""
-
-NEAR_FLOOR = 0.03
-"""Flat surfaces within this share of the room's height are the floor, or lie on it."""
+RAYS = 512  # from each point of view
+ROUNDS, VIEWPOINTS = 3, 48  # how often points of view are chosen anew, and how many: so that niches are seen too
+FACING = 0.9  # up to this cosine between normal and axis, surfaces count as floor, ceiling or wall
+SIDE_SHARE = 0.08  # of hits on surfaces that face inwards: the outermost place that has as many is a side of the room
+BEYOND = 0.15  # of all hits: where more lie beyond a place, that is no side, and the room is open there
+OPEN_SHARE = 0.5  # of steep rays: there is a ceiling if more hit something
+LEVEL = 0.5  # rays up to 30 degrees above the horizon count as level
+BACKS = 0.95  # of hits: where more are backs of surfaces, the point of view is inside of a thing, and not of a room
+PART = 0.6  # of the scene: what is smaller, or shows more backs of surfaces, is a room only if something is in it
+GROUND = 0.25  # of rays from above: there is ground where as many meet one level
+THICK = 0.25  # of the height of all that is there: the ground, which may be a slab, is not higher
+AROUND = 1.5  # of the size of what stands outdoors: how far the surroundings reach beyond it
+RISES = 0.75  # of its lengths: the least height of what is outdoors, so that cameras look down on it
+NEAR_FLOOR = 0.03  # of the room's height: flat surfaces as near to the floor are the floor, or lie on it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +37,7 @@ class Room:
     has_ceiling: bool
     is_stage: bool = False  # nothing encloses it, and it has no ground: what is there is seen from outside
     is_doubtful: bool = False  # it may be the inside of something that is to be seen from outside
-    subject: tuple[Points, Points] | None = None  # outdoors, the corners (3,) around all that stands on the ground
+    subject: Box | None = None  # outdoors, the box around all that stands on the ground
 
     @property
     def size(self) -> Points:
@@ -82,14 +63,6 @@ class _Hits(NamedTuple):
     is_back: NDArray[np.bool_]  # (N,): whether it is a surface's back that was hit
 
 
-def extent_of(surfaces: Surfaces) -> tuple[Points, Points]:
-    """The corners (3,) around a scene; raises SpecError for one of no extent."""
-    low, high = surfaces.corners.min(axis=(0, 1)), surfaces.corners.max(axis=(0, 1))
-    if not np.isfinite(low).all() or max(high - low) <= 0:
-        raise SpecError("the scene has no extent; nothing can be rendered")
-    return low, high
-
-
 def find_room(
     scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | None, others: Sequence[Room] = ()
 ) -> Room:  # fmt: skip
@@ -97,31 +70,30 @@ def find_room(
 
     `others` are rooms that the point must not be in.
     """
-    rng = np.random.default_rng(0)
-    low, high = extent_of(surfaces)
-    if camera is not None and (((camera < low) | (camera > high)).any() or _in_solid(scene, frame, camera[None])[0]):
-        camera = None
-    viewpoints = _best_viewpoint(scene, frame, low, high, rng, others) if camera is None else camera[None]
+    rng, main = np.random.default_rng(0), surfaces.main()
+    if camera is not None:
+        outside = ((camera < main.low) | (camera > main.high)).any()
+        camera = None if outside or _in_solid(scene, frame, camera[None])[0] else camera
+    viewpoints = _best_viewpoint(scene, frame, main, rng, others) if camera is None else camera[None]
     seen = []
     for _ in range(ROUNDS):
         seen.append(_cast(scene, frame, viewpoints, rng))
         if not np.isfinite(seen[-1].distance).any():
             break
         viewpoints = _along(seen[-1], rng)
-    found, level = np.isfinite(seen[0].distance), np.abs(seen[0].direction[:, 2]) < LEVEL
+    found, height = np.isfinite(seen[0].distance), seen[0].direction[:, 2]
+    level = (height > 0) & (height < LEVEL)
     backs = seen[0].is_back[found].mean() if found.any() else 1.0
     if camera is None and (found[level].mean() < OPEN_SHARE or backs > BACKS):
         return outdoors(scene, surfaces, frame)
-    low, high, has_ceiling = _sides(_Hits(*map(np.concatenate, zip(*seen, strict=True))), low, high)
-    still = surfaces.corners[~surfaces.emits[surfaces.shape]].reshape(-1, 3)
-    whole = np.ptp(still, axis=0).prod() if len(still) else 0
-    doubtful = camera is None and bool((high - low).prod() < PART * whole or backs > PART)
+    low, high, has_ceiling = _sides(_Hits(*map(np.concatenate, zip(*seen, strict=True))), main)
+    doubtful = camera is None and bool((high - low).prod() < PART * (main.high - main.low).prod() or backs > PART)
     return Room(low, high, has_ceiling, is_doubtful=doubtful)
 
 
 def outdoors(scene: Any, surfaces: Surfaces, frame: Frame) -> Room:
     """The ground with what stands on it, and some room around that; a stage where there is no ground."""
-    low, high = extent_of(surfaces)
+    low, high = surfaces.main()
     level = NEAR_FLOOR * (high[2] - low[2]) + 1e-6 * float((high - low).max())
     steps = np.stack(np.meshgrid(*(np.arange(32) + 0.5,) * 2, indexing="ij"), axis=-1).reshape(-1, 2) / 32
     above = np.column_stack([low[:2] + steps * (high - low)[:2], np.full(len(steps), high[2] + 10 * level)])
@@ -132,12 +104,13 @@ def outdoors(scene: Any, surfaces: Surfaces, frame: Frame) -> Room:
         return Room(low, high, has_ceiling=False, is_stage=True)
     lowest = levels[np.argmax(share >= GROUND)]
     floor = float(np.median(met[(met >= lowest) & (met < lowest + 2 * level)]))
-    rising = surfaces.corners[surfaces.corners[:, :, 2].max(axis=1) > floor + level].reshape(-1, 3)
+    tops = surfaces.corners[:, :, 2].max(axis=1)
+    rising = surfaces.corners[(tops > floor + level) & (tops <= high[2])].reshape(-1, 3)
     first, last = (rising.min(axis=0), rising.max(axis=0)) if len(rising) else (low, high)
     reach = AROUND * float((last - first).max())
     low, high = np.maximum(low, first - reach), np.minimum(high, last + reach)
     low[2], high[2] = floor, max(last[2], floor + RISES * float(np.sqrt((high - low)[:2].prod())))
-    return Room(low, high, has_ceiling=False, subject=(np.array([*first[:2], floor]), last))
+    return Room(low, high, has_ceiling=False, subject=Box(np.array([*first[:2], floor]), last))
 
 
 def _in_solid(scene: Any, frame: Frame, points: Points) -> NDArray[np.bool_]:
@@ -146,11 +119,12 @@ def _in_solid(scene: Any, frame: Frame, points: Points) -> NDArray[np.bool_]:
 
 
 def _best_viewpoint(
-    scene: Any, frame: Frame, low: Points, high: Points, rng: np.random.Generator, others: Sequence[Room]
+    scene: Any, frame: Frame, within: Box, rng: np.random.Generator, others: Sequence[Room]
 ) -> Points:  # fmt: skip
     """A point (1, 3), in no solid and no other room, from which most rays hit something, and what they hit is far."""
     steps = [(np.arange(n) + 0.5) / n for n in (8, 8, 4)]
-    grid = low + (high - low) * np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    shares = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    grid = within.low + (within.high - within.low) * shares
     hits = _cast(scene, frame, grid, rng, rays=64)
     distance, back = (values.reshape(len(grid), -1) for values in (hits.distance, hits.is_back))
     met = np.isfinite(distance)
@@ -197,9 +171,9 @@ def trace(scene: Any, frame: Frame, origin: Points, direction: Points) -> tuple[
     return distance, frame.inward(np.array(normal, np.float64).T)
 
 
-def _sides(hits: _Hits, low: Points, high: Points) -> tuple[Points, Points, bool]:
-    """The corners (3,) of the room that was seen, and whether it has a ceiling; `low` and `high` are the scene's."""
-    found = np.isfinite(hits.distance)
+def _sides(hits: _Hits, within: Box) -> tuple[Points, Points, bool]:
+    """The corners (3,) of the room that was seen, and whether it has a ceiling."""
+    (low, high), found = within, np.isfinite(hits.distance)
     if not found.any():
         return low, high, False
     position, normal = (hits.origin + hits.distance[:, None] * hits.direction)[found], hits.normal[found]
@@ -214,7 +188,8 @@ def _sides(hits: _Hits, low: Points, high: Points) -> tuple[Points, Points, bool
                 side = float(np.percentile(sign * position[:, axis], 0.5))
             bound[axis] = sign * side
     if not has_ceiling:
-        room_high[2] = max(np.percentile(position[:, 2], 99.5), room_low[2] + 0.3 * (room_high - room_low)[:2].max())
+        top = min(np.percentile(position[:, 2], 99.5), high[2])
+        room_high[2] = max(top, room_low[2] + 0.3 * (room_high - room_low)[:2].max())
     wrong = room_low >= room_high
     room_low[wrong], room_high[wrong] = low[wrong], high[wrong]
     return room_low, room_high, has_ceiling
@@ -231,5 +206,4 @@ def _side(values: NDArray[np.float64], extent: float) -> float | None:
     first = int(np.argmax(near >= SIDE_SHARE * len(values)))
     if near[first] < SIDE_SHARE * len(values):
         return float(np.percentile(values, 2))
-    within = values[(bins == first) | (bins == first + 1)]
-    return float(np.median(within))
+    return float(np.median(values[(bins == first) | (bins == first + 1)]))

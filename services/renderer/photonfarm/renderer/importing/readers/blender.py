@@ -13,17 +13,23 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.readers import gltf
 from photonfarm.renderer.importing.readers.blender_lamps import Lamps
 from photonfarm.shared.core.errors import BackendError, SpecError
 from photonfarm.shared.core.waiting import Log
 
+_NAMES = {
+    "KHR_materials_anisotropy": "Anisotropic", "KHR_materials_clearcoat": "Coat Weight",
+    "KHR_materials_sheen": "Sheen Weight", "KHR_materials_specular": "Specular Tint",
+    "KHR_materials_transmission": "Transmission Weight", "clearcoatNormalTexture": "Coat Normal",
+    "emissiveTexture": "Emission Color",
+}  # fmt: skip
+"""What Blender calls that which glTF has of its surfaces."""
+
 VARIABLE = "PHOTONFARM_BLENDER"
 """The variable that names Blender, or a Python that has `bpy`."""
-
-DULLEST = 1.0101
-"""The index of refraction of what the reader of glTF has no reflections for."""
 
 _SCRIPT = Path(__file__).with_name("blender_export.py")
 
@@ -32,23 +38,24 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file. Raises BackendError without Blender, SpecError if Blender cannot read the file."""
     command = blender_command(path)
     out = scratch / "exported.glb"
-    log(f"{path.name}: Blender writes it as glTF")
+    log(f"{path.name}: Blender opens it")
     _run([*command, str(path.resolve()), str(out)], path, out)
     try:
         scene = gltf.read(out, scratch, log)
     except SpecError as error:
         raise SpecError(str(error).replace(str(out), str(path))) from error
+    found, scene.changes = scene.changes, Changes()
+    scene.changes.note("Blender's (x, y, z) is (x, z, −y) here")
+    for change in found:
+        for place in change.places or [""]:
+            scene.changes.say(change.effect, _NAMES.get(change.name, change.name), change.meaning, place)
     beside: dict[str, Any] = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
     scene.objects = {made: beside["owners"].get(owner, owner) for made, owner in scene.objects.items()}
-    for effect, name, meaning, place in beside["said"]:
-        if effect is None:
-            scene.changes.note(meaning, place, name=name)
-        else:
-            scene.changes.lose(effect, name, meaning, place)
+    for each in beside["said"]:
+        scene.changes.say(*each)
     if beside["camera"] is not None:
         x, y, z = beside["camera"]
         scene.camera = (x, z, -y)
-    _make_dull_diffuse(scene)
     lamps = Lamps(scene, scratch)
     for lamp in beside["lamps"]:
         lamps.put(lamp)
@@ -56,28 +63,11 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     return scene
 
 
-def _make_dull_diffuse(scene: ImportedScene) -> None:
-    """Let what reflects by its colour alone be `diffuse`, as in Cycles; `principled` brightens it at grazing angles."""
-    for material in scene.root.iter("bsdf"):
-        found = {part.get("name"): float(part.get("value", 0)) for part in material if part.tag == "float"}
-        if found.pop("eta", 2.0) > DULLEST or found.get("metallic", 1.0) > 0 or len(found) > 2:
-            continue
-        material.set("type", "diffuse")
-        material[:] = [part for part in material if part.get("name") == "base_color"]
-        material[0].set("name", "reflectance")
-
-
 def _run(command: list[str], path: Path, out: Path) -> None:
-    output = out.with_suffix(".log")
-    with output.open("wb") as stream:
-        process = subprocess.Popen(command, stdout=stream, stderr=stream)
-        try:
-            process.wait()
-        finally:
-            process.kill()
-    lines = [line.strip() for line in output.read_text(errors="replace").splitlines() if line.strip()]
-    if process.returncode == 0 and out.with_suffix(".json").is_file():
+    made = subprocess.run(command, capture_output=True, encoding="utf-8", errors="replace", check=False)
+    if made.returncode == 0 and out.with_suffix(".json").is_file():
         return
+    lines = [line.strip() for line in (made.stdout + made.stderr).splitlines() if line.strip()]
     for line in lines:
         if line.startswith("fault: "):
             raise SpecError(f"{path}: {line.removeprefix('fault: ')[:300]}")

@@ -11,8 +11,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import sys
 from collections import Counter
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -20,11 +22,22 @@ import bpy
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from blender_materials import prepare  # type: ignore[import-not-found]
+from blender_materials import DULL, prepare, source  # type: ignore[import-not-found]
 
-_NO_MESHES = {"CURVES": "hair", "POINTCLOUD": "points", "VOLUME": "a volume", "GREASEPENCIL": "drawn lines"}
-_RAYS = ("camera", "diffuse", "glossy", "transmission", "shadow")
+OLDEST = (4, 5)
+"""The first Blender whose lamps have an exposure, a temperature and `normalize`."""
+
+_NO_MESHES = {"CURVES": "hair", "HAIR": "particles", "POINTCLOUD": "points", "VOLUME": "a volume",
+              "GREASEPENCIL": "drawn lines"}  # fmt: skip
+_RAYS = dict.fromkeys(("camera", "diffuse", "glossy", "transmission"), True)
+_LIT = dict.fromkeys(("visible_diffuse", "visible_glossy", "visible_transmission", "visible_shadow"), True)
+_SEEN = {"visible_camera": True, **_LIT, "is_holdout": False, "is_shadow_catcher": False}
+"""Flags of worlds, lamps and surfaces, as all rays take them here."""
+
 _OF_LAMPS = ("normalize", "shadow_soft_size", "angle", "spot_size", "spot_blend", "shape", "size", "size_y", "spread")
+_AREA_IN_FBX = re.compile(rb"LightType.{15,30}?(I\x03\0\0\0|,\s*3\b)", re.DOTALL)
+"""A light that is an area, in a binary file or in one of text."""
+
 SKY = (2048, 1024)
 """The size of an image of the sky; the sun of a sky is three of its pixels across."""
 
@@ -41,12 +54,14 @@ def say(effect: str | None, name: str, meaning: str, place: str = "") -> None:
 
 def main() -> None:
     """Open, look, mend and write."""
-    source, out = sys.argv[-2:]
-    _open(source)
+    if bpy.app.version < OLDEST:
+        sys.exit(f"fault: Blender {bpy.app.version_string} is too old; {'.'.join(map(str, OLDEST))} or newer is needed")
+    file, out = sys.argv[-2:]
+    _open(file)
     scene = bpy.context.scene
-    if scene.camera is None:
-        scene.camera = bpy.data.objects.new("", bpy.data.cameras.new(""))
-    seen = list(scene.camera.matrix_world.translation) if scene.camera.name in scene.objects else None
+    scene.camera = scene.camera or next((each for each in scene.objects if each.type == "CAMERA"), None)
+    seen = list(scene.camera.matrix_world.translation) if scene.camera else None
+    scene.camera = scene.camera or bpy.data.objects.new("", bpy.data.cameras.new(""))
     _look(scene)
     _say_what_else(scene)
     if not Drawn.things:
@@ -54,28 +69,53 @@ def main() -> None:
         sys.exit(f"fault: Blender draws no surface of it; {why or 'it has none'}")
     made: dict[str, Any] = {"camera": seen, "lamps": Drawn.lamps, "said": said}
     made |= {"sky": _sky(scene.world, str(Path(out).with_suffix(".exr"))), "owners": _replace_objects(scene)}
-    known = bpy.ops.export_scene.gltf.get_rna_type().properties.keys()
+    _prepare_materials(scene)
     off = ("export_animations", "export_active_vertex_color_when_no_material", "export_all_vertex_colors")
     try:
-        options = {"export_format": "GLB", "use_active_scene": True, **dict.fromkeys(off, False)}
-        bpy.ops.export_scene.gltf(filepath=out, **{key: options[key] for key in options.keys() & known})
+        bpy.ops.export_scene.gltf(filepath=out, export_format="GLB", use_active_scene=True, **dict.fromkeys(off, False))
     except RuntimeError as error:
         sys.exit(f"fault: Blender reads it, but its exporter to glTF fails: {str(error).strip().splitlines()[-1]}")
     Path(out).with_suffix(".json").write_text(json.dumps(made), encoding="utf-8")
 
 
-def _open(source: str) -> None:
-    suffix = Path(source).suffix.lower()
-    if suffix == ".blend":
-        bpy.ops.wm.open_mainfile(filepath=source, load_ui=False, use_scripts=False)
-        return
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    if suffix == ".fbx":
-        say(None, ".fbx", "has no unit for lights; they are as bright as Blender takes them to be")
-        newer = hasattr(bpy.ops.wm, "fbx_import")
-        (bpy.ops.wm.fbx_import if newer else bpy.ops.import_scene.fbx)(filepath=source)
-    else:
-        bpy.ops.wm.usd_import(filepath=source)
+def _open(file: str) -> None:
+    suffix = Path(file).suffix.lower()
+    if not Path(file).stat().st_size:
+        sys.exit("fault: is empty")
+    try:
+        if suffix == ".blend":
+            bpy.ops.wm.open_mainfile(filepath=file, load_ui=False, use_scripts=False)
+            return
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        if suffix == ".fbx":
+            say(None, ".fbx", "has no sky and no unit for lights; they are as bright as Blender takes them to be")
+            if _AREA_IN_FBX.search(Path(file).read_bytes()):
+                say("light", "LightType", "Blender makes points of its areas")
+            bpy.ops.wm.fbx_import(filepath=file)
+        else:
+            _open_usd(file)
+    except RuntimeError as error:
+        why = str(error).splitlines()[0].removeprefix("Error: ").replace(file, Path(file).name)
+        sys.exit(f"fault: is no {suffix} file that Blender {bpy.app.version_string} reads: {why}")
+
+
+def _open_usd(file: str) -> None:
+    """Open a USD file: with a world, which its sky goes into, and with each prim as an object, for their names."""
+    world = bpy.context.scene.world = bpy.data.worlds.new("World")
+    world.use_nodes = True
+    background = source(world.node_tree.get_output_node("CYCLES").inputs["Surface"])
+    background.inputs["Color"].default_value = (0, 0, 0, 1)
+    bpy.ops.wm.usd_import(filepath=file, merge_parent_xform=False)
+    held = Counter(each.parent for each in bpy.data.objects)
+    alone = [each for each in bpy.data.objects if each.type != "EMPTY" and each.parent and held[each.parent] == 1]
+    Drawn.names = {each.name: each.parent.name.partition(".")[0] for each in alone}  # prims have no dots; copies here do
+    bpy.utils.expose_bundled_modules()
+    from pxr import Usd  # type: ignore[import-not-found]
+
+    stage = Usd.Stage.Open(file)  # which its prims do not keep
+    for prim in stage.Traverse():
+        if prim.GetTypeName() in ("CylinderLight", "GeometryLight", "PortalLight"):
+            say("light", str(prim.GetTypeName()), "becomes a point in Blender", str(prim.GetPath()))
 
 
 class Drawn(bpy.types.RenderEngine):
@@ -85,44 +125,40 @@ class Drawn(bpy.types.RenderEngine):
     meshes: ClassVar[dict[tuple[int, ...], Any]] = {}
     things: ClassVar[list[tuple[str, Any, Any, list[str]]]] = []  # name, mesh, matrix, names of what it hangs on
     lamps: ClassVar[list[dict[str, Any]]] = []
+    names: ClassVar[dict[str, str]] = {}  # of objects that are named after what they alone hang on
 
     def render(self, depsgraph: Any) -> None:
         """Collect what is drawn."""
         for instance in depsgraph.object_instances:
             drawn, kind = instance.object, instance.object.type
-            if kind in _NO_MESHES:
-                say("geometry", kind, f"is missing: {_NO_MESHES[kind]}", f"object {drawn.name!r}")
-            if kind not in ("MESH", "LIGHT") or not instance.show_self:
-                continue
-            flags = [f"no {rays} rays" for rays in _RAYS if not getattr(drawn, f"visible_{rays}")]
-            if kind == "MESH":
-                flags += [name for name in ("is_holdout", "is_shadow_catcher") if getattr(drawn, name)]
-            else:
-                flags = [flag for flag in flags if "camera" not in flag]  # which see no lamps in any case
-                linking = getattr(drawn, "light_linking", None)
-                if linking and (linking.receiver_collection or linking.blocker_collection):
-                    flags.append("light_linking")
-                self.lamps.append(_lamp(drawn.data, drawn.name, [list(row) for row in instance.matrix_world]))
-            for flag in flags:
-                say("light" if kind == "LIGHT" else "geometry", flag, "is drawn as any other", f"object {drawn.name!r}")
-            if kind == "MESH" and len(drawn.data.polygons):
+            settings = [system.settings for system in drawn.particle_systems]
+            strands = {each.type for each in settings if each.render_type == "PATH"}
+            for missing in {kind, *strands} & _NO_MESHES.keys():
+                say("geometry", missing, f"is missing: {_NO_MESHES[missing]}", f"object {drawn.name!r}")
+            if kind == "LIGHT" and instance.show_self and not drawn.data.cycles.is_portal:
+                self.lamps.append(_lamp(drawn, [list(row) for row in instance.matrix_world]))
+            elif kind == "MESH" and instance.show_self and len(drawn.data.polygons):
                 self._add(instance, drawn)
 
     def _add(self, instance: Any, drawn: Any) -> None:
+        _say_flags(drawn, _SEEN, "geometry", f"object {drawn.name!r}")
         own = {k: each.material for k, each in enumerate(drawn.material_slots) if each.link == "OBJECT"}
         key = (drawn.data.as_pointer(), *(each.as_pointer() if each else 0 for each in own.values()))
         if key not in self.meshes:
             self.meshes[key] = drawn.data.copy()
             for number, material in own.items():
                 self.meshes[key].materials[number] = material and material.original
-        for system in () if instance.is_instance else drawn.particle_systems:
-            if system.settings.type == "HAIR" and system.settings.render_type == "PATH":
-                say("geometry", "HAIR", "is missing: particles", f"object {drawn.name!r}")
         above, names = instance.parent if instance.is_instance else drawn.parent, []
         while above is not None:
             names.append(above.name)
             above = above.parent
-        self.things.append((drawn.name, self.meshes[key], instance.matrix_world.copy(), names))
+        self.things.append((self.names.get(drawn.name, drawn.name), self.meshes[key], instance.matrix_world.copy(), names))
+
+
+def _say_flags(holder: Any, usual: dict[str, bool], effect: str, place: str) -> None:
+    for name, value in usual.items():
+        if getattr(holder, name) != value:
+            say(effect, name, f"is {not value}, which has no effect here", place)
 
 
 def _look(scene: Any) -> None:
@@ -140,24 +176,25 @@ def _look(scene: Any) -> None:
     bpy.ops.render.render()
 
 
-def _lamp(data: Any, name: str, matrix: list[list[float]]) -> dict[str, Any]:
+def _lamp(drawn: Any, matrix: list[list[float]]) -> dict[str, Any]:
     """A lamp's own numbers, and in `strength` its energy, exposure, colour, temperature and nodes."""
-    place = f"lamp {name!r}"
-    if not data.use_shadow:
-        say("light", "use_shadow", "it casts shadows as any other", place)
-    power = data.energy * 2.0 ** getattr(data, "exposure", 0.0)
-    tint = data.temperature_color if getattr(data, "use_temperature", False) else (1, 1, 1)
+    data, place, linking = drawn.data, f"lamp {drawn.name!r}", drawn.light_linking
+    _say_flags(drawn, _LIT, "light", place)  # cameras see no lamps in any case
+    _say_flags(data, {"use_shadow": True}, "light", place)
+    if linking.receiver_collection or linking.blocker_collection:
+        say("light", "light_linking", "it lights all", place)
+    power = data.energy * 2.0**data.exposure
+    tint = data.temperature_color if data.use_temperature else (1, 1, 1)
     factor = _of_nodes(data.node_tree, place) if data.use_nodes else (1, 1, 1)
     strength = [power * a * b * c for a, b, c in zip(data.color, tint, factor, strict=True)]
-    kind = "PORTAL" if data.type == "AREA" and data.cycles.is_portal else data.type
     numbers = {key: getattr(data, key) for key in _OF_LAMPS if hasattr(data, key)}
-    return {"name": name, "kind": kind, "matrix": matrix, "strength": strength, **numbers}
+    return {"name": Drawn.names.get(drawn.name, drawn.name), "kind": data.type, "matrix": matrix, "strength": strength, **numbers}
 
 
 def _of_nodes(tree: Any, place: str) -> list[float]:
     """The colour that a lamp's nodes multiply its own by, without what varies."""
     output = tree.get_output_node("CYCLES") if tree else None
-    shader = output.inputs["Surface"].links[0].from_node if output and output.inputs["Surface"].is_linked else None
+    shader = source(output.inputs["Surface"]) if output else None
     if shader is None:
         return [0.0, 0.0, 0.0]
     if shader.type != "EMISSION":
@@ -169,14 +206,15 @@ def _of_nodes(tree: Any, place: str) -> list[float]:
 
 def _constant(part: Any, place: str) -> list[float]:
     """The value of an input as three numbers."""
-    node = part.links[0].from_node if part.is_linked else None
-    if node is not None and node.type in ("RGB", "VALUE"):
-        part = node.outputs[0]
-    elif node is not None and node.type == "BLACKBODY" and not node.inputs[0].is_linked and bpy.app.version >= (4, 5):
+    node = source(part)
+    kind = node.type if node else ""
+    if kind == "BLACKBODY" and not node.inputs[0].is_linked:
         lamp = bpy.data.lights.new("", "POINT")
         lamp.temperature = node.inputs[0].default_value
         return list(lamp.temperature_color)
-    elif node is not None and node.type == "LIGHT_FALLOFF" and part.links[0].from_socket == node.outputs[0]:
+    if kind in ("RGB", "VALUE"):
+        part = node.outputs[0]
+    elif kind == "LIGHT_FALLOFF" and part.links[0].from_socket == node.outputs[0]:
         part = node.inputs["Strength"]
     elif node is not None:
         say("light", node.bl_label, f"{node.name!r} is not carried over", place)
@@ -184,23 +222,21 @@ def _constant(part: Any, place: str) -> list[float]:
     return list(value)[:3] if part.type == "RGBA" else [value] * 3
 
 
-def _sky(world: Any, file: str) -> list[float] | str | None:
-    """The light of the world: a radiance, or a file with one per direction, as Cycles sees it; None if it is dark."""
+def _sky(world: Any, file: str) -> list[float] | str:
+    """The light of the world: a radiance, or a file with one per direction, as Cycles sees it."""
     output = world.node_tree.get_output_node("CYCLES") if world and world.node_tree else None
     if output is None:
-        return None
-    place, links = f"world {world.name!r}", output.inputs["Surface"].links
-    hidden = [rays for rays in _RAYS[:4] if not getattr(world.cycles_visibility, rays)]
-    hidden += ["volume"] * output.inputs["Volume"].is_linked
-    hidden += ["Light Path"] * any(node.type == "LIGHT_PATH" for node in world.node_tree.nodes)
-    for name in hidden:
-        say("light", name, "the world lights all as cameras see it", place)
-    if not links:
-        return None
-    shader = links[0].from_node
+        return [0.0, 0.0, 0.0]
+    place, shader = f"world {world.name!r}", source(output.inputs["Surface"])
+    _say_flags(world.cycles_visibility, _RAYS, "light", place)
+    if output.inputs["Volume"].is_linked:
+        say("light", "Volume", "is not carried over", place)
+    if any(node.type == "LIGHT_PATH" for node in world.node_tree.nodes):
+        say("light", "Light Path", "the world lights all as cameras see it", place)
+    if shader is None:
+        return [0.0, 0.0, 0.0]
     if shader.type == "BACKGROUND" and not any(part.is_linked for part in shader.inputs):
-        values = [part * shader.inputs["Strength"].default_value for part in shader.inputs["Color"].default_value[:3]]
-        return values if max(values) > 0 else None
+        return [part * shader.inputs["Strength"].default_value for part in shader.inputs["Color"].default_value[:3]]
     _photograph(world, file)
     say(None, "world", f"its light is an image of {SKY[0]} × {SKY[1]} directions, as Cycles has it", place)
     return file
@@ -233,7 +269,8 @@ def _say_what_else(scene: Any) -> None:
     if abs(scene.unit_settings.scale_length - 1) > 1e-6:
         say(None, "scale_length", f"a unit is {scene.unit_settings.scale_length:g} m; lengths stay in Blender's units")
     if scene.view_settings.exposure:
-        say(None, "exposure", f"{scene.view_settings.exposure:g} stops of the view are not part of the light")
+        stops = f"{scene.view_settings.exposure:+g} stops"
+        say(None, "", f"the view's exposure of {stops} is left out; photonfarm sets its own")
 
 
 def _replace_objects(scene: Any) -> dict[str, str]:
@@ -255,11 +292,16 @@ def _replace_objects(scene: Any) -> dict[str, str]:
         scene.collection.objects.link(made)
         most = OBJECT_SHARE * len(Drawn.things)
         owners[made.name] = next((head for head in reversed(names) if heads[head] <= most), name)
-    grey = bpy.data.materials.new("no material")  # what Cycles takes where there is none: diffuse
+    return owners
+
+
+def _prepare_materials(scene: Any) -> None:
+    """Make all materials that are drawn such as the exporter can write; Cycles takes a diffuse grey for none."""
+    grey = bpy.data.materials.new("no material")
     grey.use_nodes = True
-    shader = grey.node_tree.nodes.new("ShaderNodeBsdfDiffuse")
-    shader.inputs["Color"].default_value = (0.8, 0.8, 0.8, 1.0)
-    grey.node_tree.links.new(shader.outputs[0], grey.node_tree.get_output_node("CYCLES").inputs["Surface"])
+    shader = source(grey.node_tree.get_output_node("CYCLES").inputs["Surface"])
+    for name, value in {**DULL, "Base Color": (0.8, 0.8, 0.8, 1)}.items():
+        shader.inputs[name].default_value = value
     shown = set()
     for mesh in {each.data for each in scene.objects}:
         if not mesh.materials:
@@ -268,9 +310,7 @@ def _replace_objects(scene: Any) -> dict[str, str]:
             mesh.materials[number] = mesh.materials[number] or grey
             shown.add(mesh.materials[number])
     for material in shown:
-        place = f"material {material.name!r}"
-        prepare(material, lambda effect, name, meaning, place=place: say(effect, name, meaning, place))
-    return owners
+        prepare(material, partial(say, place=f"material {material.name!r}"))
 
 
 main()

@@ -17,15 +17,18 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.imported import Ids, ImportedScene
-from photonfarm.renderer.importing.meshes import Mesh
 from photonfarm.renderer.importing.readers import images
 
 Floats = NDArray[np.float64]
 Lamp = dict[str, Any]
+Sky = list[float] | str
 Profile = Callable[[Floats, Floats], Floats]
 
 AXES = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """The map of Blender's coordinates, z up, to glTF's, y up."""
+
+TURN, NOWHERE = np.array([-1.0, 1, -1]), np.zeros(3)
+"""What turns the axes of a lamp, which shines along −z, to those of a light of Mitsuba's, which shines along +z."""
 
 PARTS = 16
 """Spots with a radius, and areas of a small spread, become so many spots, which have no extent in Mitsuba."""
@@ -33,17 +36,14 @@ PARTS = 16
 SHARP = math.radians(1.0)
 """A sun that is no wider is one direction; a wider one is a disc of the sky."""
 
-WIDEST, TEXELS, CORNERS = math.radians(89.5), 1024, 64
-
-STEEP = math.radians(80)
-"""Wider cones have finer images, as their tangents are large."""
+WIDEST = math.radians(89.5)
 
 
 class Lamps:
     """Puts lamps into a scene."""
 
     def __init__(self, scene: ImportedScene, scratch: Path) -> None:
-        self._scene, self._scratch, self._ids, self._black = scene, scratch, Ids(), ""
+        self._scene, self._scratch, self._ids = scene, scratch, Ids()
         self._discs: list[tuple[Floats, Floats, float]] = []  # suns: direction, irradiance, sine of the half angle
         for part in scene.root.iter():
             self._ids.keep(part.get("id", ""))
@@ -54,64 +54,51 @@ class Lamps:
         if strength.min() < 0:
             self._scene.changes.lose("light", "energy", "is negative, which no light is here", f"lamp {lamp['name']!r}")
         kinds = {"SUN": self._put_sun, "SPOT": self._put_spot, "POINT": self._put_point, "AREA": self._put_area}
-        if strength.max() > 0 and lamp["kind"] in kinds:
+        if strength.max() > 0:
             kinds[lamp["kind"]](lamp, np.maximum(strength, 0), matrix)
 
-    def put_sky(self, sky: list[float] | str | None) -> None:
+    def put_sky(self, sky: Sky) -> None:
         """Surround the scene by a radiance, or by an image of all directions with Blender's +y in the middle; last."""
-        if self._discs:
-            sky = self._with_discs(sky)
-        if sky is None:
-            return
-        emitter = self._emitter("envmap" if isinstance(sky, str) else "constant", "sky")
-        if not isinstance(sky, str):
-            elements.put_value(emitter, "radiance", sky)
-            return
-        elements.put_value(emitter, "filename", sky)
-        elements.put_matrix(emitter, "to_world", np.diag([-1, 1, -1, 1]).tolist())
-
-    def _with_discs(self, sky: list[float] | str | None) -> str:
-        """An image of a sky with the discs of suns, each with its irradiance."""
+        sky = self._with_discs(sky) if self._discs else sky
         if isinstance(sky, str):
-            values = images.decoded(Path(sky).read_bytes(), sky, raw=True)[..., :3].astype(np.float64)
-        else:
-            values = np.tile(np.array(sky or (0.0, 0.0, 0.0)), (1024, 2048, 1))
-        down = (np.arange(len(values)) + 0.5)[:, None] * math.pi / len(values)
-        along = (np.arange(values.shape[1]) + 0.5) * 2 * math.pi / values.shape[1]
-        x, z = -np.sin(down) * np.sin(along), np.sin(down) * np.cos(along)
-        for axis, flux, sine in self._discs:
-            cosine = axis[0] * x + axis[1] * np.cos(down) + axis[2] * z
+            image = self._emitter("envmap", "sky")
+            elements.put_value(image, "filename", sky)
+            _place(image, np.diag([-1, 1, -1]))
+        elif max(sky) > 0:
+            elements.put_value(self._emitter("constant", "sky"), "radiance", sky)
+
+    def _with_discs(self, sky: Sky) -> str:
+        """An image of a sky with the discs of suns, each with its irradiance."""
+        light = images.decoded(Path(sky).read_bytes(), sky, raw=True)[..., :3] if isinstance(sky, str) else sky
+        height, width = 1024, 2048
+        values = np.broadcast_to(light, (height, width, 3)).astype(np.float64)
+        down = (np.arange(height) + 0.5)[:, None] * math.pi / height
+        along = (np.arange(width) + 0.5) * 2 * math.pi / width
+        for (x, y, z), flux, sine in self._discs:
+            cosine = y * np.cos(down) + np.sin(down) * (z * np.cos(along) - x * np.sin(along))
             disc = cosine >= math.sqrt(1 - sine**2)
-            sizes = np.sin(down) * 2 * math.pi**2 / values[..., 0].size
-            values[disc] += flux / (disc * cosine * sizes).sum()
+            values[disc] += flux / (disc * cosine * np.sin(down)).sum() * height * width / (2 * math.pi**2)
         return str(images.save_radiance(values.astype(np.float32), self._scratch / "sky.exr"))
 
     def _put_sun(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
-        sine, axis = math.sin(min(lamp["angle"], math.pi) / 2), _frame(matrix)[:, 2]
+        sine = math.sin(min(lamp["angle"], math.pi) / 2)
         flux = strength * (math.pi * sine**2 if sine and not lamp["normalize"] else 1.0)
         if lamp["angle"] > SHARP:
-            self._discs.append((axis, flux, sine))
+            self._discs.append((_frame(matrix)[:, 2], flux, sine))
             return
         sun = self._emitter("directional", lamp["name"])
         elements.put_value(sun, "irradiance", flux.tolist())
-        elements.put_matrix(sun, "to_world", _towards(-axis, np.zeros(3)))
+        _place(sun, _frame(matrix) * TURN)
 
     def _put_point(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
-        radius = lamp["shadow_soft_size"]
-        x, y, z = (f"{part:.9g}" for part in matrix[:3, 3])
+        radius, intensity = float(lamp["shadow_soft_size"]), _intensity(lamp, strength)
         if radius == 0:
             point = self._emitter("point", lamp["name"])
-            SubElement(point, "point", name="position", x=x, y=y, z=z)
-            elements.put_value(point, "intensity", _intensity(lamp, strength).tolist())
-            return
-        made = self._ids.make(lamp["name"], "lamp")
-        black = self._black_material()
-        sphere = SubElement(self._scene.root, "shape", type="sphere", id=made)
-        SubElement(sphere, "point", name="center", x=x, y=y, z=z)
-        elements.put_value(sphere, "radius", float(radius))
-        SubElement(sphere, "ref", id=black)
-        sphere.append(elements.area_light((_intensity(lamp, strength) / (math.pi * radius**2)).tolist()))
-        self._scene.objects[made] = lamp["name"]
+            elements.put_value(point, "intensity", intensity.tolist())
+            _place(point, np.eye(3), matrix[:3, 3])
+        else:
+            sphere = self._shape("sphere", lamp["name"], intensity / (math.pi * radius**2))
+            _place(sphere, radius * np.eye(3), matrix[:3, 3])
 
     def _put_spot(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
         """Add a spot: Cycles' cone is that of an object without scale, squeezed by its scale."""
@@ -129,67 +116,56 @@ class Lamps:
 
     def _put_area(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
         """Add an area that shines along −z; one whose light is spread less than by a cosine becomes cones."""
-        round_one, square = lamp["shape"] in ("DISK", "ELLIPSE"), lamp["shape"] in ("SQUARE", "DISK")
-        size = np.array([lamp["size"], lamp["size"] if square else lamp["size_y"]]) / 2
-        n, turn = (CORNERS, 0.0) if round_one else (4, math.pi / 4)
-        angles = turn - 2 * np.pi * np.arange(n) / n  # clockwise from above, as it faces down
-        stretch = math.sqrt(2 * math.pi / (n * math.sin(2 * math.pi / n))) if round_one else math.sqrt(2)
-        corners = np.stack([np.cos(angles) * size[0], np.sin(angles) * size[1], 0 * angles], axis=1)
-        fan = np.array([(0, k, k + 1) for k in range(1, n - 1)], np.uint32)
-        mesh = Mesh(corners * stretch, fan).moved(matrix)
-        area = float(np.linalg.norm(np.cross(matrix[:3, 0], matrix[:3, 1])) * size[0] * size[1])
-        area *= math.pi if round_one else 4.0
+        is_round, is_square = lamp["shape"] in ("DISK", "ELLIPSE"), lamp["shape"] in ("SQUARE", "DISK")
+        sides = matrix[:3, :2] * (lamp["size"] / 2, lamp["size" if is_square else "size_y"] / 2)
+        area = float(np.linalg.norm(np.cross(*sides.T))) * (math.pi if is_round else 4.0)
         if area == 0:
             return
         radiance = strength / (math.pi * (area if lamp["normalize"] else 1.0))
-        half = lamp["spread"] / 2
+        half = max(lamp["spread"] / 2, math.radians(0.5))
         if half >= WIDEST:
-            made = self._ids.make(lamp["name"], "lamp")
-            light = elements.area_light(radiance.tolist())
-            self._scene.put_shape(made, mesh, self._black_material(), lamp["name"], light)
+            shape = self._shape("disk" if is_round else "rectangle", lamp["name"], radiance)
+            sides[:, 0] *= -np.copysign(1, np.linalg.det(matrix[:3, :3]))  # the axes are right-handed then
+            _place(shape, np.column_stack([sides, -_frame(matrix)[:, 2]]), matrix[:3, 3])
             return
-        tangent = math.tan(half := max(half, math.radians(0.5)))
+        tangent = math.tan(half)
 
         def profile(x: Floats, y: Floats) -> Floats:
             return np.maximum(1 - np.hypot(x, y) / tangent, 0) / np.sqrt(1 + x * x + y * y)
 
-        places = _spread_over(lamp["shape"]) * size @ matrix[:3, :2].T
         on_axis = radiance * area * tangent / (tangent - half)
-        self._put_cones(lamp, on_axis, matrix, places, half, profile)
+        self._put_cones(lamp, on_axis, matrix, _spread_over(lamp["shape"]) @ sides.T, half, profile)
 
     def _put_cones(
         self, lamp: Lamp, intensity: Floats, matrix: Floats, places: Floats, cut: float, profile: Profile
     ) -> None:
         """Add spots at offsets (N, 3) that share an intensity; `profile`: its share at tangents (x, y) off the axis."""
-        made = self._ids.make(lamp["name"], "lamp")
-        file = cone_image(profile, cut, self._scratch / f"{made}.png")
-        axis, up = -_frame(matrix)[:, 2], _frame(matrix)[:, 1]
+        file = cone_image(profile, cut, self._scratch / f"{self._ids.make(lamp['name'], 'lamp')}.png")
         for place in places:
             spot = self._emitter("spot", lamp["name"])
             elements.put_value(spot, "intensity", (intensity / len(places)).tolist())
-            elements.put_matrix(spot, "to_world", _towards(axis, matrix[:3, 3] + place, up))
+            _place(spot, _frame(matrix) * TURN, matrix[:3, 3] + place)
             put_cone(spot, cut, file)
         if len(places) > 1:
-            meaning = (
-                f"spots with a radius and areas with a spread become {PARTS} spots each, whose shadows are as soft"
-            )
+            meaning = f"became {PARTS} spots, whose shadows are as soft, for its radius or its spread"
             self._scene.changes.note(meaning, f"lamp {lamp['name']!r}")
 
     def _emitter(self, kind: str, name: str) -> Element:
         return SubElement(self._scene.root, "emitter", type=kind, id=self._ids.make(name, "lamp"))
 
-    def _black_material(self) -> str:
-        if not self._black:
-            self._black = self._ids.make("black")
-            made = Element("bsdf", type="diffuse", id=self._black)
-            elements.put_value(made, "reflectance", (0.0, 0.0, 0.0))
-            self._scene.root.insert(0, made)
-        return self._black
+    def _shape(self, kind: str, name: str, radiance: Floats) -> Element:
+        """Add a black shape that emits."""
+        made = SubElement(self._scene.root, "shape", type=kind, id=self._ids.make(name, "lamp"))
+        elements.put_value(SubElement(made, "bsdf", type="diffuse"), "reflectance", (0.0, 0.0, 0.0))
+        made.append(elements.area_light(radiance.tolist()))
+        self._scene.objects[made.get("id", "")] = name
+        self._scene.changes.note("cameras see it, which they do in Blender only if told to", f"lamp {name!r}")
+        return made
 
 
 def cone_image(profile: Profile, cut: float, file: Path) -> Path:
     """The image of a spot within an angle; `profile`: its share at tangents (x, y) off the axis."""
-    texels = TEXELS if cut < STEEP else 2 * TEXELS
+    texels = 1024 if cut < math.radians(80) else 2048  # as tangents are large there
     y, x = np.meshgrid(*[math.tan(cut) * (2 * (np.arange(texels) + 0.5) / texels - 1)] * 2, indexing="ij")
     return images.save(profile(x, y).astype(np.float32), file)
 
@@ -216,21 +192,15 @@ def _frame(matrix: Floats) -> Floats:
     return np.stack([np.cross(y, z), y, z], axis=1)
 
 
-def _towards(axis: Floats, place: Floats, up: Floats | None = None) -> list[list[float]]:
-    """The matrix of a light at a place that shines along an axis, which is Mitsuba's +z."""
-    if up is None:
-        up = np.eye(3)[int(np.argmin(np.abs(axis)))]
-    matrix = np.eye(4)
-    matrix[:3, :3] = _frame(np.stack([axis, up, axis], axis=1))
-    matrix[:3, 3] = place
-    rows: list[list[float]] = matrix.tolist()
-    return rows
+def _place(light: Element, axes: Floats, place: Floats = NOWHERE) -> None:
+    """Put a light at a place, with its axes as columns (3, 3)."""
+    elements.put_matrix(light, "to_world", [*np.column_stack([axes, place]).tolist(), (0, 0, 0, 1)])
 
 
 def _spread_over(shape: str) -> Floats:
     """Places (PARTS, 2) spread evenly over a shape within [−1, 1]²."""
-    k = np.arange(PARTS) + 0.5
     if shape in ("DISK", "ELLIPSE"):
+        k = np.arange(PARTS) + 0.5
         radius, angle = np.sqrt(k / PARTS), k * math.pi * (3 - math.sqrt(5))
         return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
     side = round(math.sqrt(PARTS))

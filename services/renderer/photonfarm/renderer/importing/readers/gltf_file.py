@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import base64
 import json
-import struct
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, unquote_to_bytes
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,9 +21,8 @@ Node = Mapping[str, Any]
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
-_JSON, _BINARY = 0x4E4F534A, 0x004E4942
 
-READ = frozenset(
+_READ = frozenset(
     {"EXT_mesh_gpu_instancing", "EXT_texture_avif", "EXT_texture_webp", "KHR_lights_punctual", "KHR_mesh_quantization",
      "KHR_materials_clearcoat", "KHR_materials_emissive_strength", "KHR_materials_ior",
      "KHR_materials_pbrSpecularGlossiness", "KHR_materials_specular", "KHR_materials_transmission",
@@ -32,19 +30,22 @@ READ = frozenset(
 )  # fmt: skip
 """The extensions that are carried over; what of one is not is said where it is read."""
 
-HARMLESS = frozenset(
-    {"AGI_articulations", "EXT_instance_features", "EXT_mesh_features", "EXT_structural_metadata",
-     "FB_geometry_metadata", "KHR_animation_pointer", "KHR_audio", "KHR_audio_emitter", "KHR_implicit_shapes",
-     "KHR_interactivity", "KHR_materials_variants", "KHR_node_hoverability", "KHR_node_selectability",
-     "KHR_physics_rigid_bodies", "KHR_xmp", "KHR_xmp_json_ld", "MSFT_lod", "MSFT_packing_normalRoughnessMetallic",
-     "MSFT_packing_occlusionRoughnessMetallic", "OMI_collider", "OMI_physics_body", "OMI_physics_joint",
-     "OMI_physics_shape", "VRMC_node_constraint", "VRMC_springBone"}
+_HARMLESS = (
+    "AGI_", "EXT_instance_features", "EXT_mesh_features", "EXT_structural_metadata", "FB_geometry_metadata",
+    "KHR_animation_pointer", "KHR_audio", "KHR_implicit_shapes", "KHR_interactivity", "KHR_materials_variants",
+    "KHR_node_hover", "KHR_node_select", "KHR_physics", "KHR_xmp", "MSFT_lod", "MSFT_packing", "OMI_collider",
+    "OMI_physics", "VRMC_node_constraint", "VRMC_springBone",
 )  # fmt: skip
-"""Those that leave a picture of what is shown first as it is."""
+"""How the names of those begin that leave a picture of what is shown first as it is."""
 
-COMPRESSED = frozenset(
-    {"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_meshopt_compression", "KHR_texture_basisu"}
-)
+_OF_TYPES: dict[str, type] = {
+    **dict.fromkeys(("accessors", "buffers", "bufferViews", "children", "extensionsRequired", "images", "materials",
+                     "meshes", "nodes", "primitives", "samplers", "scenes", "textures"), list),
+    **dict.fromkeys(("asset", "attributes", "extensions", "pbrMetallicRoughness", "sparse"), dict),
+}  # fmt: skip
+"""Keys that hold others, and what they are in JSON."""
+
+COMPRESSED = {"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_meshopt_compression", "KHR_texture_basisu"}
 """Those that may have the same data uncompressed beside them, which is read then."""
 
 _ZEROS = {
@@ -62,16 +63,17 @@ class GltfFile:
 
     def __init__(self, path: Path, changes: Changes) -> None:
         self.path, self.changes = path, changes
-        self.document, self._binary = _opened(path)
         self._buffers: dict[int, bytes] = {}
         with self.at():
+            self.document, self._binary = _opened(path)
+            _check_types(self.document)
             version = str(self.document.get("asset", {}).get("version", "unknown"))
             if not version.startswith("2."):
                 raise SpecError(f"is glTF of version {version!r}; only version 2 is read")
-            refused = ", ".join(sorted({str(name) for name in self.all("extensionsRequired")} - READ - HARMLESS))
+            refused = ", ".join(sorted(_unknown(self.all("extensionsRequired"))))
             if refused:
                 raise SpecError(f"extensionsRequired has {refused}, which is not read; export without it")
-            for name in sorted(set(self.document.get("extensions", ())) - READ - HARMLESS):
+            for name in _unknown(self.document.get("extensions", ())):
                 changes.note("what the file as a whole has of it is not read", name=name)
 
     @contextmanager
@@ -86,11 +88,9 @@ class GltfFile:
             missing = " is missing, or no value that glTF has" if isinstance(error, KeyError) else ""
             raise SpecError(f"{where}is not valid glTF: {error}{missing}") from error
 
-    def all(self, kind: str) -> list[Node]:
+    def all(self, kind: str) -> list[Any]:
         """The entries of one array of the document, such as meshes."""
-        entries: list[Node] = self.document.get(kind, [])
-        if not isinstance(entries, list):
-            raise SpecError(f"{kind} is {entries!r}; it must be a list")
+        entries: list[Any] = self.document.get(kind, [])
         return entries
 
     def entry(self, kind: str, number: int, entries: Sequence[Node] | None = None) -> Node:
@@ -103,39 +103,33 @@ class GltfFile:
     def report(self, entry: Node, effect: Effect, place: str) -> None:
         """Say which extensions of an entry, and of all in it, are not carried over."""
         for name, value in entry.get("extensions", {}).items():
-            if name in HARMLESS:
+            if name.startswith(_HARMLESS):
                 self.changes.note("leaves a picture of what is shown first as it is", place, name=name)
-            elif name not in READ | COMPRESSED and (name not in _ZEROS or np.any(value.get(_ZEROS[name], 0))):
+            elif name not in _READ | COMPRESSED and (name not in _ZEROS or np.any(value.get(_ZEROS[name], 0))):
                 self.changes.lose("light" if "light" in name else effect, name, "is not carried over", place)
         for key, value in entry.items():
             if isinstance(value, dict) and key != "extras":
                 self.report(value, effect, place)
 
-    # ------------------------------------------------------------------------------------------------------- bytes
-
     def _buffer(self, number: int) -> bytes:
         if number not in self._buffers:
             entry = self.entry("buffers", number)
             self.report(entry, "geometry", f"buffer {number}")
-            data = self._bytes_of(entry, number)
+            if "uri" in entry:
+                data = self._read(entry["uri"], f"buffer {number}")
+            elif number == 0 and self._binary:
+                data = self._binary
+            else:
+                why = ", ".join(entry.get("extensions", ())) or "no binary chunk"
+                raise SpecError(f"buffer {number} has no uri, and {why} in its place; export without compression")
             if len(data) < entry["byteLength"]:
                 raise SpecError(f"buffer {number} is cut off: it has {len(data)} bytes and needs {entry['byteLength']}")
             self._buffers[number] = data
         return self._buffers[number]
 
-    def _bytes_of(self, entry: Node, number: int) -> bytes:
-        if "uri" in entry:
-            return self._read(entry["uri"], f"buffer {number}")
-        if number == 0 and self._binary is not None:
-            return self._binary
-        compressed = ", ".join(entry.get("extensions", ()))
-        why = f"{compressed} has its data, which is not read" if compressed else "the file has no binary chunk for it"
-        raise SpecError(f"buffer {number} has no uri, and {why}; export the file without compression")
-
     def _read(self, uri: str, what: str) -> bytes:
         if uri.startswith("data:"):
-            kind, _, words = uri.partition(",")
-            return base64.b64decode(words) if kind.endswith(";base64") else unquote_to_bytes(words)
+            return base64.b64decode(uri.partition(",")[2])
         name = unquote(uri).replace("\\", "/")
         try:
             return (self.path.parent / name).read_bytes()
@@ -147,24 +141,19 @@ class GltfFile:
         """The bytes of a buffer view, and its stride."""
         view = self.entry("bufferViews", number)
         self.report(view, effect, f"buffer view {number}")
-        start, data = view.get("byteOffset", 0), self._buffer(view["buffer"])
-        end = start + view["byteLength"]
-        if end > len(data):
-            raise SpecError(f"buffer {view['buffer']} has {len(data)} bytes; view {number} needs {end}")
-        return data[start:end], view.get("byteStride", 0)
+        start = view.get("byteOffset", 0)
+        return self._buffer(view["buffer"])[start : start + view["byteLength"]], view.get("byteStride", 0)
 
     def array(self, number: int) -> NDArray[Any]:
         """The values of an accessor, (N, width): integers as they are, unless normalised to floats."""
         accessor = self.entry("accessors", number)
         self.report(accessor, "geometry", f"accessor {number}")
-        width, count = _WIDTHS[accessor["type"]], accessor["count"]
-        kind = np.dtype(_TYPES[accessor["componentType"]])
-        values = self._strided(accessor, kind, count, width)
+        width, kind = _WIDTHS[accessor["type"]], np.dtype(_TYPES[accessor["componentType"]])
+        values = self._strided(accessor, kind, accessor["count"], width)
         if "sparse" in accessor:
-            sparse = accessor["sparse"]
-            where = self._strided(sparse["indices"], np.dtype(_TYPES[sparse["indices"]["componentType"]]),
-                                  sparse["count"], 1)  # fmt: skip
-            values[where[:, 0]] = self._strided(sparse["values"], kind, sparse["count"], width)
+            count, where, what = (accessor["sparse"][key] for key in ("count", "indices", "values"))
+            rows = self._strided(where, np.dtype(_TYPES[where["componentType"]]), count, 1)
+            values[rows[:, 0]] = self._strided(what, kind, count, width)
         return normalised(values) if accessor.get("normalized") else values
 
     def attribute(self, number: int, name: str, count: int, widths: Collection[int]) -> NDArray[Any]:
@@ -181,23 +170,25 @@ class GltfFile:
         """Values in a buffer view (count, width); zeros without one."""
         if "bufferView" not in entry:
             return np.zeros((count, width), kind)
-        view, offset = entry["bufferView"], entry.get("byteOffset", 0)
-        data, stride = self._view(view)
+        (data, stride), start = self._view(entry["bufferView"]), entry.get("byteOffset", 0)
         step = stride or width * kind.itemsize
-        needed = offset + (count - 1) * step + width * kind.itemsize
+        needed = start + (count - 1) * step + width * kind.itemsize
         if count and len(data) < needed:
-            raise SpecError(f"buffer view {view} has {len(data)} bytes, and an accessor needs {needed}")
-        return np.ndarray((count, width), kind, data, offset, (step, kind.itemsize)).copy()
+            raise SpecError(f"buffer view {entry['bufferView']} has {len(data)} bytes, and an accessor needs {needed}")
+        return np.ndarray((count, width), kind, data, start, (step, kind.itemsize)).copy()
 
     def image(self, number: int) -> tuple[str, bytes]:
-        """The name and the encoded bytes of an image."""
+        """The name and the encoded bytes of an image; none, which is said, of a file that is not there."""
         entry = self.entry("images", number)
         self.report(entry, "colour", f"image {number}")
+        name = str(entry.get("name") or unquote(entry.get("uri", "")))[:40]  # which may be the image itself
         if "bufferView" in entry:
-            return entry.get("name", f"image_{number}"), self._view(entry["bufferView"], "colour")[0]
-        uri = entry["uri"]
-        named = entry.get("name") or ("" if uri.startswith("data:") else Path(unquote(uri)).stem)
-        return named or f"image_{number}", self._read(uri, f"image {number}")
+            return name, self._view(entry["bufferView"], "colour")[0]
+        try:
+            return name, self._read(entry["uri"], f"image {number}")
+        except SpecError as error:
+            self.changes.lose("colour", "images", "are not there, so that their factors stand alone", str(error))
+            return name, b""
 
 
 def extension(entry: Node, name: str) -> Node:
@@ -221,26 +212,38 @@ def normalised(values: NDArray[Any]) -> NDArray[np.float64]:
     return np.maximum(values / np.iinfo(values.dtype).max, -1.0)
 
 
-def _opened(path: Path) -> tuple[dict[str, Any], bytes | None]:
-    """The document of a file, and its binary chunk."""
-    try:
-        data = path.read_bytes()
-        text, binary = _chunks(data) if data[:4] == b"glTF" else (data, None)
-        document = json.loads(text)
-    except (OSError, ValueError, struct.error) as error:
-        raise SpecError(f"{path}: is not a readable glTF file: {error}") from error
-    if not isinstance(document, dict):
-        raise SpecError(f"{path}: is not a readable glTF file: its JSON is no object")
-    return document, binary
+def _unknown(names: Collection[str]) -> list[str]:
+    """The extensions that may change the picture."""
+    return [name for name in names if name not in _READ and not name.startswith(_HARMLESS)]
 
 
-def _chunks(data: bytes) -> tuple[bytes, bytes | None]:
-    found: dict[int, bytes] = {}
-    place = 12
-    while place + 8 <= len(data):
-        length, kind = struct.unpack_from("<II", data, place)
-        found.setdefault(kind, data[place + 8 : place + 8 + length])
-        place += 8 + length
-    if _JSON not in found:
-        raise ValueError("it has no JSON chunk")
-    return found[_JSON], found.get(_BINARY)
+def _opened(path: Path) -> tuple[dict[str, Any], bytes]:
+    """The document of a file, and its binary chunk, which follows the document's in GLB."""
+    data = path.read_bytes()
+    text, binary = data, b""
+    if data[:4] == b"glTF":
+        end = 20 + int.from_bytes(data[12:16], "little")
+        text, binary = data[20:end], data[end + 8 :]
+    if not text.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
+        raise SpecError("is no glTF: it is neither JSON nor binary glTF" if data else "is empty")
+    return json.loads(text), binary
+
+
+def _check_types(entry: Node, place: str = "") -> None:
+    """Raise SpecError for what holds others, in an entry and in all below it, and is not of the type that glTF has."""
+    for key, value in entry.items():
+        _check_type(value, _OF_TYPES.get(key, object), place + key)
+        if key == "extensions":
+            for name, each in value.items():
+                _check_type(each, dict, f"{place}{key}.{name}")
+        elif isinstance(value, dict) and key != "extras":
+            _check_types(value, f"{place}{key}.")
+        elif isinstance(value, list) and key != "extras":
+            for number, each in enumerate(value):
+                if isinstance(each, dict):
+                    _check_types(each, f"{place}{key}[{number}].")
+
+
+def _check_type(value: Any, kind: type, place: str) -> None:
+    if not isinstance(value, kind):
+        raise SpecError(f"{place} is {str(value)[:60]}; it must be {'a list' if kind is list else 'an object'}")

@@ -1,6 +1,6 @@
 """What changed since Mitsuba 0.6: names, and what has another meaning or default under the same name.
 
-Sources: Mitsuba 0.6's documentation and code; for 0.3 to 0.5, its `data/schema/upgrade_0.4.0.xsl`.
+Source: Mitsuba 0.6's documentation and code.
 """
 
 from __future__ import annotations
@@ -22,25 +22,11 @@ from photonfarm.shared.core.errors import SpecError
 
 _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
-_TAGS = {"luminaire": "emitter", "camera": "sensor", "lookAt": "lookat"}
-
-_NEAREST = {"roughdiffuse": "diffuse", "ward": "roughplastic", "phong": "roughplastic", "ldrtexture": "bitmap",
-            "sky": "sunsky", "sun": "sunsky"}  # fmt: skip
+_NEAREST = {"roughdiffuse": "diffuse", "sky": "sunsky", "sun": "sunsky", "phong": "blendbsdf", "ward": "blendbsdf"}
 """The usual counterparts of what Mitsuba 3 has not."""
 
-_PROPERTIES: dict[tuple[str, str], str | None] = {
-    ("area", "intensity"): "radiance",
-    ("constant", "intensity"): "radiance",
-    ("directional", "intensity"): "irradiance",
-    ("envmap", "intensity_scale"): "scale",
-    ("diffuse", "diffuse_reflectance"): "reflectance",
-    **dict.fromkeys(
-        [("ward", "variant"), ("roughdiffuse", "alpha"), ("roughdiffuse", "use_fast_approx"),
-         ("bitmap", "cache"), ("bitmap", "max_anisotropy"), ("envmap", "cache"), ("obj", "collapse"),
-         ("sky", "resolution"), ("sun", "resolution"), ("sunsky", "resolution")]
-    ),
-}  # fmt: skip
-"""Properties by the type that has them: the name of today, or none for what no picture shows, or no counterpart has."""
+_UNSEEN = ("cache", "max_anisotropy", "collapse", "resolution", "use_fast_approx")
+"""Properties that no picture shows."""
 
 
 @dataclass(slots=True)
@@ -64,46 +50,40 @@ class Upgrade:
                 for part in list(node):
                     self._upgrade_property(node, part)
             for node in reversed(list(root.iter())):  # what is in others first
-                self._upgrade_object(node)
+                kind = node.get("type", "")
+                if kind in _UPGRADES:
+                    _UPGRADES[kind](self, node)
+                if kind in _NEAREST:
+                    meaning = f"became {_NEAREST[kind]!r}, the nearest in Mitsuba 3"
+                    self.changes.note(meaning, elements.place(node), name=kind)
+                    node.set("type", _NEAREST[kind])
         except ValueError as error:
             raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
 
-    def _upgrade_object(self, node: Element) -> None:
-        kind = node.get("type", "")
-        if kind in _UPGRADES:
-            _UPGRADES[kind](self, node)
-        if kind in _NEAREST:
-            node.set("type", _NEAREST[kind])
-            self.changes.note(f"became {_NEAREST[kind]!r}, the nearest in Mitsuba 3", elements.place(node), name=kind)
-
     def _rename(self, node: Element) -> None:
-        node.tag = _TAGS.get(node.tag, node.tag)
-        node.attrib.pop("intent", None)
-        node.attrib.update({key: text.lower() for key, text in node.attrib.items() if key == "type"})
-        for part in [part for part in node if part.tag != "default" and part.get("name")]:
+        kind = node.get("type", "").lower()
+        node.attrib = {key: text for key, text in node.attrib.items() if key != "intent"}
+        node.attrib |= {"type": kind} if kind else {}
+        node.tag = "lookat" if node.tag == "lookAt" else node.tag
+        for part in [part for part in node if part.get("name")]:
             old = part.get("name", "")
             new = _HUMP.sub("_", old).lower()
-            self.names[new] = old
-            today = _PROPERTIES.get((node.get("type", ""), new), new)
-            if today is None:
+            if new in _UNSEEN or (kind, new) == ("roughdiffuse", "alpha"):
                 node.remove(part)
-            else:
-                part.set("name", today)
+            elif part.tag not in ("default", "bsdf") and (part.tag, node.tag) != ("ref", "shape"):
+                self.names[new] = old
+                part.set("name", "reflectance" if (kind, new) == ("diffuse", "diffuse_reflectance") else new)
 
     def _upgrade_property(self, node: Element, part: Element) -> None:
         name = part.get("name", "")
-        if part.tag == "animation":
-            node[list(node).index(part)] = first = min(part, key=lambda step: abs(float(step.get("time", "0"))))
-            first.attrib = {"name": name}
-            self.changes.note("stands still, as it is at time 0", elements.place(node), name="animation")
-        elif part.tag == "subsurface":
+        if part.tag == "subsurface":
             node.remove(part)
             self.lose("colour", "subsurface", "is left out: Mitsuba 3 has none", node)
         elif name == "distribution" and part.get("value", "").lower() in ("as", "phong"):
             part.set("value", "beckmann")  # Walter et al. 2007: of the same α, they are about as wide
             self.changes.note("became 'beckmann', of the same width", elements.place(node), name="distribution")
-        elif part.tag == "lookat":
-            _look(part)
+        elif part.tag == "lookat" and not part.get("up"):
+            part.set("up", _any_up(*(numbers_of(part.get(key, "")) for key in ("origin", "target"))))
         elif name == "ext_eta" and part.get("value") in ("air", "vacuum", "1", "1.0"):
             node.remove(part)
         elif (colour := of_old(part)) is not None:
@@ -111,41 +91,17 @@ class Upgrade:
                 colour = colour / max(1.0, float(colour.max()))  # as 0.6 does, to conserve energy
             put(part, colour)
 
-    def bake(self, texture: Element, gamma: float, channels: str) -> None:
-        """Let a bitmap name an image of some of its channels, with sRGB in place of another gamma."""
-        named = elements.child(texture, "filename")
-        file = self.find(_value(texture, "filename"))
-        if named is None or file is None:
-            return
-        texels = images.decoded(file.read_bytes(), str(file), raw=True)
-        if gamma not in (1, -1):
-            texels[..., :3] = images.encoded(texels[..., :3] ** gamma)
-        texels = texels[..., ["rgba".index(channel) for channel in channels]]
-        name = f"{len(list(self.scratch.iterdir()))}-{file.stem}.png"
-        named.set("value", str(images.save(texels, self.scratch / name)))
-
     def lose(self, effect: Effect, name: str, meaning: str, node: Element) -> None:
         """Say what is lost of an element."""
         self.changes.lose(effect, self.names.get(name, name), meaning, elements.place(node))
 
 
-def _look(step: Element) -> None:
-    """Its three vectors, which were nine numbers before 0.4; raises ValueError for one that is not of three numbers."""
-    for key in ("origin", "target", "up"):
-        if f"{key[0]}x" in step.attrib:
-            step.set(key, " ".join(step.attrib.pop(f"{key[0]}{axis}", "") for axis in "xyz"))
-        count = len(numbers_of(step.get(key, "")))
-        if count != 3 and (key != "up" or count):
-            raise ValueError(f"{key!r} of <lookat> has {count} numbers, and needs three: x, y and z")
-    if not step.get("up"):
-        step.set("up", _any_up(step))
-
-
-def _any_up(step: Element) -> str:
+def _any_up(origin: list[float], target: list[float]) -> str:
     """The `up` that 0.6 takes where none is given; Mitsuba 3 takes another."""
-    x, y, z = (np.array(numbers_of(step.get("target", ""))) - numbers_of(step.get("origin", ""))).tolist()
-    across = (z, 0, -x) if abs(x) > abs(y) else (0, z, -y)
-    return elements.numbers(np.cross(across, (x, y, z)).tolist())
+    if len(origin) != 3 or len(target) != 3:
+        return ""  # Mitsuba says what is wrong
+    x, y, z = np.subtract(target, origin).tolist()
+    return elements.numbers(np.cross((z, 0, -x) if abs(x) > abs(y) else (0, z, -y), (x, y, z)).tolist())
 
 
 def _taken(node: Element, name: str, otherwise: str) -> str:
@@ -157,7 +113,8 @@ def _taken(node: Element, name: str, otherwise: str) -> str:
     return found.get("value", otherwise).lower()
 
 
-def _value(node: Element, name: str) -> str:
+def value_of(node: Element, name: str) -> str:
+    """The value of a property; empty for one that is not there."""
     found = elements.child(node, name)
     return "" if found is None else found.get("value", "")
 
@@ -174,58 +131,68 @@ def _texture(_: Upgrade, texture: Element) -> None:
 def _bitmap(upgrade: Upgrade, texture: Element) -> None:
     """Gamma 1 is `raw`; filters but `nearest` are `bilinear`, the default; one way to wrap for both axes."""
     _texture(upgrade, texture)
-    is_float = Path(_value(texture, "filename")).suffix.lower() in (".exr", ".hdr", ".rgbe", ".pfm")
-    gamma, channel = float(_taken(texture, "gamma", "1" if is_float else "-1")), _value(texture, "channel")
-    if gamma == 1 or channel == "a":
+    name = value_of(texture, "filename")
+    is_float = Path(name).suffix.lower() in (".exr", ".hdr", ".rgbe", ".pfm")
+    gamma = float(_taken(texture, "gamma", "1" if is_float else "-1"))
+    channels = _taken(texture, "channel", "rgb") if not is_float else "rgb"
+    if gamma == 1 or channels == "a":
         elements.put_value(texture, "raw", True)
-    if not is_float and (channel in tuple("rgba") or gamma not in (1, -1)):
-        upgrade.bake(texture, gamma, _taken(texture, "channel", "rgb"))
-    elif is_float and gamma != 1:
+    if is_float and gamma != 1:
         upgrade.lose("colour", "gamma", f"{gamma:g} is left out: texels are read as their file says", texture)
+    elif (channels in tuple("rgba") or gamma not in (1, -1)) and (file := upgrade.find(name)):
+        to = upgrade.scratch / f"{len(list(upgrade.scratch.iterdir()))}-{file.stem}.png"
+        _taken(texture, "filename", "")
+        elements.put_value(texture, "filename", str(_baked(file, gamma, channels, to)))
     if _taken(texture, "filter_type", "ewa") == "nearest":
         elements.put_value(texture, "filter_type", "nearest")
     both = _taken(texture, "wrap_mode", "repeat")
     u, v = (_taken(texture, f"wrap_mode_{axis}", both) for axis in "uv")
-    mode = {"zero": "clamp", "one": "clamp", "black": "clamp", "white": "clamp"}.get(v, v)
+    mode = v if v in ("repeat", "mirror") else "clamp"
     if u != mode or v != mode:
         said = f"{u} and {v} became {mode}: Mitsuba 3 repeats, mirrors or clamps, both axes alike"
         upgrade.lose("colour", "wrapMode", said, texture)
     elements.put_value(texture, "wrap_mode", mode)
 
 
+def _baked(file: Path, gamma: float, channels: str, to: Path) -> Path:
+    """An image of some channels of another, with sRGB in place of another gamma."""
+    texels = images.decoded(file.read_bytes(), str(file), raw=True)
+    if gamma not in (1, -1):
+        texels[..., :3] = images.encoded(texels[..., :3] ** gamma)
+    return images.save(texels[..., ["rgba".index(channel) for channel in channels]], to)
+
+
 def _scaled_texture(upgrade: Upgrade, texture: Element) -> None:
-    """The texture or the colour that was scaled; a height's factor becomes that of its bump map."""
+    """The texture that was scaled; a height's factor becomes that of its bump map."""
     factor = np.array(numbers_of(_taken(texture, "scale", "1")))
-    if not len(texture):
-        raise ValueError("it has no texture to scale; put one in")
-    inner, above = texture[0], elements.parents(upgrade.root)
-    users = [ref for ref in upgrade.root.iter("ref") if ref.get("id") == texture.get("id", "")]
-    around = [above[user] for user in users] + [above[texture]] * (above[texture] is not upgrade.root)
-    for bump in [user for user in around if user.get("type") == "bumpmap"]:
-        elements.put_value(bump, "scale", float(factor.mean()))
-        around.remove(bump)
-    if inner.tag == "rgb":
-        inner.set("value", elements.numbers((factor * numbers_of(inner.get("value", ""))).tolist()))
-    elif (factor != 1).any() and around:
-        upgrade.lose("colour", "scale", "a factor of a texture is left out: Mitsuba 3 has none", texture)
+    inner = next((part for part in texture if part.tag in ("texture", "ref")), None)
+    if inner is None:
+        raise ValueError("it has no texture to scale; put one in, or a colour in its place")
+    above, name = elements.parents(upgrade.root), texture.get("id")
+    for user in [above[texture], *(above[ref] for ref in upgrade.root.iter("ref") if ref.get("id") == name)]:
+        if user.get("type") == "bumpmap":
+            elements.put_value(user, "scale", float(factor.mean()))
+        elif user is not upgrade.root and (factor != 1).any():
+            upgrade.lose("colour", "scale", "a factor of a texture is left out: Mitsuba 3 has none", texture)
     inner.attrib.pop("name", None)
-    if users and inner.tag != "rgb":
-        inner.attrib.setdefault("id", texture.get("id", ""))
-    for user in users:
-        made = Element("ref", id=inner.get("id", "")) if inner.tag != "rgb" else elements.copied(inner)
-        made.attrib.update({key: text for key, text in user.attrib.items() if key == "name"})
-        above[user][list(above[user]).index(user)] = made
     inner.attrib.update({key: text for key, text in texture.attrib.items() if key == "name"})
-    parent = above[texture]
-    parent[list(parent).index(texture)] = inner
-    if parent is upgrade.root and inner.tag != "texture":
-        parent.remove(inner)
+    if name and inner.tag == "texture":
+        inner.attrib.setdefault("id", name)
+    above[texture][list(above[texture]).index(texture)] = inner
+    if name and inner.get("id") != name:
+        SubElement(upgrade.root, "alias", {"id": inner.get("id", ""), "as": name})
 
 
 def _obj(upgrade: Upgrade, shape: Element) -> None:
-    """Where a shape has no material, 0.6 takes those of the OBJ file."""
-    file = upgrade.find(_value(shape, "filename"))
-    if shape.find("bsdf") is None and shape.find("ref") is None and file and b"mtllib" in file.read_bytes():
+    """Materials by the names of `usemtl`, and those of the MTL file where the shape has none, are lost."""
+    file, materials = upgrade.find(value_of(shape, "filename")), [part for part in shape if part.tag in ("bsdf", "ref")]
+    text = file.read_bytes() if file and (len(materials) != 1 or materials[0].get("name")) else b""
+    used = set(re.findall(rb"^\s*usemtl\s+(.*\S)", text, re.MULTILINE))
+    if len(used) > 1 and used & {part.get("name", "").encode() for part in materials}:
+        upgrade.lose("colour", "usemtl", "all faces get the first material; make a shape of those of each", shape)
+        for part in materials[1:]:
+            shape.remove(part)
+    elif not materials and b"mtllib" in text:
         upgrade.lose("colour", "mtllib", "is not read: Mitsuba 3 wants a material for the shape", shape)
 
 
@@ -235,27 +202,34 @@ def _conductor(_: Upgrade, bsdf: Element) -> None:
         elements.put_value(bsdf, "material", "Cu")
 
 
-def _width(upgrade: Upgrade, bsdf: Element, name: str, otherwise: str) -> float:
-    """A number that says how wide a lobe is, taken out; a texture of them is lost, as one width is all a lobe has."""
-    found = elements.child(bsdf, name)
-    if found is not None and found.tag in ("texture", "ref"):
-        upgrade.lose("colour", name, f"its texture became {otherwise}, the default: Mitsuba 3 has a number here", bsdf)
-        bsdf.remove(found)
-    return float(_taken(bsdf, name, otherwise))
+def _glossy(upgrade: Upgrade, bsdf: Element) -> None:
+    """A blend of what is diffuse and of rough metal, which add up to the levels that `phong` and `ward` have.
 
-
-def _phong(upgrade: Upgrade, bsdf: Element) -> None:
-    """Walter et al. 2007: a Phong lobe of exponent n is about as wide as a Beckmann lobe of α = √(2 / (n + 2))."""
-    elements.put_value(bsdf, "alpha", math.sqrt(2 / (_width(upgrade, bsdf, "exponent", "30") + 2)))
-
-
-def _ward(upgrade: Upgrade, bsdf: Element) -> None:
-    """One width of the lobe in place of one along u and one along v."""
-    along_u, along_v = (_width(upgrade, bsdf, f"alpha_{axis}", "0.1") for axis in "uv")
-    if along_u != along_v:
-        said = f"{along_u:g} along u and {along_v:g} along v became one width: the nearest in Mitsuba 3 has no other"
-        upgrade.lose("colour", "alphaV", said, bsdf)
-    elements.put_value(bsdf, "alpha", math.sqrt(along_u * along_v))
+    A Phong lobe of exponent n, around the mirrored direction, is as high as a Beckmann lobe of α = 1 / √(2 (n + 2)).
+    """
+    for name in ("exponent", "specular_reflectance"):
+        if (found := elements.child(bsdf, name)) is not None and found.tag in ("texture", "ref"):
+            upgrade.lose("colour", name, "its texture became the default: a blend has numbers here", bsdf)
+    shine = np.array(numbers_of(_taken(bsdf, "specular_reflectance", "0.2")))
+    diffuse, metal = Element("bsdf", type="diffuse"), Element("bsdf", type="roughconductor")
+    if bsdf.get("type") == "phong":
+        elements.put_value(metal, "alpha", math.sqrt(0.5 / (float(_taken(bsdf, "exponent", "30")) + 2)))
+    else:
+        metal.extend(part for part in bsdf if part.get("name") in ("alpha_u", "alpha_v"))  # 0.1 by default in both
+    stated = elements.child(bsdf, "diffuse_reflectance")
+    matt = elements.put_value(diffuse, "reflectance", (0.5, 0.5, 0.5)) if stated is None else stated
+    matt.set("name", "reflectance")
+    diffuse[:] = [matt]
+    base = np.array(numbers_of(matt.get("value", "")) or [1 - float(shine.max())])
+    total = min(1.0, float(base.max() + shine.max()))  # as 0.6 does, to conserve energy
+    if matt.tag == "rgb":
+        put(matt, base * total / max(float(base.max()), 1e-9))
+    else:
+        said = f"its texture becomes {float(base[0]):.2g} times as bright: the shares of a blend add up to 1"
+        upgrade.lose("colour", "diffuse_reflectance", said, bsdf)
+    put(elements.put_value(metal, "specular_reflectance", 0.0), np.resize(shine * total / max(*shine, 1e-9), 3))
+    bsdf[:] = [diffuse, metal]
+    elements.put_value(bsdf, "weight", float(shine.max() / max(1e-9, base.max() + shine.max())))
 
 
 def _mask(upgrade: Upgrade, bsdf: Element) -> None:
@@ -265,46 +239,13 @@ def _mask(upgrade: Upgrade, bsdf: Element) -> None:
         upgrade.lose("colour", "opacity", "became grey: Mitsuba 3 has one opacity for all colours", bsdf)
 
 
-def _coating(upgrade: Upgrade, bsdf: Element) -> None:
-    """A coat on a diffuse material is plastic; of others, what lies under the coat stays."""
-    inside = (node for node in bsdf if node.tag == "bsdf" or (node.tag == "ref" and not node.get("name")))
-    if (under := next(inside, None)) is None:
-        raise ValueError("it has no material under its coat; put one in")
-    bsdf.remove(under)
-    same = (node for node in upgrade.root.iter("bsdf") if under.tag == "ref" and node.get("id") == under.get("id"))
-    found, kind = next(same, under), bsdf.get("type", "")
-    if found.get("type") == "diffuse":
-        for part in map(elements.copied, found):
-            part.set("name", part.get("name", "").replace("reflectance", "diffuse_reflectance"))
-            bsdf.append(part)
-        bsdf.set("type", kind.replace("coating", "plastic"))
-        upgrade.changes.note("on a diffuse material became plastic", elements.place(bsdf), name=kind)
-    else:
-        upgrade.lose("colour", kind, "is left out: Mitsuba 3 has it on diffuse materials alone", bsdf)
-        _blend(bsdf, [(0.5, under), (0.5, elements.copied(under))])
-
-
 def _mixture(_: Upgrade, bsdf: Element) -> None:
-    """Blends of two, one in another; what the weights leave of 1 is absorbed, as in 0.6."""
-    weights = numbers_of(_taken(bsdf, "weights", ""))
-    mixed = [node for node in bsdf if node.tag in ("bsdf", "ref")]
-    if len(weights) != len(mixed) or not mixed:
-        raise ValueError(f"it has {len(weights)} weights for {len(mixed)} materials")
-    black = Element("bsdf", type="diffuse")
-    elements.put_value(black, "reflectance", (0.0, 0.0, 0.0))
-    _blend(bsdf, [*zip(weights, mixed, strict=True), (max(0.0, 1 - sum(weights)), black)])
-
-
-def _blend(bsdf: Element, parts: list[tuple[float, Element]]) -> None:
-    total, made = parts[-1]
-    for weight, part in parts[-2::-1]:
-        total += weight
-        blend = Element("bsdf", type="blendbsdf")
-        elements.put_value(blend, "weight", 1 - weight / max(total, 1e-9))
-        blend.extend([part, made])
-        made = blend
-    bsdf[:] = list(made)
-    bsdf.set("type", "blendbsdf")
+    """A blend, where all of two materials is mixed; Mitsuba 3 has no other mixture."""
+    weights = numbers_of(value_of(bsdf, "weights"))
+    if len(weights) == 2 and math.isclose(sum(weights), 1, abs_tol=1e-3):
+        _taken(bsdf, "weights", "")
+        bsdf.set("type", "blendbsdf")
+        elements.put_value(bsdf, "weight", weights[1])
 
 
 def _normalmap(upgrade: Upgrade, bsdf: Element) -> None:
@@ -325,8 +266,6 @@ def _sky(upgrade: Upgrade, emitter: Element) -> None:
         own = _taken(emitter, f"{part}_scale", scale)
         elements.put_value(emitter, f"{part}_scale", float(own) if part in kind else 0.0)
     elements.put_value(emitter, "sun_aperture", 0.5358 * (float(_taken(emitter, "sun_radius_scale", "1")) or 0.02))
-    if float(_taken(emitter, "stretch", "1")) != 1 or _taken(emitter, "extend", "false") == "true":
-        upgrade.lose("light", "stretch", "is left out: nothing comes from below the horizon", emitter)
     placed = elements.child(emitter, "to_world")
     if placed is None:
         placed = SubElement(emitter, "transform", name="to_world")
@@ -339,10 +278,8 @@ def _sky(upgrade: Upgrade, emitter: Element) -> None:
 
 
 _UPGRADES: dict[str, Callable[[Upgrade, Element], None]] = {
-    "bitmap": _bitmap, "ldrtexture": _bitmap, "checkerboard": _texture,
-    "scale": _scaled_texture, "obj": _obj, "conductor": _conductor, "roughconductor": _conductor, "phong": _phong,
-    "ward": _ward, "mask": _mask,
-    "coating": _coating, "roughcoating": _coating, "mixturebsdf": _mixture, "normalmap": _normalmap,
-    "sky": _sky, "sun": _sky, "sunsky": _sky,
+    "bitmap": _bitmap, "checkerboard": _texture, "scale": _scaled_texture, "obj": _obj,
+    "conductor": _conductor, "roughconductor": _conductor, "phong": _glossy, "ward": _glossy, "mask": _mask,
+    "mixturebsdf": _mixture, "normalmap": _normalmap, "sky": _sky, "sun": _sky, "sunsky": _sky,
 }  # fmt: skip
 """What means something else in Mitsuba 3, or is no longer there, by type."""

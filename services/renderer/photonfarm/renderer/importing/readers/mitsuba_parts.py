@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from xml.etree.ElementTree import Element
+from collections.abc import Callable, Iterator
+from functools import cache, partial
+from pathlib import Path
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import Changes, Effect
+from photonfarm.renderer.importing.meshes import Floats, of_shape, write_ply
 from photonfarm.renderer.importing.readers import mitsuba_spectra
+from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.files import POLARISED, SHAPES
 
 _SHAPES = (*SHAPES, "instance", "shapegroup")  # the last two become others
@@ -14,36 +21,30 @@ _SHAPES = (*SHAPES, "instance", "shapegroup")  # the last two become others
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "texture": "Texture"}
 """What Mitsuba has plugins for, by element."""
 
-_MEDIUM_PLACES = ("interior", "exterior", "medium")
+_MEDIA = ("medium", "volume", "phase")
+
+MOST = 5000
+"""The most shapes that instances are expanded into; more are a forest, which no memory holds."""
+
+_ROUND = ("sphere", "cylinder", "disk")
+"""The shapes that Mitsuba keeps round under each transform of their own."""
+
+_MESHES = ("obj", "ply", "serialized", "cube")
+"""The shapes whose normals turn where a transform of their own mirrors them, and turn not in an instance."""
+
+_IDENTITY, _MIRROR = np.eye(4), np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 def mend(root: Element, changes: Changes) -> None:
     """Mend a scene in place, and say what was left out or replaced."""
     _keep_used(root)
-    gone = {node.get("id") for tag in ("medium", "volume", "phase") for node in root.iter(tag)}
-    _drop_media(root, gone - {None}, changes)
+    _drop_media(root, changes)
     above = elements.parents(root)
-    for node in [part for part in root.iter() if part.tag in ("shape", *_KINDS)]:
-        parent, kind = above[node], node.get("type", "")
-        if parent is not root and node not in list(parent):
-            continue  # left out with what it was in
-        if kind == "merge":
-            place = list(parent).index(node)
-            parent[place : place + 1] = node.findall("shape")
-            above.update(dict.fromkeys(node, parent))
-        elif node.tag == "shape" and kind not in _SHAPES:
-            gone |= _lose(node, parent, above, changes, "cannot be rendered here, and is left out")
-        elif kind == "directionalarea":
-            node.set("type", "area")
-            changes.lose("light", kind, "became an area light, which shines in all directions", elements.place(node))
-        elif node.tag == "bsdf" and (kind in POLARISED or not _is_known(node)):
-            changes.lose("colour", kind, "is not rendered here, and became diffuse", elements.place(node))
-            _make_diffuse(node)
-        elif node.tag in _KINDS and not _is_known(node):
-            gone |= _lose(node, parent, above, changes, "is not in Mitsuba 3, and is left out")
+    left_out = list(_leave_out(root, above, changes))
+    gone = {part.get("id") for node in left_out for part in node.iter() if part.tag != "ref"}
     for node in list(root.iter()):
         node[:] = [part for part in node if not (part.tag == "ref" and part.get("id") in gone)]
-    _integrate_spectra(root)
+    _integrate_spectra(root, above)
 
 
 def effect_of(node: Element, above: dict[Element, Element]) -> Effect:
@@ -54,17 +55,8 @@ def effect_of(node: Element, above: dict[Element, Element]) -> Effect:
     return effects.get(node.tag, "colour")
 
 
-def _lose(
-    node: Element, parent: Element, above: dict[Element, Element], changes: Changes, meaning: str
-) -> set[str | None]:  # fmt: skip
-    """Take an element out; the ids that are gone with it."""
-    changes.lose(effect_of(node, above), node.get("type", ""), meaning, elements.place(node))
-    parent.remove(node)
-    return {part.get("id") for part in node.iter() if part.tag != "ref"} - {None}
-
-
 def _keep_used(root: Element) -> None:
-    """Move materials and textures that are referred to out of what they are in, and leave out those that are not."""
+    """Move materials and textures that are referred to out of what they are in; leave out those that nothing uses."""
     used = {node.get("id") for node in root.iter("ref")}
     for parent in [node for part in root for node in part.iter()]:
         for place, node in enumerate(parent):
@@ -73,7 +65,47 @@ def _keep_used(root: Element) -> None:
                 node.attrib.pop("name", None)
                 parent[place] = Element("ref", named)
                 root.insert(0, node)
-    root[:] = [node for node in root if node.tag not in ("bsdf", "texture") or node.get("id") in used]
+    held = {node.get("id") for node in root if node.tag != "ref"}  # a shape that a <ref> names again stays one
+    of_others = {node for node in root if node.tag in ("bsdf", "texture") or node.get("type") == "shapegroup"}
+    left_out = {node for node in of_others if node.get("id") not in used}
+    left_out |= {node for node in root if node.tag == "ref" and node.get("id") in held}
+    root[:] = [node for node in root if node not in left_out]
+
+
+def _drop_media(root: Element, changes: Changes) -> None:
+    """Take media out; a shape that only bounds one goes with it, as nothing of it would be seen."""
+    media = {node.get("id") for node in root.iter() if node.tag in _MEDIA} - {None}
+    unseen = {node.get("id") for node in root.iter("bsdf") if node.get("type") == "null"} - {None}
+    above = elements.parents(root)
+    for node in list(root.iter()):
+        kept = [part for part in node if part.tag not in _MEDIA and part.get("id") not in media]
+        held, node[:] = len(node), kept
+        if len(kept) == held or node.tag not in ("shape", "emitter"):
+            continue
+        seen = [part for part in kept if part.tag in ("bsdf", "emitter", "ref") and part.get("id") not in unseen]
+        if node.tag == "shape" and all(part.get("type") == "null" for part in seen):
+            above[node].remove(node)
+            changes.lose("geometry", "medium", "is left out, with what only bounds it", elements.place(node))
+        else:
+            changes.lose("colour", "medium", "is left out: only surfaces are rendered", elements.place(node))
+
+
+def _leave_out(parent: Element, above: dict[Element, Element], changes: Changes) -> Iterator[Element]:
+    """Take out, or replace, what is not rendered of all that is in an element; what was taken out."""
+    for node in list(parent):
+        kind, is_known = node.get("type", ""), node.tag not in _KINDS or _is_known(node)
+        if (node.tag == "shape" and kind not in _SHAPES) or (node.tag != "bsdf" and not is_known):
+            meaning = "is not rendered here, and is left out"
+            changes.lose(effect_of(node, above), kind, meaning, elements.place(node))
+            parent.remove(node)
+            yield node
+            continue
+        if node.tag == "bsdf" and (kind in POLARISED or not is_known):
+            changes.lose("colour", kind, f"is not rendered here, and became {_replace(node)}", elements.place(node))
+        elif kind == "directionalarea":
+            node.set("type", "area")
+            changes.lose("light", kind, "became an area light, which shines in all directions", elements.place(node))
+        yield from _leave_out(node, above, changes)
 
 
 def _is_known(node: Element) -> bool:
@@ -83,57 +115,101 @@ def _is_known(node: Element) -> bool:
     return kind == getattr(mi.ObjectType, _KINDS[node.tag]) or node.get("type") in ("rgb", "spectrum")
 
 
-def _drop_media(root: Element, media: set[str | None], changes: Changes) -> None:
-    """Take media out; a shape that only bounds one goes with it, as nothing of it would be seen."""
-    invisible = {node.get("id") for node in root.iter("bsdf") if node.get("type") == "null"} - {None}
-    above = elements.parents(root)
-    for shape in [node for node in root.iter() if node.tag in ("shape", "emitter")]:
-        outside = [part for part in shape if not _is_medium(part, media)]
-        if len(outside) == len(shape):
-            continue
-        shape[:] = outside
-        materials = [
-            part for part in shape if part.tag in ("bsdf", "emitter") or (part.tag == "ref" and not part.get("name"))
-        ]
-        if shape.tag == "shape" and all(
-            part.get("type") == "null" or part.get("id") in invisible for part in materials
-        ):
-            above[shape].remove(shape)
-            meaning = "is left out with what only bounds it: only surfaces are rendered"
-            changes.lose("geometry", "medium", meaning, elements.place(shape))
-        else:
-            changes.lose("colour", "medium", "is left out: only surfaces are rendered", elements.place(shape))
-    root[:] = [node for node in root if node.tag not in ("medium", "volume", "phase")]
-
-
-def _is_medium(part: Element, media: set[str | None]) -> bool:
-    return part.tag == "medium" or (
-        part.tag == "ref" and (part.get("id") in media or part.get("name") in _MEDIUM_PLACES)
-    )
-
-
-def _make_diffuse(bsdf: Element) -> None:
-    """Make a material diffuse, with a reflectance that it states."""
+def _replace(bsdf: Element) -> str:
+    """Make a material what it is on, or else diffuse, with a reflectance that it states; which of them."""
     names = ("reflectance", "diffuse_reflectance", "base_color", "specular_reflectance", "transmittance")
     stated = next((found for name in names if (found := elements.child(bsdf, name)) is not None), None)
+    under = [part for part in bsdf if part.tag == "bsdf" or (part.tag == "ref" and not part.get("name"))]
     bsdf[:] = []
+    if under:  # a blend of it with itself, as there may be an id for the material as a whole
+        bsdf.set("type", "blendbsdf")
+        bsdf.extend([under[0], elements.copied(under[0])])
+        elements.put_value(bsdf, "weight", 0.0)
+        return "what it is on"
     bsdf.set("type", "diffuse")
-    if stated is None:
-        elements.put_value(bsdf, "reflectance", (0.5, 0.5, 0.5))
-    else:
-        stated.set("name", "reflectance")
-        bsdf.append(stated)
+    bsdf.append(elements.put_value(elements.scene(), "", (0.5, 0.5, 0.5)) if stated is None else stated)
+    bsdf[0].set("name", "reflectance")
+    return "diffuse"
 
 
-def _integrate_spectra(root: Element) -> None:
+def _integrate_spectra(root: Element, above: dict[Element, Element]) -> None:
     """Make colours of black bodies and sampled spectra, which Mitsuba 3 evaluates in its spectral modes alone."""
-    above = elements.parents(root)
     for node in list(root.iter("texture")):
-        colour = mitsuba_spectra.of_new(node, shines=effect_of(node, above) == "light")
+        try:
+            colour = mitsuba_spectra.of_new(node, shines=effect_of(node, above) == "light")
+        except ValueError as error:
+            raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
         if colour is None:
             continue
         for user in [part for part in root.iter("ref") if part.get("id") == node.get("id")]:
             mitsuba_spectra.put(user, colour)
-        if above[node] is root:
+        if node in list(root):
             root.remove(node)
         mitsuba_spectra.put(node, colour)
+
+
+def expand(root: Element, changes: Changes, scratch: Path) -> None:
+    """Put copies of its group's shapes, which can move and be sampled as lights, in the place of each instance."""
+    groups = {group.get("id"): group for group in root.findall("shape[@type='shapegroup']")}
+    copies: dict[Element, list[Element]] = {}
+    mirrored = cache(partial(_mirrored, scratch=scratch))
+    made = 0
+    for number, instance in enumerate(root.findall("shape[@type='instance']"), 1):
+        ref, placed = instance.find("ref"), elements.child(instance, "to_world")
+        group = instance.find("shape") if ref is None else groups.get(ref.get("id"))
+        matrix = _IDENTITY if placed is None else np.array(placed[0].get("value", "").split(), np.float64)
+        shapes = [] if group is None or made >= MOST else group.findall("shape")
+        copies[instance] = [_placed(shape, matrix.reshape(4, 4), mirrored, changes) for shape in shapes]
+        for shape, copy in zip(shapes, copies[instance], strict=True):
+            copy.set("id", f"{shape.get('id') or (ref is not None and ref.get('id')) or 'instance'}_{number}")
+        made += len(shapes)
+    root[:] = [part for node in root if node.get("id") not in groups for part in copies.get(node, [node])]
+    if made:
+        changes.note(f"{len(copies)} instances became {made} shapes of their own")
+    if left_out := sum(not each for each in copies.values()):
+        meaning = f"{left_out} of {len(copies)} are missing, of empty groups or beyond {MOST} shapes"
+        changes.lose("geometry", "instance", meaning)
+
+
+def _placed(shape: Element, matrix: Floats, mirrored: Callable[[Element], Element], changes: Changes) -> Element:
+    """A copy of a shape, moved by the matrix of an instance; its front stays its front, as in Mitsuba's instances."""
+    kind, is_mirrored = shape.get("type", ""), np.linalg.det(matrix[:3, :3]) < 0
+    square = matrix[:3, :3].T @ matrix[:3, :3]
+    if kind in _ROUND and not np.allclose(square, np.eye(3) * np.trace(square) / 3, atol=1e-5 * np.trace(square)):
+        meaning = "stays round where an instance stretches it; make it a mesh"
+        changes.lose("geometry", kind, meaning, elements.place(shape))
+    if is_mirrored and kind in _MESHES:
+        shape, matrix = mirrored(shape), matrix @ _MIRROR
+    copy = elements.copied(shape)
+    if (own := elements.child(copy, "to_world")) is None:
+        own = SubElement(copy, "transform", name="to_world")
+    SubElement(own, "matrix", value=" ".join(map(repr, matrix.ravel().tolist())))
+    if is_mirrored and kind == "sphere":
+        flipped = elements.child(copy, "flip_normals")
+        if flipped is not None:
+            copy.remove(flipped)
+        elements.put_value(copy, "flip_normals", flipped is None or flipped.get("value") != "true")
+    return copy
+
+
+def _mirrored(shape: Element, scratch: Path) -> Element:
+    """A mesh as a mirror at x = 0 shows it, with its fronts; one that Mitsuba refuses stays, and is told later."""
+    import mitsuba as mi
+
+    alone = elements.copied(shape)
+    alone[:] = [part for part in alone if part.tag not in ("bsdf", "emitter", "ref")]
+    alone.set("version", "3.0.0")
+    config = mi.parser.ParserConfig(mi.variant())
+    config.unused_properties = mi.LogLevel.Debug
+    try:
+        state = mi.parser.parse_string(config, elements.text(alone).replace("$", r"\$"))
+        mi.parser.transform_all(config, state)
+        mesh = of_shape(mi.parser.instantiate(config, state)).moved(_MIRROR)
+    except RuntimeError:
+        return shape
+    made = Element("shape", type="ply")
+    file = write_ply(mesh, scratch / f"{len(list(scratch.iterdir()))}-mirrored.ply")
+    elements.put_value(made, "filename", str(file))
+    elements.put_value(made, "face_normals", mesh.normals is None)
+    made.extend(elements.copied(part) for part in shape if part.tag in ("bsdf", "emitter", "ref"))
+    return made

@@ -66,8 +66,11 @@ def put(node: Element, colour: Colour) -> None:
 
 
 def numbers_of(text: str) -> list[float]:
-    """Numbers with spaces or commas between."""
-    return [float(each) for each in re.findall(r"[^\s,]+", text)]
+    """Numbers with spaces or commas between; raises ValueError for what is none, or is not finite."""
+    numbers = [float(each) for each in re.findall(r"[^\s,]+", text)]
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{text!r} is no number")
+    return numbers
 
 
 def _blackbody(kelvin: float) -> Colour:

@@ -8,13 +8,13 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from xml.etree.ElementTree import Element
 
 import numpy as np
+from PIL import Image as Pillow
 
-from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.readers import images
+from photonfarm.renderer.importing.readers.surfaces import Lie, Map
 from photonfarm.shared.core.errors import SpecError
 
 Meaning = tuple[Effect | None, str]
@@ -26,13 +26,10 @@ _OPTION = re.compile(
 )
 """An option before the name of an image: one word, or up to three numbers."""
 
-_CARRIED = ("mm", "o", "s", "clamp", "bm", "imfchan", "blendu", "blendv", "boost", "texres")
+_CARRIED = ("o", "s", "clamp", "bm", "blendu", "blendv", "boost", "texres")
 """The options that have their meaning here, or speak of how programs filter; others have none if 0 or off."""
 
 RELIEFS = ("norm", "map_bump", "bump")
-
-_CHANNELS = {"r": 0, "g": 1, "b": 2, "m": 3}
-
 WHITE = (1.0, 1.0, 1.0)
 
 
@@ -60,17 +57,15 @@ def statements(file: Path) -> Iterator[tuple[int, str, str]]:
 def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[str, Material]:
     """The materials of the `mtllib` statements of a file, by name; of two of one name the first is taken."""
     found: dict[str, Material] = {}
-    for file in dict.fromkeys(file for names in stated for file in _libraries(path, names, changes)):
+    for file in dict.fromkeys(file for names in stated for file in _libraries(path.parent, names, changes)):
         material: Material | None = None
         for line, word, rest in statements(file):
             if word.lower() == "newmtl":
                 material = Material(rest, file, changes)
                 if found.setdefault(rest, material) is not material:
                     changes.note("is defined twice, and the first is taken", f"{file.name}: line {line}", name=rest)
-            elif material is None:
-                changes.note("stands before all materials, and means nothing", f"{file.name}: line {line}", name=word)
-            elif not rest:
-                material.say((None, "has no value, and means nothing"), word)
+            elif material is None or not rest:
+                changes.note("has no material or no value, and means nothing", f"{file.name}: line {line}", name=word)
             else:
                 if material.lines.get(word.lower(), (0, "", rest))[2] != rest:
                     material.say((None, "is stated twice, and the last is taken"), word)
@@ -78,25 +73,20 @@ def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[
     return found
 
 
-def _libraries(path: Path, stated: str, changes: Changes) -> Iterator[Path]:
+def _libraries(folder: Path, stated: str, changes: Changes) -> Iterator[Path]:
     """The files of a statement, which may be several, and have spaces in their names."""
-    words = stated.split()
-    while words:
-        ends = range(len(words), 0, -1)
-        end = next((end for end in ends if _found(path.parent, " ".join(words[:end]))), len(words))
-        file = _located(path.parent, " ".join(words[:end]), changes)
-        if file is None:
-            changes.lose("colour", "mtllib", "material files are not there", " ".join(words))
-            return
-        yield file
-        words = words[end:]
+    for name in re.findall(r"\S.*?\.mtl(?=[\"'\s]|$)", stated, re.IGNORECASE) or [stated]:
+        if file := _located(folder, name, changes):
+            yield file
+        else:
+            changes.lose("colour", "mtllib", "material files are not there", name)
 
 
 def _located(folder: Path, name: str, changes: Changes) -> Path | None:
     """The file of a name, or else the one of its last part in the folder, as paths may be those of another machine."""
     file = _found(folder, name)
     if file is None and (last := re.split(r"[/\\]", name.strip("\"'"))[-1]) and (file := _found(folder, last)):
-        changes.note(f"{name!r} is not there; {file.name!r} beside the file is taken")
+        changes.note(f"'{name}' is not there; '{file.name}' beside the file is taken")
     return file
 
 
@@ -128,21 +118,18 @@ class Material:
     def colour(self, key: str, otherwise: Sequence[float] = (0.0, 0.0, 0.0)) -> Sequence[float]:
         """The numbers of a line; one stands for all three."""
         line, word, rest = self.lines.get(key, (0, key, ""))
-        words = rest.partition("#")[0].split()
-        form = words[0].lower() if words else ""
-        if form in ("", "spectral"):
-            if form:
-                self.say(("colour", "spectra of files are left out"), f"{word} spectral")
+        words = [part for part in rest.partition("#")[0].split() if part.lower() != "-halo"]
+        if not words:
             return otherwise
         try:
-            values = [float(part) for part in words[form in ("xyz", "-halo") :][: len(otherwise)]]
-        except ValueError:
+            values = [float(part) for part in words[: len(otherwise)]]
+        except ValueError:  # such as `spectral` and `xyz`, which hardly any file has
             values = []
         values = values * len(otherwise) if len(values) == 1 else values
         if len(values) != len(otherwise) or not all(map(math.isfinite, values)):
             place = f"{self.file}: line {line}: material {self.name!r}"
             raise SpecError(f"{place}: {word} = {rest!r} is no number, or three")
-        return [float(part) for part in images.RGB_OF_XYZ @ values] if form == "xyz" else values
+        return values
 
     def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
         """The numbers of a line from 0 to `most`, to which others are cut; black is white where `otherwise` is."""
@@ -170,8 +157,7 @@ class Material:
             return None
         made = Image(file, options)
         for name, value in options.items():
-            neutral = (*_CHANNELS, "l") if name == "imfchan" else ("0", "0.0", "off")
-            if (name not in _CARRIED or name == "imfchan") and set(value.split()) - set(neutral):
+            if name not in _CARRIED and (name, value) != ("mm", "0 1") and set(value.split()) - {"0", "0.0", "off"}:
                 self.say(("colour", "is an option that is not carried over"), f"{word} -{name}")
         return made
 
@@ -200,11 +186,8 @@ class Image:
     @property
     def is_plain(self) -> bool:
         """Whether Mitsuba reads the file as it is; of other formats and modes it misreads some without a word."""
-        from PIL import JpegImagePlugin, PngImagePlugin
-
-        for kind in (PngImagePlugin.PngImageFile, JpegImagePlugin.JpegImageFile):
-            with suppress(OSError, ValueError, SyntaxError), kind(self.file) as image:
-                return image.mode in ("L", "RGB", "RGBA") and not {"mm", "imfchan"} & set(self.options)
+        with suppress(OSError, ValueError, SyntaxError), Pillow.open(self.file) as image:
+            return image.format in ("PNG", "JPEG") and image.mode in ("L", "RGB", "RGBA")
         return False
 
     def triple(self, option: str, otherwise: float = 0.0) -> list[float]:
@@ -212,23 +195,19 @@ class Image:
         return [*(float(part) for part in self.options.get(option, "").split()), *[otherwise] * 3][:3]
 
     def values(self, *, raw: bool = False) -> images.Image:
-        """Its values as they are stored (H, W, 4), under `-mm` and `-imfchan`."""
-        values = images.decoded(self.file.read_bytes(), str(self.file), raw=raw)
-        channel = self.options.get("imfchan", "")
-        if channel in _CHANNELS:
-            values = np.dstack([values[..., _CHANNELS[channel]]] * 3 + [np.ones_like(values[..., 0])])
-        elif channel == "l":
-            values[..., :3] = values[..., :3].mean(axis=2, keepdims=True)
-        if "mm" in self.options:
-            base, gain, _ = self.triple("mm", 1.0)
-            values[..., :3] = (base + gain * values[..., :3]).clip(0)
-        return values
+        """Its values as they are stored (H, W, 4)."""
+        return images.decoded(self.file.read_bytes(), str(self.file), raw=raw)
 
-    def put_place(self, bitmap: Element) -> None:
-        """Add where a texture lies and how far it reaches. MTL's v goes upwards, and Mitsuba's downwards."""
+    def map(self, factor: Sequence[float] = WHITE, *, raw: bool = False) -> Map:
+        """Its colours times a factor, linear unless raw."""
+        if min(factor) >= 1 and self.is_plain:
+            return Map(np.zeros((0, 0, 3), np.float32), self.lie, self.file)
+        values = self.values(raw=raw)[..., :3]
+        return Map((values.clip(0, 1) if raw else images.linear(values)) * np.array(factor, np.float32), self.lie)
+
+    @property
+    def lie(self) -> Lie:
+        """How it lies. MTL's v goes upwards, and Mitsuba's downwards."""
         (su, sv, _), (u, v, _) = self.triple("s", 1.0), self.triple("o")
-        if self.options.get("clamp") == "on":
-            elements.put_value(bitmap, "wrap_mode", "clamp")
-        if (su, sv, u, v) != (1, 1, 0, 0):
-            rows = ((su, 0.0, 0.0, u), (0.0, sv, 0.0, 1 - sv - v), (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0))
-            elements.put_matrix(bitmap, "to_uv", rows)
+        wrap = "clamp" if self.options.get("clamp") == "on" else "repeat"
+        return Lie(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))

@@ -15,8 +15,9 @@ import numpy as np
 
 from photonfarm.renderer.importing import elements, readers
 from photonfarm.renderer.importing.changes import Changes
-from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
+from photonfarm.renderer.importing.imported import ImportedScene, Vector
 from photonfarm.renderer.importing.loading import load, shapes_of_things
+from photonfarm.renderer.importing.proposal.groups import group_name
 from photonfarm.renderer.importing.proposal.proposed import propose
 from photonfarm.renderer.importing.proposal.surfaces import Frame
 from photonfarm.renderer.importing.spec_text import SpecText
@@ -109,8 +110,8 @@ def _import(
     scene.write_meshes(scratch / "meshes")
     work.begin("writing the scene")
     _write_scene(scene, scratch / folder.name)
-    name, file = Ids().make(spec.stem.lstrip("._-"), "scene"), f"{folder.name}/scene.xml"
-    shapeless = list(dict.fromkeys(node.get("type", "") for node in scene.root.findall("emitter")))
+    name, file = group_name(spec.stem), f"{folder.name}/scene.xml"
+    shapeless = [str(node.get("id") or node.get("type")) for node in scene.root.findall("emitter")]
     text = SpecText(name, file, path.name, frame, proposal, shapes, shapeless, scene.changes, proposal.views[0])
     text = _lit(text, scene, loaded, scratch / spec.name, work)
     shutil.move(scratch / folder.name, folder)

@@ -17,6 +17,9 @@ from photonfarm.renderer.strategy.output.spec_file import put
 
 WIDTH = 110
 
+OFF = 0.02
+"""A box that is farther than this share of the room's height from where its thing stands is said to be."""
+
 MOST_NOTES = 10
 """The most sentences about what was changed that the spec repeats; the command prints all."""
 
@@ -34,7 +37,7 @@ class SpecText:
     frame: Frame
     proposal: Proposal
     shapes: list[list[str]]  # the ids of each movable's shapes
-    shapeless: list[str]  # the kinds of lights that have no shape
+    shapeless: list[str]  # the names of lights that have no shape
     changes: Changes
     view: View
     adds_light: bool = False
@@ -83,7 +86,11 @@ depth = 4
         moves = self.proposal.movables
         things = [movable.thing.name for movable in moves if not movable.thing.emits]
         lamps = [movable.thing.name for movable in moves if movable.thing.emits]
-        static = "nothing was found that stands by itself (if the scene lies on its side, see --up)"
+        static = "nothing was found that stands by itself"
+        if not self.source.lower().endswith(".xml"):
+            static += " (an object is never split: separate it in your program, by loose parts, to let them move)"
+        if self.source.lower().endswith(".obj"):
+            static += "; OBJ does not say which axis is up: if the scene lies on its side, try --up z"
         lights = [f"{listed(lamps, len(lamps))} may move"] * bool(lamps) + list(self._fixed_lights())
         lights += ["one is added under the ceiling"] * self.adds_light
         return [
@@ -108,7 +115,7 @@ depth = 4
         for reason, names in self.proposal.stays.items():
             yield f"{listed(names)}: {'stays' if len(names) == 1 else 'stay'}, {reason}"
         if self.shapeless:
-            yield f"{listed(self.shapeless)}: no shape, so that a spec cannot move it"
+            yield f"{listed(self.shapeless)}: cannot move, as a spec moves shapes"
 
     def _head(self) -> Iterator[str]:
         yield (
@@ -126,10 +133,13 @@ depth = 4
     def _groups(self) -> Iterator[str]:
         moved = zip(self.proposal.movables, self.shapes, strict=True)
         for (thing, box), shapes in sorted(moved, key=lambda one: one[0].thing.emits):
-            size = " × ".join(self._number(abs(part)) for part in self.frame.world(thing.size))
+            x, y, z = map(self._number, thing.size)
             place = "hangs from the ceiling" if thing.hangs else "stands on the floor"
-            alone = "" if (box.low != box.high).any() else "; there is no free place to move it to"
-            named = f"{json.dumps(thing.name)}  # {size}, {place}{alone}"
+            off = float(np.maximum(box.low - thing.at, thing.at - box.high)[:2].max())
+            is_off = off > OFF * self.proposal.room.height
+            where = f"; its box begins {self._number(off)} from there, clear of what stays" if is_off else ""
+            where = where if (box.low != box.high).any() else "; there is no free place to move it to"
+            named = f"{json.dumps(thing.name)}  # {x} × {y}, and {z} high; it {place}{where}"
             own = f"shapes = {json.dumps(shapes, ensure_ascii=False)}"
             end = "" if thing.emits else "removal_probability = 0.2\n"
             yield self._group("lights" if thing.emits else "objects", named, own, thing.at, box) + end + "\n"

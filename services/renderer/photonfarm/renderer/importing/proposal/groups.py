@@ -101,8 +101,10 @@ class _Search:
 
     def find(self) -> Found:
         pieces, glows = self.pieces, self.surfaces.emits[self.pieces.shape]
-        middle, near = (pieces.low + pieces.high) / 2, WALL * self.room.size
-        beyond = (middle < self.room.low + near) | (middle > self.room.high - near)
+        middle, near, touch = (pieces.low + pieces.high) / 2, WALL * self.room.size, CELL * self.room.height
+        low, high = self.room.low, self.room.high
+        beyond = (middle < low + near) & (pieces.low < low + touch)
+        beyond |= (middle > high - near) & (pieces.high > high - touch)
         outside: NDArray[np.bool_] = beyond[:, 0] | beyond[:, 1]
         why = np.where(glows, self._why_fixed(outside), MOVES)
         loose = np.where(glows, why == MOVES, ~self._is_shell(outside))

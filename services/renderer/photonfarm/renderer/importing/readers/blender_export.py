@@ -108,7 +108,7 @@ def _open_usd(file: str) -> None:
     bpy.ops.wm.usd_import(filepath=file, merge_parent_xform=False)
     held = Counter(each.parent for each in bpy.data.objects)
     alone = [each for each in bpy.data.objects if each.type != "EMPTY" and each.parent and held[each.parent] == 1]
-    Drawn.names = {each.name: each.parent.name.partition(".")[0] for each in alone}  # prims have no dots; copies here do
+    Drawn.names = {each.name: each.parent.name.partition(".")[0] for each in alone}  # Blender's dots number copies
     bpy.utils.expose_bundled_modules()
     from pxr import Usd  # type: ignore[import-not-found]
 
@@ -152,7 +152,8 @@ class Drawn(bpy.types.RenderEngine):
         while above is not None:
             names.append(above.name)
             above = above.parent
-        self.things.append((self.names.get(drawn.name, drawn.name), self.meshes[key], instance.matrix_world.copy(), names))
+        name = self.names.get(drawn.name, drawn.name)
+        self.things.append((name, self.meshes[key], instance.matrix_world.copy(), names))
 
 
 def _say_flags(holder: Any, usual: dict[str, bool], effect: str, place: str) -> None:
@@ -178,7 +179,8 @@ def _look(scene: Any) -> None:
 
 def _lamp(drawn: Any, matrix: list[list[float]]) -> dict[str, Any]:
     """A lamp's own numbers, and in `strength` its energy, exposure, colour, temperature and nodes."""
-    data, place, linking = drawn.data, f"lamp {drawn.name!r}", drawn.light_linking
+    data, linking, name = drawn.data, drawn.light_linking, Drawn.names.get(drawn.name, drawn.name)
+    place = f"lamp {name!r}"
     _say_flags(drawn, _LIT, "light", place)  # cameras see no lamps in any case
     _say_flags(data, {"use_shadow": True}, "light", place)
     if linking.receiver_collection or linking.blocker_collection:
@@ -188,7 +190,7 @@ def _lamp(drawn: Any, matrix: list[list[float]]) -> dict[str, Any]:
     factor = _of_nodes(data.node_tree, place) if data.use_nodes else (1, 1, 1)
     strength = [power * a * b * c for a, b, c in zip(data.color, tint, factor, strict=True)]
     numbers = {key: getattr(data, key) for key in _OF_LAMPS if hasattr(data, key)}
-    return {"name": Drawn.names.get(drawn.name, drawn.name), "kind": data.type, "matrix": matrix, "strength": strength, **numbers}
+    return {"name": name, "kind": data.type, "matrix": matrix, "strength": strength, **numbers}
 
 
 def _of_nodes(tree: Any, place: str) -> list[float]:
@@ -269,8 +271,8 @@ def _say_what_else(scene: Any) -> None:
     if abs(scene.unit_settings.scale_length - 1) > 1e-6:
         say(None, "scale_length", f"a unit is {scene.unit_settings.scale_length:g} m; lengths stay in Blender's units")
     if scene.view_settings.exposure:
-        stops = f"{scene.view_settings.exposure:+g} stops"
-        say(None, "", f"the view's exposure of {stops} is left out; photonfarm sets its own")
+        stops = scene.view_settings.exposure
+        say(None, "", f"the view's exposure of {stops:+g} stops is left out; photonfarm sets its own")
 
 
 def _replace_objects(scene: Any) -> dict[str, str]:

@@ -90,7 +90,7 @@ class _Reader:
             self.scene.camera = (x, y, z)
         pieces = [piece for visit in visits if "mesh" in visit.node for piece in self._pieces(visit)]
         for made, owner, mesh, look in pieces:  # materials need to know all meshes that have them
-            with self.file.at(self.materials.place(look)):
+            with self.file.at(f"material {self.materials.name(look)!r}"):
                 self._put_piece(made, owner, mesh, look)
         lights = extension(self.file.document, _LIGHTS).get("lights", [])
         if lights and str(self.file.document["asset"].get("generator")).startswith("Khronos glTF Blender I/O"):
@@ -100,8 +100,6 @@ class _Reader:
             if number is not None:
                 with self.file.at(visit.place):
                     self._put_light(self.file.entry("lights", number, lights), visit.matrix)
-
-    # ------------------------------------------------------------------------------------------------------- nodes
 
     def _visits(self) -> Iterator[_Visit]:
         """The visible nodes, each after the ones above it."""
@@ -179,8 +177,6 @@ class _Reader:
         for number in range(count):
             name = f"{visit.name}_{number}"
             yield name, name, visit.matrix @ _matrix({key: each[number] for key, each in values.items()})
-
-    # ------------------------------------------------------------------------------------------------------ meshes
 
     def _meshes(self, primitive: Node, matrix: Floats, place: str) -> list[_Piece]:
         """The meshes of a primitive: none if it has no triangles, and two where some of its images are mirrored."""
@@ -274,8 +270,6 @@ class _Reader:
                 self.scene.changes.lose("colour", "TANGENT", meaning, place)
         parts = [(mesh.part(mirrored == side), look._replace(mirrored=side)) for side in (False, True)]
         return [part for part in parts if len(part[0].faces)]
-
-    # ------------------------------------------------------------------------------------------------------ lights
 
     def _put_light(self, light: Node, matrix: Floats) -> None:
         """Candela and lux are taken as radiometric units, as emissive strength is, so that all lights agree."""

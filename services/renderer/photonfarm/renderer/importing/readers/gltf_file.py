@@ -66,10 +66,10 @@ class GltfFile:
         self._buffers: dict[int, bytes] = {}
         with self.at():
             self.document, self._binary = _opened(path)
-            _check_types(self.document)
             version = str(self.document.get("asset", {}).get("version", "unknown"))
             if not version.startswith("2."):
                 raise SpecError(f"is glTF of version {version!r}; only version 2 is read")
+            _check_types({key: value for key, value in self.document.items() if key in _OF_TYPES})
             refused = ", ".join(sorted(_unknown(self.all("extensionsRequired"))))
             if refused:
                 raise SpecError(f"extensionsRequired has {refused}, which is not read; export without it")
@@ -134,8 +134,7 @@ class GltfFile:
         try:
             return (self.path.parent / name).read_bytes()
         except OSError as error:
-            reason = error.strerror or str(error)
-            raise SpecError(f"{what}: {name!r} cannot be read: {reason}; put it there") from error
+            raise SpecError(f"{what}: {name!r} cannot be read: {error.strerror}; put it there") from error
 
     def _view(self, number: int, effect: Effect = "geometry") -> tuple[bytes, int]:
         """The bytes of a buffer view, and its stride."""
@@ -177,7 +176,7 @@ class GltfFile:
             raise SpecError(f"buffer view {entry['bufferView']} has {len(data)} bytes, and an accessor needs {needed}")
         return np.ndarray((count, width), kind, data, start, (step, kind.itemsize)).copy()
 
-    def image(self, number: int) -> tuple[str, bytes]:
+    def image(self, number: int) -> tuple[str, bytes | None]:
         """The name and the encoded bytes of an image; none, which is said, of a file that is not there."""
         entry = self.entry("images", number)
         self.report(entry, "colour", f"image {number}")
@@ -188,7 +187,7 @@ class GltfFile:
             return name, self._read(entry["uri"], f"image {number}")
         except SpecError as error:
             self.changes.lose("colour", "images", "are not there, so that their factors stand alone", str(error))
-            return name, b""
+            return name, None
 
 
 def extension(entry: Node, name: str) -> Node:
@@ -229,21 +228,17 @@ def _opened(path: Path) -> tuple[dict[str, Any], bytes]:
     return json.loads(text), binary
 
 
-def _check_types(entry: Node, place: str = "") -> None:
+def _check_types(entry: Node, place: str = "", of_all: type | None = None) -> None:
     """Raise SpecError for what holds others, in an entry and in all below it, and is not of the type that glTF has."""
     for key, value in entry.items():
-        _check_type(value, _OF_TYPES.get(key, object), place + key)
-        if key == "extensions":
-            for name, each in value.items():
-                _check_type(each, dict, f"{place}{key}.{name}")
-        elif isinstance(value, dict) and key != "extras":
-            _check_types(value, f"{place}{key}.")
-        elif isinstance(value, list) and key != "extras":
-            for number, each in enumerate(value):
-                if isinstance(each, dict):
-                    _check_types(each, f"{place}{key}[{number}].")
-
-
-def _check_type(value: Any, kind: type, place: str) -> None:
-    if not isinstance(value, kind):
-        raise SpecError(f"{place} is {str(value)[:60]}; it must be {'a list' if kind is list else 'an object'}")
+        kind = of_all or _OF_TYPES.get(key, object)
+        if not isinstance(value, kind):
+            wanted = "a list" if kind is list else "an object"
+            raise SpecError(f"{place}{key} is {str(value)[:60]}; it must be {wanted}")
+        if of_all or key == "extras":
+            continue
+        if isinstance(value, dict):
+            _check_types(value, f"{place}{key}.", dict if key == "extensions" else None)
+        for number, each in enumerate(value if isinstance(value, list) else ()):
+            if isinstance(each, dict):
+                _check_types(each, f"{place}{key}[{number}].")

@@ -78,7 +78,7 @@ class Textures:
         source = sources[-1][1]
         if (source, colour) not in self._last:
             name, data = self.file.image(source)
-            if not data:
+            if data is None:
                 return None
             what = f"{self.file.path}: image {source} ({name})"
             self._last = {(source, colour): images.decoded(data, what, raw=not colour)}
@@ -147,15 +147,12 @@ class Materials:
         surface = entry.get("pbrMetallicRoughness", {})
         return "baseColorTexture" in surface or _OLD in entry, numbers(surface, "baseColorFactor", _WHITE)
 
-    def place(self, look: Look) -> str:
-        """A material as a message names it."""
-        return f"material {self._name(look)!r}"
-
-    def _name(self, look: Look) -> str:
+    def name(self, look: Look) -> str:
+        """The name of a material, or its number."""
         return str(self.entry(look.number).get("name") or f"material_{'none' if look.number is None else look.number}")
 
     def _make(self, look: Look) -> tuple[str, Element | None] | None:
-        entry, place = self.entry(look.number), self.place(look)
+        entry, place = self.entry(look.number), f"material {self.name(look)!r}"
         surface, tint = entry.get("pbrMetallicRoughness", {}), np.array(look.tint)
         factor = (tint * numbers(surface, "baseColorFactor", _WHITE)).tolist()
         colour = self.textures.map(surface.get("baseColorTexture"), factor, _RGBA, colour=True)
@@ -165,7 +162,7 @@ class Materials:
         self.file.report(entry, "colour", place)
         if "occlusionTexture" in entry:
             self.file.changes.note("light is computed here", place, name="occlusionTexture")
-        made = self.ids.make(self._name(look) + "_mirrored" * look.mirrored, "material")
+        made = self.ids.make(self.name(look) + "_mirrored" * look.mirrored, "material")
         reach = self._reach.get(look.number, np.array([[0.0, 0.0], [1.0, 1.0]]))
         writer = Writer(self.textures.scratch / made, self.file.changes, place, reach.T.tolist())
         top = Element("bsdf", id=made)

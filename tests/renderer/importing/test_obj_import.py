@@ -115,7 +115,8 @@ def test_objects_and_materials_name_shapes_and_images_stand_upright(
     ("lines", "kinds"),
     [
         ("Kd .5 .5 .5", ["TwoSided", "SmoothDiffuse"]),
-        ("Kd .5 .5 .5\nKs .5 .5 .5\nNs 98\nillum 2", ["Principled", "roughness: UniformSpectrum[value=[0.376"]),
+        ("Kd .5 .5 .5\nKs .5 .5 .5\nNs 98\nillum 2", ["RoughPlastic", "alpha = [0.141"]),
+        ("Kd .5 .5 .5\nKs .5 .5 .5\nNs 6\nillum 2", ["Principled", "roughness: UniformSpectrum[value=[0.707"]),
         ("Kd 1 1 1\nd 0.1\nNi 1.4\nillum 4", ["ThinDielectric", "eta = [1.39"]),
         ("Kd .5 .5 .5\nd 0.8", ["Mask", "0.8"]),
         ("Kd .5 .5 .5\nPr .3\nPm 1", ["Principled"]),

@@ -87,10 +87,10 @@ depth = 4
         things = [movable.thing.name for movable in moves if not movable.thing.emits]
         lamps = [movable.thing.name for movable in moves if movable.thing.emits]
         static = "nothing was found that stands by itself"
-        if not self.source.lower().endswith(".xml"):
-            static += " (an object is never split: separate it in your program, by loose parts, to let them move)"
+        if not self.source.lower().endswith(".xml") and not self.proposal.room.is_stage:
+            static += ", and no object is split: separate it in your program, by loose parts, to let these move"
         if self.source.lower().endswith(".obj"):
-            static += "; OBJ does not say which axis is up: if the scene lies on its side, try --up z"
+            static += "; if the scene lies on its side, try --up z, as OBJ does not say what is up"
         lights = [f"{listed(lamps, len(lamps))} may move"] * bool(lamps) + list(self._fixed_lights())
         lights += ["one is added under the ceiling"] * self.adds_light
         return [

@@ -36,6 +36,7 @@ _GLASS, _MIRRORS, _LIT = (4, 6, 7, 9), (3, 5, 8), range(1, 10)
 """The models of illumination that are glass, those that reflect the scene, and those of what light and shadows meet."""
 
 _GREY = (0.7, 0.7, 0.7)  # the reflectance of what has no colour
+_SMOOTH = 0.2  # gloss up to this α is Mitsuba's `roughplastic`, which loses light above; `principled` gains some
 _SHINES = 0.02  # gloss is modelled from this specular reflectance on
 
 
@@ -131,7 +132,11 @@ class Surface:
         alpha = max(math.sqrt(2 / (max(material.number("ns", 30.0), 0.0) + 2)), 0.02)
         if _PBR & set(material.lines) or (max(ks) > _SHINES and illum not in (0, 1, *_MIRRORS)):
             if max(ks) > _SHINES:
-                material.say((None, "becomes the gloss of `principled`, by Ns alone"), "Ks")
+                material.say((None, "becomes the gloss of plastic, by Ns alone"), "Ks")
+            if alpha <= _SMOOTH and not (self.coloured or _PBR & set(material.lines)):
+                parts = {"diffuse_reflectance": colour, "alpha": constant(alpha)}
+                writer.put_surface(place, "roughplastic", parts)
+                return
             writer.put_surface(place, "principled", self._parts(colour, math.sqrt(alpha)), painted=self.coloured)
             return
         below = place

@@ -17,7 +17,7 @@ from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.readers import images
 
-_COLOURS = ("base_color", "reflectance")  # the properties that may be images of colour
+_COLOURS = ("base_color", "reflectance", "diffuse_reflectance")  # the properties that may be images of colour
 _MOST_PADDING = 8192  # texels by which an image grows where it is clamped along one axis alone
 
 

@@ -117,6 +117,13 @@ def test_a_scene_far_from_the_origin_is_found_before_all_else(write: Write, tmp_
     assert "photonfarm scene import scene.xml" in found.sentence
 
 
+def test_a_carpet_is_in_the_way_of_nothing(write: Write, tmp_path: Path) -> None:
+    spec = write()
+    rug = '<shape type="cube" id="rug"><transform name="to_world"><scale x="0.4" y="0.02" z="2"/><translate x="0.9" '
+    (tmp_path / "scene.xml").write_text(ROOM.replace("</scene>", f'{rug} y="0.02"/></transform></shape></scene>'))
+    assert not checked(spec).findings
+
+
 @pytest.mark.parametrize("static", [False, True])
 def test_the_pictures_are_the_samples_that_submit_plans_first(write: Write, static: bool) -> None:
     group = SPEC[SPEC.index("[[objects]]") : SPEC.index("[view]")]

@@ -248,6 +248,64 @@ def test_of_closed_rooms_the_one_with_something_in_it_is_shown(
     assert [movable.thing.name for movable in found.movables] == ["Sofa"]
 
 
+def test_of_rooms_with_furniture_that_with_most_is_shown_and_it_is_said_that_there_are_others(
+    put: Callable[..., None], gltf: Any, tmp_path: Path
+) -> None:
+    put("Bedroom", (0, 0, 0), (4, 2.6, 4), inwards=True)
+    put("Bed", (1, 0, 1), (2.8, 0.5, 2.8))
+    put("Globe", (2, 2, 2), (2.3, 2.3, 2.3), light=9)
+    put("Living", (4.2, 0, 0), (7.2, 2.6, 4), inwards=True)
+    put("Sofa", (5, 0, 1), (6.4, 0.8, 1.9))
+    put("Board", (5, 0, 2.8), (6.6, 1.6, 3.3))
+    found, _ = proposed(gltf.write(), tmp_path)
+    assert [movable.thing.name for movable in found.movables] == ["Board", "Sofa"]
+    assert found.has_others
+    assert found.stays == {"outside the room": ["Globe"]}
+
+
+@pytest.mark.parametrize(("furnished", "ground"), [(True, 300), (False, 15)])
+def test_a_furnished_room_on_a_large_ground_is_seen_from_within_and_an_empty_one_from_outside(
+    put: Callable[..., None], gltf: Any, tmp_path: Path, furnished: bool, ground: float
+) -> None:
+    put("Inner", (-3.1, 0, -1.8), (3.1, 2.5, 1.8), inwards=True)
+    put("Outer", (-3.2, -0.02, -1.9), (3.2, 2.6, 1.9))
+    put("Lawn", (-ground, -0.06, -ground), (ground, -0.04, ground))
+    if furnished:
+        put("Table", (-0.5, 0, -0.5), (0.5, 0.7, 0.5))
+    found, _ = proposed(gltf.write(), tmp_path)
+    assert found.room.has_ceiling == furnished
+    assert [movable.thing.name for movable in found.movables] == ["Table"] * furnished
+    assert not found.has_others
+
+
+def test_what_is_close_to_a_wall_and_does_not_reach_it_is_no_part_of_it(
+    room: None, put: Callable[..., None], gltf: Any, tmp_path: Path
+) -> None:
+    put("Top", (0.05, 0.7, 1.5), (1.2, 0.75, 2.2))
+    for number, x in enumerate((0.05, 1.15)):
+        put(f"Leg{number}", (x, 0, 1.5), (x + 0.05, 0.7, 2.2))
+    put("Panel", (0, 0.1, 3), (0.05, 1.5, 3.9))
+    for node in gltf.document["nodes"]:
+        node.pop("name")  # names keep objects together
+    found, _ = proposed(gltf.write(), tmp_path)
+    assert sorted(len(set(found.shape[found.thing == number])) for number in range(len(found.movables))) == [1, 3]
+
+
+def test_a_room_of_mirrored_rectangles_is_seen_from_their_front(tmp_path: Path) -> None:
+    sides = [("x", 0), ("x", 90), ("x", 180), ("x", 270), ("y", 90), ("y", 270)]
+    shapes = "".join(
+        f'<shape type="rectangle"><transform name="to_world"><scale x="-2" y="2"/><translate z="-2"/>'
+        f'<rotate {axis}="1" angle="{angle}"/></transform></shape>'
+        for axis, angle in sides
+    )
+    table = '<shape type="cube" id="Table"><transform name="to_world"><scale value="0.5"/><translate y="-1.5"/>'
+    file = tmp_path / "room.xml"
+    file.write_text(f'<scene version="3.0.0">{shapes}{table}</transform></shape></scene>')
+    found, _ = proposed(file, tmp_path)
+    assert found.room.has_ceiling
+    assert [movable.thing.name for movable in found.movables] == ["Table"]
+
+
 @pytest.mark.parametrize("camera", [None, (0, 1, -9), (9, 1, 0)])
 def test_a_house_alone_is_seen_from_outside_from_the_side_of_the_camera(
     put: Callable[..., None], gltf: Any, tmp_path: Path, camera: Any
@@ -296,7 +354,13 @@ def test_the_largest_rectangle_is_that_of_all_rectangles() -> None:
 
 @pytest.mark.parametrize(
     ("name", "shell", "furniture"),
-    [("Walls_0001", True, False), ("FloorLamp", False, True), ("Mesh12", False, False), ("Ceiling fan", True, False)],
+    [
+        ("Walls_0001", True, False),
+        ("FloorLamp", False, True),
+        ("Mesh12", False, False),
+        ("Ceiling fan", True, False),
+        ("Mushrooms", False, False),
+    ],
 )
 def test_names_say_what_belongs_to_the_room(name: str, shell: bool, furniture: bool) -> None:
     assert is_shell(name) == shell

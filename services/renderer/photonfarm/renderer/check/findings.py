@@ -188,8 +188,8 @@ def _of_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> Iter
     elif placed.cut >= CUT_AT_ALL:
         yield Finding(
             f"{key}.box",
-            f"box of {group.name!r} lets it stand in {placed.through!r} and others in {percent(placed.cut)} of its "
-            f"places; at {_point(placed.place)} {percent(placed.worst)} of it is behind them",
+            f"in {percent(placed.cut)} of its places {group.name!r} overlaps what does not move, such as "
+            f"{placed.through!r}: at {_point(placed.place)} {percent(placed.worst)} of its surface is inside",
             serious=placed.cut >= CUT,
         )
     up = int(np.abs(spec.view.up).argmax())

@@ -29,6 +29,9 @@ POINTS = 256
 TOUCHING = 0.02
 """The share of the way from a group's middle by which rays end before a vertex, where feet meet the floor."""
 
+CARPET = 0.03
+"""The share of the scene's height up to which nothing is in a group's way, such as a carpet."""
+
 CUT = 0.1
 """The share of a group that must be behind something for it to stand in that."""
 
@@ -52,8 +55,10 @@ def placements(scene: LoadedScene, geometry: Geometry) -> list[Placed]:
 
     still = [shape for shape, stays in zip(scene.scene.shapes(), scene.still, strict=True) if stays]
     fixed, hollow = scene_of(still) if still else None, scene.hollow[scene.still]
+    up = np.array(scene.spec.view.up, np.float32)
+    carpet = CARPET * float(np.ptp(scene.boxes @ up))
     groups = enumerate(scene.spec.groups)
-    return [_placed(fixed, hollow, group_vertices(geometry, number), group) for number, group in groups]
+    return [_placed(fixed, hollow, group_vertices(geometry, number), group, up, carpet) for number, group in groups]
 
 
 def _corners(group: Movable) -> F32:
@@ -68,7 +73,9 @@ def group_vertices(geometry: Geometry, number: int) -> F32:
     return geometry.vertices[np.unique(faces)]
 
 
-def _placed(fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable) -> Placed:
+def _placed(
+    fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable, up: F32, carpet: float
+) -> Placed:  # fmt: skip
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     corners = _corners(group)
     if fixed is None:
@@ -79,7 +86,7 @@ def _placed(fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable
     middle = (low + high) / 2
     there = surroundings(fixed, middle + moves, hollow).open
     spread = vertices[np.linspace(0, len(vertices) - 1, min(POINTS, len(vertices))).astype(np.int64)]
-    behind, shapes = _behind(fixed, middle, spread, moves)
+    behind, shapes = _behind(fixed, middle, _lifted(spread, up, carpet), moves)
     cut = np.maximum(behind - behind[0], 0)
     random, worst = slice(1 + len(corners), None), int(cut.argmax())
     return Placed(
@@ -91,6 +98,13 @@ def _placed(fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable
         place=tuple(places[worst].tolist()),
         through=shapes,
     )
+
+
+def _lifted(vertices: F32, up: F32, carpet: float) -> F32:
+    """Vertices (V, 3) of a group, raised by as much as a carpet is high, or to half the group's height."""
+    height = vertices @ up
+    least = height.min() + min(carpet, np.ptp(height) / 2)
+    return vertices + np.maximum(least - height, 0)[:, None] * up
 
 
 def _behind(fixed: Any, middle: F32, vertices: F32, moves: F32) -> tuple[NDArray[np.float64], str | None]:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import gc
 import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Collection
 from dataclasses import asdict, dataclass, replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -106,6 +106,10 @@ def _import(
     frame = Frame(up or scene.up)
     camera = None if scene.camera is None else frame.inward(np.array(scene.camera))
     proposal = propose(loaded, frame, camera, scene.objects, work.begin)
+    if proposal.has_others:
+        scene.changes.note(
+            "there are other rooms; this is the one with most that may move, unless the file has a camera in another"
+        )
     shapes = shapes_of_things(scene, loaded, proposal.shape, proposal.thing)
     scene.write_meshes(scratch / "meshes")
     work.begin("writing the scene")
@@ -124,14 +128,13 @@ def _write_scene(scene: ImportedScene, folder: Path) -> None:
     """Write the scene into a folder, with copies of all files that it names, by relative names."""
     folder.mkdir()
     names: dict[str, str] = {}
-    taken: Counter[str] = Counter()
     for node, key in elements.file_names(scene.root):
         source = Path(node.get(key, ""))
         if str(source) not in names:
             kind = "meshes" if source.suffix.lower() in MESHES else "textures"
-            taken[f"{kind}/{source.name.lower()}"] += 1
-            number = taken[f"{kind}/{source.name.lower()}"]
-            name = f"{kind}/{source.stem}{f'_{number}' if number > 1 else ''}{source.suffix}"
+            others = (f"{kind}/{source.stem}_{number}{source.suffix}" for number in count(2))
+            taken = {name.lower() for name in names.values()}
+            name = next(name for name in chain([f"{kind}/{source.name}"], others) if name.lower() not in taken)
             (folder / kind).mkdir(exist_ok=True)
             shutil.copyfile(source, folder / name)
             names[str(source)] = name

@@ -151,13 +151,16 @@ def _say_roughness(scene: ImportedScene, loaded: Any, *, moved: bool) -> None:
 
 def _move(scene: ImportedScene, node: Element, by: Floats, factor: float) -> None:
     """Move and enlarge a shape or a light, after all that moves it already."""
-    intensity = elements.child(node, "intensity")
+    name = "irradiance" if node.get("type") == "projector" else "intensity"
+    intensity = elements.child(node, name)
+    if intensity is None and node.tag == "emitter":
+        intensity = elements.put_value(node, name, 1.0)
     if intensity is not None and factor > 1:  # which is by the square of lengths
         if intensity.tag in ("rgb", "float"):
             numbers = [float(word) for word in intensity.get("value", "").replace(",", " ").split()]
             intensity.set("value", elements.numbers([factor**2 * number for number in numbers]))
         else:
-            scene.changes.lose("light", "intensity", "is too low, as the scene is enlarged", elements.place(node))
+            scene.changes.lose("light", name, "is too low, as the scene is enlarged", elements.place(node))
     place = elements.child(node, "position")
     if place is not None:
         for axis, part in zip("xyz", by, strict=True):

@@ -25,6 +25,7 @@ SHEET = 0.01  # what is thinner is a sheet
 PLANE = 0.01  # what is nearer to the ceiling lies in its plane
 AT_CEILING = 0.04  # what reaches up to this distance from the ceiling hangs from it
 WALL = 0.03  # of the room: what has its middle within this of a side, or beyond it, is part of the wall
+BEHIND = 0.1  # of the room: what is as far behind its sides is outside, and not in a window
 TALL, WIDE = 0.88, 0.6  # of the room: what is taller or wider is part of it
 HUGE = 1 / 3  # of the ceiling: a light as large is the ceiling
 CLOSED = 0.75  # of the places over a lamp: the ceiling is closed there if as many have a point of its plane
@@ -40,7 +41,7 @@ MOST = 12
 
 _SHELL = re.compile(
     "wall|floor|ceil|window|door|skirting|baseboard|curtain|drape|blind|roof|ground|beam|column|pillar|stair|radiator|"
-    "carpet|rug|room|shell|pane|sill|moulding|molding|socket|switch"
+    "carpet|rug|(?<!mush)room|shell|pane|sill|moulding|molding|socket|switch"
 )
 
 _FURNITURE = re.compile(
@@ -54,7 +55,8 @@ IN_CEILING = "set into the ceiling, which has a hole there"
 LARGE = "as large as the room or its ceiling"
 HELD = "on or in something that stays, or in the air"
 MANY = "as only the largest are proposed to move"
-OUTSIDE = "as nothing is proposed to move where there is no room"
+OUTSIDE = "outside the room"
+NO_ROOM = "as nothing is proposed to move where there is no room"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,14 +83,22 @@ class Thing:
 
 
 class Found(NamedTuple):
-    """What was found in a room."""
+    """A room, and what was found in it."""
 
+    room: Room
+    pieces: Pieces
     things: list[Thing]  # the largest first
     stays: dict[str, list[str]]  # the names of lights that stay, by the reason
 
+    @property
+    def moving(self) -> set[int]:
+        """The numbers of the pieces that may move."""
+        return {int(piece) for thing in self.things for piece in thing.pieces}
 
-def find_things(pieces: Pieces, surfaces: Surfaces, room: Room, objects: Mapping[str, str]) -> Found:
+
+def find_things(surfaces: Surfaces, room: Room, objects: Mapping[str, str]) -> Found:
     """What may move in a room; `objects` are the objects of shape ids where the source names them."""
+    pieces = Pieces.of(surfaces, CELL * room.height, float(room.size.max()))
     return _Search(pieces, surfaces, room, [objects.get(shape, "") for shape in surfaces.ids]).find()
 
 
@@ -101,13 +111,8 @@ class _Search:
 
     def find(self) -> Found:
         pieces, glows = self.pieces, self.surfaces.emits[self.pieces.shape]
-        middle, near, touch = (pieces.low + pieces.high) / 2, WALL * self.room.size, CELL * self.room.height
-        low, high = self.room.low, self.room.high
-        beyond = (middle < low + near) & (pieces.low < low + touch)
-        beyond |= (middle > high - near) & (pieces.high > high - touch)
-        outside: NDArray[np.bool_] = beyond[:, 0] | beyond[:, 1]
-        why = np.where(glows, self._why_fixed(outside), MOVES)
-        loose = np.where(glows, why == MOVES, ~self._is_shell(outside))
+        why = np.where(glows, self._why_fixed(), MOVES)
+        loose = np.where(glows, why == MOVES, ~self._is_shell()) & (not self.room.is_stage)
         group = self._grouped(loose, glows)
         things = []
         for number, built_in in enumerate(self._built_in(group)):
@@ -125,15 +130,27 @@ class _Search:
         for name, reason in {self._called(pieces.shape[one]): why[one] for one in np.flatnonzero(glows)}.items():
             if reason != MOVES:
                 stays.setdefault(str(reason), []).append(name)
-        return Found(_named_apart(kept), stays)
+        return Found(self.room, pieces, _named_apart(kept), stays)
 
-    def _why_fixed(self, outside: NDArray[np.bool_]) -> NDArray[Any]:
-        """Why each piece would stay as a light wherever it hangs, or MOVES, (N,); `outside`: in a wall or beyond."""
+    def _in_walls(self, gap: float) -> NDArray[np.bool_]:
+        """Which pieces have their middle close to a wall or beyond it, and are no farther from it than a gap, (N,)."""
+        pieces, room = self.pieces, self.room
+        middle, near = (pieces.low + pieces.high) / 2, WALL * room.size
+        inner = (middle < room.low + near) & (pieces.low < room.low + gap)
+        outer = (middle > room.high - near) & (pieces.high > room.high - gap)
+        return np.asarray((inner | outer)[:, :2].any(axis=1))
+
+    def _why_fixed(self) -> NDArray[Any]:
+        """Why each piece would stay as a light wherever it hangs, or MOVES, (N,)."""
         pieces, room = self.pieces, self.room
         size = pieces.high - pieces.low
         wide = (size[:, :2].prod(axis=1) > HUGE * room.size[:2].prod()) & (size[:, 2] < 0.5 * room.height)
         above = (pieces.high[:, 2] > room.high[2] + PLANE * room.height) & room.has_ceiling
-        return np.select([wide, outside, above], [LARGE, IN_WALL, IN_CEILING], MOVES).astype(object)
+        apart = np.maximum(pieces.low - room.high, room.low - pieces.high) > BEHIND * room.size
+        cases = {LARGE: wide, OUTSIDE: apart[:, :2].any(axis=1), IN_WALL: self._in_walls(np.inf), IN_CEILING: above}
+        if room.is_stage:
+            cases = {NO_ROOM: np.ones(len(size), np.bool_)}
+        return np.select([*cases.values()], [*cases], MOVES).astype(object)
 
     def _order(self, thing: Thing) -> tuple[float, int]:
         """By volume, to three digits, so that things that are alike keep the file's order."""
@@ -143,7 +160,7 @@ class _Search:
     def _called(self, shape: int) -> str:
         return self.names[shape] or self.surfaces.ids[shape]
 
-    def _is_shell(self, outside: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _is_shell(self) -> NDArray[np.bool_]:
         """Which pieces are the room itself, by their names, or by where they are and how large, (N,)."""
         pieces, room = self.pieces, self.room
         called = [f"{shape} {name}" for shape, name in zip(self.surfaces.ids, self.names, strict=True)]
@@ -153,7 +170,8 @@ class _Search:
         flat = (pieces.high[:, 2] < room.floor + FLAT * room.height) & (size[:, :2].max(axis=1) > CARPET * room.height)
         wide = size[:, :2] > 0.8 * room.size[:2]
         large = (wide.any(axis=1) & (size[:, 2] > 0.6 * room.height)) | wide.all(axis=1)
-        return named | ((outside | above | flat | large) & ~self._compact())
+        walls = self._in_walls(CELL * room.height)
+        return named | ((walls | above | flat | large) & ~self._compact())
 
     def _compact(self) -> NDArray[np.bool_]:
         """Which pieces are of a named object that is within the room and no part of it as a whole, (N,)."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from photonfarm.renderer.importing.proposal.groups import CELL, OUTSIDE, PLANE, Found, Thing, find_things
+from photonfarm.renderer.importing.proposal.groups import PLANE, Found, Thing, find_things
 from photonfarm.renderer.importing.proposal.room import NEAR_FLOOR, Room, find_room, outdoors, trace
 from photonfarm.renderer.importing.proposal.surfaces import Box, Frame, Pieces, Points, Surfaces
 from photonfarm.renderer.scene.surroundings import LEAVING, NONE, surroundings
@@ -134,6 +134,7 @@ class Proposal:
     views: list[View]  # the best first; the others are for scenes in which nothing of it is free
     light: Ceiling  # for a scene that has none, or too little
     stays: dict[str, list[str]]  # the names of lights that do not move, by the reason
+    has_others: bool  # whether things stand in other rooms, too
     shape: NDArray[np.int32]  # (F,): the number of each triangle's shape
     thing: NDArray[np.int64]  # (F,): the number of the movable that it belongs to, or −1
 
@@ -145,41 +146,39 @@ def propose(scene: Any, frame: Frame, camera: Points | None, objects: Mapping[st
     """
     surfaces = Surfaces.of(scene, frame)
     log(f"looking for the room and what stands in it, among {len(surfaces.shape)} triangles")
-    room, pieces, found = _find(scene, surfaces, frame, camera, objects)
+    (room, pieces, things, stays), has_others = _find(scene, surfaces, frame, camera, objects)
     moves = np.full(len(pieces.shape), -1, np.int64)
-    for number, thing in enumerate(found.things):
+    for number, thing in enumerate(things):
         moves[thing.pieces] = number
     views = _around(surfaces.main(), frame, camera)
     plan, movables = None, []
     if not room.is_stage:
         plan = FloorPlan.of(pieces, room, moves < 0)
-        movables = [_movable(thing, plan) for thing in found.things]
+        movables = [_movable(thing, plan) for thing in things]
         origin = _origin(plan, scene, frame)
         views.insert(0, View(origin, _look_at(movables, room, origin)))
     light = _light(scene, frame, room, views[0].origin, plan)
-    return Proposal(
-        room, surfaces.extent, movables, views, light, found.stays, surfaces.shape, moves[pieces.label]
-    )  # fmt: skip
+    thing_of = moves[pieces.label]
+    return Proposal(room, surfaces.extent, movables, views, light, stays, has_others, surfaces.shape, thing_of)
 
 
 def _find(
     scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | None, objects: Mapping[str, str]
-) -> tuple[Room, Pieces, Found]:  # fmt: skip
-    """The room and what is in it; of several in doubt the first in which there is something, or else all outdoors."""
-    tried: list[Room] = []
-    for last in [False] * MOST_ROOMS + [True]:
-        room = outdoors(scene, surfaces, frame) if last else find_room(scene, surfaces, frame, camera, tried)
-        pieces = Pieces.of(surfaces, CELL * room.height, float(room.size.max()))
-        if room.is_stage:
-            lights = [
-                objects.get(name) or name for name, emits in zip(surfaces.ids, surfaces.emits, strict=True) if emits
-            ]
-            return room, pieces, Found([], {OUTSIDE: list(dict.fromkeys(lights))} if lights else {})
-        found = find_things(pieces, surfaces, room, objects)
-        if not room.is_doubtful or found.things:
+) -> tuple[Found, bool]:  # fmt: skip
+    """The room with what is in it, and whether things stand in others, too.
+
+    Of rooms in doubt it is that with the largest area that may move; if nothing may move, it is all outdoors.
+    """
+    tried: list[Found] = []
+    for _ in range(MOST_ROOMS):
+        room = find_room(scene, surfaces, frame, camera, [found.room for found in tried])
+        if not room.is_doubtful:
             break
-        tried.append(room)
-    return room, pieces, found
+        tried.append(find_things(surfaces, room, objects))
+    if not any(found.things for found in tried):
+        return find_things(surfaces, outdoors(scene, surfaces, frame) if tried else room, objects), False
+    best = max(tried, key=lambda found: found.pieces.area[[*found.moving]].sum())
+    return best, any(found.moving - best.moving for found in tried)
 
 
 def _around(extent: Box, frame: Frame, camera: Points | None) -> list[View]:

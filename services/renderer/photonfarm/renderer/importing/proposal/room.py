@@ -70,11 +70,14 @@ def find_room(
 
     `others` are rooms that the point must not be in.
     """
-    rng, main = np.random.default_rng(0), surfaces.main()
+    rng, main, around = np.random.default_rng(0), surfaces.main(), outdoors(scene, surfaces, frame)
     if camera is not None:
         outside = ((camera < main.low) | (camera > main.high)).any()
         camera = None if outside or _in_solid(scene, frame, camera[None])[0] else camera
-    viewpoints = _best_viewpoint(scene, frame, main, rng, others) if camera is None else camera[None]
+    within = around.subject or main
+    viewpoints = _best_viewpoint(scene, frame, within, rng, others) if camera is None else camera[None]
+    if not len(viewpoints):
+        return around
     seen = []
     for _ in range(ROUNDS):
         seen.append(_cast(scene, frame, viewpoints, rng))
@@ -85,7 +88,7 @@ def find_room(
     level = (height > 0) & (height < LEVEL)
     backs = seen[0].is_back[found].mean() if found.any() else 1.0
     if camera is None and (found[level].mean() < OPEN_SHARE or backs > BACKS):
-        return outdoors(scene, surfaces, frame)
+        return around
     low, high, has_ceiling = _sides(_Hits(*map(np.concatenate, zip(*seen, strict=True))), main)
     doubtful = camera is None and bool((high - low).prod() < PART * (main.high - main.low).prod() or backs > PART)
     return Room(low, high, has_ceiling, is_doubtful=doubtful)
@@ -121,7 +124,7 @@ def _in_solid(scene: Any, frame: Frame, points: Points) -> NDArray[np.bool_]:
 def _best_viewpoint(
     scene: Any, frame: Frame, within: Box, rng: np.random.Generator, others: Sequence[Room]
 ) -> Points:  # fmt: skip
-    """A point (1, 3), in no solid and no other room, from which most rays hit something, and what they hit is far."""
+    """The point from which most rays hit something far away, in no solid and no other room: (1, 3), or (0, 3)."""
     steps = [(np.arange(n) + 0.5) / n for n in (8, 8, 4)]
     shares = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)
     grid = within.low + (within.high - within.low) * shares
@@ -135,7 +138,7 @@ def _best_viewpoint(
         enclosed[((grid > room.low) & (grid < room.high)).all(axis=1)] = -1
     reach = np.median(np.where(met, distance, 0), axis=1)
     reach[enclosed < 0.9 * enclosed.max()] = -1
-    return grid[[int(np.argmax(reach))]]
+    return grid[[int(np.argmax(reach))] if (enclosed >= 0).any() else []]
 
 
 def _along(hits: _Hits, rng: np.random.Generator) -> Points:
@@ -158,7 +161,10 @@ def _cast(scene: Any, frame: Frame, viewpoints: Points, rng: np.random.Generator
 
 
 def trace(scene: Any, frame: Frame, origin: Points, direction: Points) -> tuple[NDArray[np.float64], Points]:
-    """Distances (N,) to the first surfaces, infinite without one, and their normals (N, 3) as modelled."""
+    """Distances (N,) to the first surfaces, infinite without one, and their normals (N, 3), which point to the front.
+
+    That is where shading normals point: of a mirrored rectangle the corners turn round, and its front does not.
+    """
     import drjit as dr
     import mitsuba as mi
 
@@ -166,7 +172,7 @@ def trace(scene: Any, frame: Frame, origin: Points, direction: Points) -> tuple[
 
     o, d = (points(frame.world(x).astype(np.float32)) for x in (origin, direction))
     si = scene.ray_intersect(mi.Ray3f(o=o, d=mi.Vector3f(d), time=0, wavelengths=[]))
-    normal = dr.select(si.is_valid(), si.n, 0)
+    normal = dr.select(si.is_valid(), si.n * dr.sign(dr.dot(si.n, si.sh_frame.n)), 0)
     distance = np.array(dr.select(si.is_valid(), si.t, dr.inf), np.float64)
     return distance, frame.inward(np.array(normal, np.float64).T)
 

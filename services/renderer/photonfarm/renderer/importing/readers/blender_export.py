@@ -226,6 +226,8 @@ def _constant(part: Any, place: str) -> list[float]:
 
 def _sky(world: Any, file: str) -> list[float] | str:
     """The light of the world: a radiance, or a file with one per direction, as Cycles sees it."""
+    if world and not world.use_nodes:
+        return list(world.color)
     output = world.node_tree.get_output_node("CYCLES") if world and world.node_tree else None
     if output is None:
         return [0.0, 0.0, 0.0]

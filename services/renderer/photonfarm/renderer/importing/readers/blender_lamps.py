@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import Ids, ImportedScene
+from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.readers import images
 
 Floats = NDArray[np.float64]
@@ -43,10 +43,8 @@ class Lamps:
     """Puts lamps into a scene."""
 
     def __init__(self, scene: ImportedScene, scratch: Path) -> None:
-        self._scene, self._scratch, self._ids = scene, scratch, Ids()
+        self._scene, self._scratch = scene, scratch
         self._discs: list[tuple[Floats, Floats, float]] = []  # suns: direction, irradiance, sine of the half angle
-        for part in scene.root.iter():
-            self._ids.keep(part.get("id", ""))
 
     def put(self, lamp: Lamp) -> None:
         """Add a lamp: the numbers that Blender has of it, its `strength` as a colour, and its `matrix` in its world."""
@@ -140,9 +138,9 @@ class Lamps:
         self, lamp: Lamp, intensity: Floats, matrix: Floats, places: Floats, cut: float, profile: Profile
     ) -> None:
         """Add spots at offsets (N, 3) that share an intensity; `profile`: its share at tangents (x, y) off the axis."""
-        file = cone_image(profile, cut, self._scratch / f"{self._ids.make(lamp['name'], 'lamp')}.png")
-        for place in places:
-            spot = self._emitter("spot", lamp["name"])
+        spots = [self._emitter("spot", lamp["name"]) for _ in places]
+        file = cone_image(profile, cut, self._scratch / f"{spots[0].get('id')}.png")
+        for spot, place in zip(spots, places, strict=True):
             elements.put_value(spot, "intensity", (intensity / len(places)).tolist())
             _place(spot, _frame(matrix) * TURN, matrix[:3, 3] + place)
             put_cone(spot, cut, file)
@@ -151,11 +149,11 @@ class Lamps:
             self._scene.changes.note(meaning, f"lamp {lamp['name']!r}")
 
     def _emitter(self, kind: str, name: str) -> Element:
-        return SubElement(self._scene.root, "emitter", type=kind, id=self._ids.make(name, "lamp"))
+        return SubElement(self._scene.root, "emitter", type=kind, id=self._scene.ids.make(name, "lamp"))
 
     def _shape(self, kind: str, name: str, radiance: Floats) -> Element:
         """Add a black shape that emits."""
-        made = SubElement(self._scene.root, "shape", type=kind, id=self._ids.make(name, "lamp"))
+        made = SubElement(self._scene.root, "shape", type=kind, id=self._scene.ids.make(name, "lamp"))
         elements.put_value(SubElement(made, "bsdf", type="diffuse"), "reflectance", (0.0, 0.0, 0.0))
         made.append(elements.area_light(radiance.tolist()))
         self._scene.objects[made.get("id", "")] = name

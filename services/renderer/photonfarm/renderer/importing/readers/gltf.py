@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import Ids, ImportedScene
+from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh
 from photonfarm.renderer.importing.readers.blender_lamps import WIDEST, cone_image, put_cone
 from photonfarm.renderer.importing.readers.gltf_file import COMPRESSED, GltfFile, Node, extension, normalised, numbers
@@ -48,12 +48,12 @@ _Piece = tuple[Mesh, Look]  # a mesh and its material
 
 def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file; meshes and images are put into the folder `scratch`. Raises SpecError for what cannot be read."""
-    scene, ids = ImportedScene(), Ids()
+    scene = ImportedScene()
     file = GltfFile(path, scene.changes)
-    materials = Materials(file, scene.root, Textures(file, scratch), ids)
+    materials = Materials(file, scene.root, Textures(file, scratch), scene.ids)
     with file.at(), np.errstate(invalid="ignore"):  # of corners that are infinite, which are said
         log(f"reading {len(file.all('nodes'))} nodes and {len(file.all('meshes'))} meshes of {path.name}")
-        _Reader(file, scene, materials, ids).read()
+        _Reader(file, scene, materials).read()
     if scene.root.find("shape") is None:
         found = "".join(f"\n  {change}" for change in sorted(scene.changes, key=lambda change: not change.effect))
         raise SpecError(f"{path}: its scene has no triangles; nothing can be rendered{found}")
@@ -78,7 +78,6 @@ class _Reader:
     file: GltfFile
     scene: ImportedScene
     materials: Materials
-    ids: Ids
 
     def read(self) -> None:
         """Read all nodes of the file's scene."""
@@ -151,7 +150,7 @@ class _Reader:
                 for number, primitive in enumerate(mesh["primitives"]):
                     called = f"{name}_{number}" if len(mesh["primitives"]) > 1 else name
                     for part, look in self._meshes(primitive, matrix, visit.place):
-                        yield self.ids.make(called), owner, part, look
+                        yield self.scene.ids.make(called), owner, part, look
 
     def _put_piece(self, made: str, owner: str, mesh: Mesh, look: Look) -> None:
         material = self.materials.made(look)
@@ -286,7 +285,7 @@ class _Reader:
             return
         if "range" in light:
             self.scene.changes.note("light does not end there", place, name="range")
-        emitter = SubElement(self.scene.root, "emitter", type=kind, id=self.ids.make(name))
+        emitter = SubElement(self.scene.root, "emitter", type=kind, id=self.scene.ids.make(name))
         elements.put_value(emitter, "irradiance" if kind == "directional" else "intensity", colour.clip(0).tolist())
         elements.put_matrix(emitter, "to_world", _along_z(matrix).tolist())
         if kind == "spot":

@@ -72,7 +72,8 @@ class Upgrade:
                 node.remove(part)
             elif part.tag not in ("default", "bsdf") and (part.tag, node.tag) != ("ref", "shape"):
                 self.names[new] = old
-                part.set("name", "reflectance" if (kind, new) == ("diffuse", "diffuse_reflectance") else new)
+                is_base = kind in ("diffuse", "roughdiffuse") and new == "diffuse_reflectance"
+                part.set("name", "reflectance" if is_base else new)
 
     def _upgrade_property(self, node: Element, part: Element) -> None:
         name = part.get("name", "")

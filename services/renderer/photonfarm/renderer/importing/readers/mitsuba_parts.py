@@ -11,6 +11,7 @@ import numpy as np
 
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import Changes, Effect
+from photonfarm.renderer.importing.imported import Ids
 from photonfarm.renderer.importing.meshes import Floats, of_shape, write_ply
 from photonfarm.renderer.importing.readers import mitsuba_spectra
 from photonfarm.shared.core.errors import SpecError
@@ -83,7 +84,8 @@ def _drop_media(root: Element, changes: Changes) -> None:
         if len(kept) == held or node.tag not in ("shape", "emitter"):
             continue
         seen = [part for part in kept if part.tag in ("bsdf", "emitter", "ref") and part.get("id") not in unseen]
-        if node.tag == "shape" and all(part.get("type") == "null" for part in seen):
+        has_material = any(part.tag in ("bsdf", "ref") for part in kept)  # Mitsuba gives others a grey one
+        if node.tag == "shape" and has_material and all(part.get("type") == "null" for part in seen):
             above[node].remove(node)
             changes.lose("geometry", "medium", "is left out, with what only bounds it", elements.place(node))
         else:
@@ -135,23 +137,26 @@ def _replace(bsdf: Element) -> str:
 def _integrate_spectra(root: Element, above: dict[Element, Element]) -> None:
     """Make colours of black bodies and sampled spectra, which Mitsuba 3 evaluates in its spectral modes alone."""
     for node in list(root.iter("texture")):
-        try:
-            colour = mitsuba_spectra.of_new(node, shines=effect_of(node, above) == "light")
-        except ValueError as error:
-            raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
-        if colour is None:
-            continue
-        for user in [part for part in root.iter("ref") if part.get("id") == node.get("id")]:
-            mitsuba_spectra.put(user, colour)
-        if node in list(root):
+        users = [part for part in root.iter("ref") if part.get("id") == node.get("id")]
+        for user in users or [node]:
+            shines = effect_of(above[user] if users else node, above) == "light"
+            try:
+                colour = mitsuba_spectra.of_new(node, shines=shines)
+            except ValueError as error:
+                raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
+            if colour is not None:
+                mitsuba_spectra.put(user, colour)
+        if users and users[0].tag == "rgb" and node in list(root):
             root.remove(node)
-        mitsuba_spectra.put(node, colour)
 
 
 def expand(root: Element, changes: Changes, scratch: Path) -> None:
     """Put copies of its group's shapes, which can move and be sampled as lights, in the place of each instance."""
     groups = {group.get("id"): group for group in root.findall("shape[@type='shapegroup']")}
     copies: dict[Element, list[Element]] = {}
+    ids = Ids()
+    for node in root.iter():
+        ids.keep(node.get("id", ""))
     mirrored = cache(partial(_mirrored, scratch=scratch))
     made = 0
     for number, instance in enumerate(root.findall("shape[@type='instance']"), 1):
@@ -161,7 +166,8 @@ def expand(root: Element, changes: Changes, scratch: Path) -> None:
         shapes = [] if group is None or made >= MOST else group.findall("shape")
         copies[instance] = [_placed(shape, matrix.reshape(4, 4), mirrored, changes) for shape in shapes]
         for shape, copy in zip(shapes, copies[instance], strict=True):
-            copy.set("id", f"{shape.get('id') or (ref is not None and ref.get('id')) or 'instance'}_{number}")
+            name = shape.get("id") or (ref is not None and ref.get("id")) or "instance"
+            copy.set("id", ids.make(f"{name}_{number}"))
         made += len(shapes)
     root[:] = [part for node in root if node.get("id") not in groups for part in copies.get(node, [node])]
     if made:

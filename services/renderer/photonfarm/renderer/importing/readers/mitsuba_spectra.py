@@ -54,7 +54,9 @@ def of_new(texture: Element, *, shines: bool) -> Colour | None:
         return None
     samples = numbers_of(values["values"])
     ends = float(values.get("wavelength_min", "360")), float(values.get("wavelength_max", "830"))
-    at = np.linspace(*ends, len(samples)).tolist() if kind == "regular" else numbers_of(values["wavelengths"])
+    at = np.linspace(*ends, len(samples)).tolist() if kind == "regular" else numbers_of(values.get("wavelengths", ""))
+    if len(at) != len(samples):
+        raise ValueError(f"it has {len(samples)} values and {len(at)} wavelengths")
     return _integrated(at, samples, reflects=not shines)
 
 

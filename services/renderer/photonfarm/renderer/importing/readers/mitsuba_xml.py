@@ -20,7 +20,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.located_xml import line_of, parse
 
-MITSUBA_2 = (2,)
+OLDEST, MITSUBA_2 = (0, 4), (2,)
 """Mitsuba 3 reads what is of this version or newer."""
 
 _NUMBERS = ("float", "rgb", "vector", "spectrum", "transform")
@@ -129,6 +129,8 @@ class _Files:
                     found = self._copy(found, inner, (*around, file))
                 node.set("filename", str(found.resolve()))
         version = tuple(int(part) for part in re.findall(r"\d+", root.get("version", "3")))[:2]
+        if version < OLDEST:
+            raise SpecError(f"{file}: is of Mitsuba {root.get('version')}; open it in Mitsuba 0.6, and save it there")
         if version < MITSUBA_2:
             self.upgrade.run(root, lambda name: self.find(name, file))
         copy = self.upgrade.scratch / f"{len(self.originals)}-{file.name}"
@@ -206,8 +208,8 @@ def _camera(root: Element) -> tuple[Vector | None, Vector]:
     matrix = np.array(placed[0].get("value", "").split(), np.float64).reshape(4, 4)
     axis = int(np.abs(matrix[:3, 1]).argmax())
     x, y, z = np.where(np.arange(3) == axis, np.sign(matrix[axis, 1]), 0.0)
-    right, up, back = matrix[:3, 3]
-    return (float(right), float(up), float(back)), (float(x), float(y), float(z))
+    a, b, c = matrix[:3, 3].tolist()
+    return (a, b, c), (float(x), float(y), float(z))
 
 
 def _drop_settings(root: Element, changes: Changes) -> None:

@@ -132,11 +132,12 @@ class Material:
         return values
 
     def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
-        """The numbers of a line from 0 to `most`, to which others are cut; black is white where `otherwise` is."""
+        """The numbers of a line from 0 to `most`, to which others are cut. Where `otherwise` is white, so is black."""
         values = self.colour(key, otherwise)
         made: list[float] = np.clip(values, 0, most).tolist()
         if np.abs(np.subtract(made, values)).max() > 1e-3:  # more than rounding
-            self.say((effect, f"is cut to what lies between 0 and {most:g}"), self.lines[key][1])
+            bounds = "is below 0, and is cut to that" if most == math.inf else f"is cut to what lies in 0 to {most:g}"
+            self.say((effect, bounds), self.lines[key][1])
         if tuple(otherwise) == WHITE and max(made) <= 0:
             self.say((None, "is black where black is not meant, and is taken for white"), self.lines[key][1])
             return list(WHITE)
@@ -157,7 +158,10 @@ class Material:
             return None
         made = Image(file, options)
         for name, value in options.items():
-            if name not in _CARRIED and (name, value) != ("mm", "0 1") and set(value.split()) - {"0", "0.0", "off"}:
+            if name in ("s", "o", "bm") and {"on", "off"} & set(value.split()):
+                place = f"{self.file}: line {line}: material {self.name!r}"
+                raise SpecError(f"{place}: {word} -{name} {value} is no number")
+            if name not in _CARRIED and not _is_neutral(name, value):
                 self.say(("colour", "is an option that is not carried over"), f"{word} -{name}")
         return made
 
@@ -174,6 +178,15 @@ class Material:
     def relief(self) -> str:
         """The key of its normal map, or else of its bump map, or nothing."""
         return next((key for key in RELIEFS if key in self.lines), "")
+
+
+def _is_neutral(name: str, value: str) -> bool:
+    """Whether an option changes nothing."""
+    try:
+        numbers = [float(part) for part in value.split()]
+    except ValueError:
+        return value == "off"
+    return numbers == ([0, 1] if name == "mm" else [0] * len(numbers))
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.changes import Effect
 from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.mtl import RELIEFS, WHITE, Material, Meaning
 from photonfarm.renderer.importing.readers.surfaces import Map, Writer, constant
@@ -66,7 +67,8 @@ class Surface:
             material.say((None, "becomes clear glass without a thickness, of Ni and Tf; Ke shines in full"), "illum")
             return writer.light(glow, None, "map_Ke")
         if illum in _GLASS:
-            material.say((None, "is of glass, and none here by its opacity or its images"), f"illum {illum:g}")
+            effect: Effect | None = None if {"d", "tr"} & set(material.lines) else "colour"  # many state d 1
+            material.say((effect, "is of glass, and none here by its opacity or its images"), f"illum {illum:g}")
         if min(tint) < 1:
             material.say(("colour", "does not tint the light that passes through"), "Tf")
         self._put_gloss(writer.put_layers(top, opacity, self._normals(writer)), illum, writer)
@@ -86,12 +88,13 @@ class Surface:
 
     def _opacity(self, illum: float) -> Map | None:
         """Its opacity; None is opaque. An image's own opacity where it has some, or else its brightness."""
-        opacity, stencil = self._dissolve(illum), self.material.image("map_d") or self.material.image("map_tr")
+        opacity, map_d = self._dissolve(illum), self.material.image("map_d")
+        stencil = map_d or self.material.image("map_tr")
         if stencil is None:
             return constant(opacity) if opacity < 1 else None
         values = stencil.values(raw=True)
         grey = values[..., 3:] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2, keepdims=True)
-        return Map(np.float32(opacity) * abs(("map_d" not in self.material.lines) - grey.clip(0, 1)), stencil.lie)
+        return Map(np.float32(opacity) * abs((map_d is None) - grey.clip(0, 1)), stencil.lie)
 
     def _dissolve(self, illum: float) -> float:
         """Its `d`, or 1 − `Tr`, unless that hides what is there to be seen."""

@@ -17,7 +17,7 @@ from mapbox_earcut import triangulate_float64
 from numpy.typing import NDArray
 
 from photonfarm.renderer.importing.changes import Changes, Effect
-from photonfarm.renderer.importing.imported import Ids, ImportedScene
+from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh, unit
 from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.mtl import WHITE, Material, read_libraries, statements
@@ -49,16 +49,16 @@ _Tables = tuple[Floats, Floats, Floats]
 def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     """Read a file; changed images are put into the folder `scratch`. Raises SpecError if it cannot be read."""
     log(f"reading {path.name}")
-    scene, ids = ImportedScene(), Ids()
+    scene = ImportedScene()
     file = _File(path, scene.changes)
     parts = list(_parts(file, read_libraries(path, file.libraries, scene.changes)))
     known: dict[Surface, tuple[str, Element | None]] = {}
     for _, surface, _ in parts:
         if surface not in known:
-            made = ids.make(surface.material.name, "material")
+            made = scene.ids.make(surface.material.name, "material")
             known[surface] = made, replace(surface, stem=scratch / made).put(SubElement(scene.root, "bsdf", id=made))
     for owner, surface, mesh in parts:
-        shape_id = ids.make("_".join(filter(None, (owner or path.stem, surface.material.name))))
+        shape_id = scene.ids.make("_".join(filter(None, (owner or path.stem, surface.material.name))))
         made, light = known[surface]
         scene.put_shape(shape_id, mesh, made, owner, light, both_sides=True)
     if scene.root.find("shape") is None:
@@ -228,9 +228,11 @@ def _smooth_normals(corner: _Ints, across: Floats, group: _Ints, count: int) -> 
 def _colours(given: Floats, changes: Changes) -> Floats:
     """Linear colours of vertices, NaN for those that have none, from what stands after their coordinates."""
     given = np.where(np.isfinite(given).all(axis=1, keepdims=True), given, np.nan)
-    if (given > 1).any():
-        changes.note("colours of vertices go beyond 1, and are taken for 0 to 255", name="v")
+    if (given > 2).any() and not np.nansum(given % 1):
+        changes.note("colours of vertices are whole numbers beyond 1, and are taken for 0 to 255", name="v")
         given = given / 255
+    elif (given > 1.001).any():  # more than rounding
+        changes.lose("colour", "v", "colours of vertices go beyond 1, and are cut")
     return images.linear(given.clip(0, 1).astype(np.float32)).astype(np.float64)
 
 

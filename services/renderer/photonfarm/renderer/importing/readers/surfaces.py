@@ -70,8 +70,10 @@ class Writer:
         (values, lie), file = self._wrapped(part.values, part.lie), part.file
         if file is None:
             file = self.stem.with_name(f"{self.stem.name}_{name}.{'exr' if kind == 'light' else 'png'}")
-            write = images.save_radiance if kind == "light" else images.save
-            file = write(images.encoded(values) if kind == "colour" else values, file)
+            if kind == "light":
+                file = images.save_radiance(values, file)
+            else:
+                file = images.save(images.encoded(values) if kind == "colour" else values.clip(0, 1), file)
         bitmap = elements.put_bitmap(parent, name, file, raw=kind != "colour")
         if lie.nearest:
             elements.put_value(bitmap, "filter_type", "nearest")
@@ -116,7 +118,7 @@ class Writer:
         return one.values[texels[0]], other.values[texels[1]], one.lie or other.lie
 
     def put_layers(self, top: Element, opacity: Map | None, normals: Map | None, *, passes: bool = False) -> Element:
-        """Put what lies above a material; the place of the material. What light `passes` has two sides."""
+        """Put what lies above a material; the place of the material, two-sided unless it `passes` light."""
         if opacity is not None:
             top.set("type", "mask")
             self.put(top, "opacity", opacity)

@@ -336,6 +336,17 @@ group = tree.nodes.new("ShaderNodeGroup")
 group.node_tree = bpy.data.node_groups.new("Group", "ShaderNodeTree")
 group.node_tree.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
 tree.links.new(group.outputs[0], tree.get_output_node("CYCLES").inputs["Surface"])
+surface(14, "rough", "ShaderNodeBsdfDiffuse", Roughness=0.5)
+surface(15, "film", "ShaderNodeBsdfTransparent", Color=(1, 0.2, 0.2, 1))
+surface(16, "twice", "ShaderNodeEmission", Strength=2)
+tree = bpy.data.materials["twice"].node_tree
+both = tree.nodes.new("ShaderNodeAddShader")
+for place in (0, 1):
+    tree.links.new(tree.nodes.new("ShaderNodeEmission").outputs[0], both.inputs[place])
+tree.links.new(both.outputs[0], tree.get_output_node("CYCLES").inputs["Surface"])
+surface(17, "fog", "")
+tree = bpy.data.materials["fog"].node_tree
+tree.links.new(tree.nodes.new("ShaderNodeVolumeScatter").outputs[0], tree.get_output_node("CYCLES").inputs["Volume"])
 world = bpy.data.worlds.new("World")
 world.use_nodes = True
 tree = world.node_tree
@@ -365,6 +376,8 @@ def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Pa
         hit = scene.ray_intersect(mi.Ray3f([1.1, -3 * direction, 0.1], [0, direction, 0]))
         assert np.array(hit.emitter(scene).eval(hit)).ravel() == pytest.approx([4, 2, 1], rel=1e-5)
     assert "Dielectric" in str(down(7).bsdf())
+    assert not down(17).is_valid()  # what has a volume alone is seen through
+    assert ("Add Shader", ["material 'twice'"]) in [(c.name, c.places) for c in made.changes if c.effect == "light"]
     for x, opacity in ((-0.35, 1), (0.15, 0)):  # of an image's own alpha
         passing = np.array(down(8 + x).bsdf().eval_null_transmission(down(8 + x))).ravel()
         assert passing == pytest.approx(1 - opacity, abs=0.01)
@@ -372,6 +385,9 @@ def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Pa
         ("Noise Texture", "material 'cloudy'"),
         ("Subsurface Weight", "material 'waxen'"),
         ("Sheen BSDF", "material 'cloth'"),
+        ("Roughness", "material 'rough'"),
+        ("Transparent BSDF", "material 'film'"),
+        ("Volume", "material 'fog'"),
         ("Sheen Weight", "material 'velvet'"),
         ("Anisotropic", "material 'brushed'"),
         ("Specular Tint", "material 'tinted'"),

@@ -24,6 +24,7 @@ _SHADERS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
 """The shaders that the Principled BSDF can stand for: which input becomes which of its own, and its other values."""
 
 _NEUTRAL = ("Subsurface Weight", "Sheen Weight", "Anisotropic", "Diffuse Roughness", "Thin Film Thickness")
+_SPECIAL = ("Roughness", "Anisotropy", "Thin Film Thickness")
 _COLOURS, _NUMBERS = ("Base Color", "Emission Color"), ("Roughness", "Metallic")
 
 Lose = Callable[[str, str, str], None]
@@ -36,18 +37,23 @@ def prepare(material: Any, lose: Lose) -> None:
         return
     tree = material.node_tree
     output = tree.get_output_node("CYCLES") or tree.nodes.new("ShaderNodeOutputMaterial")
+    has_volume = output.inputs["Volume"].is_linked
     for name, effect in (("Volume", "colour"), ("Displacement", "geometry")):
         for link in output.inputs[name].links:
             lose(effect, name, "is not carried over")
             tree.links.remove(link)
-    surface = _principled(tree, source(output.inputs["Surface"]), lose)
+    node = source(output.inputs["Surface"])
+    if node is None and has_volume:  # which has no surface
+        node = tree.nodes.new("ShaderNodeBsdfTransparent")
+    surface = _principled(tree, node, lose)
     tree.links.new(surface.outputs[0], output.inputs["Surface"])
     for part in surface.inputs:
         unfit = _unfit(part)
         if part.name in _NEUTRAL and (part.is_linked or part.default_value > 0):
             lose("colour", part.name, "is not carried over")
         elif unfit is not None:
-            lose("colour", unfit.bl_label, f"{part.name} does not vary here; bake it to an image to keep it")
+            effect = "light" if "Emission" in part.name else "colour"
+            lose(effect, unfit.bl_label, f"{part.name} does not vary here; bake it to an image to keep it")
             tree.links.remove(part.links[0])
     if surface.inputs["Coat Weight"].default_value > 0 and min(surface.inputs["Coat Tint"].default_value) < 1:
         lose("colour", "Coat Tint", "is not carried over")
@@ -78,6 +84,10 @@ def _principled(tree: Any, node: Any, lose: Lose) -> Any:
     for part in node.inputs if node else ():
         if part.name in takes:
             _give(part, made.inputs[takes[part.name]])
+        elif kind in _SHADERS and (part.is_linked or (part.name in _SPECIAL and part.default_value > 0)):
+            lose("colour", part.name, f"of {node.bl_label} is not carried over")
+    if kind == "BSDF_TRANSPARENT":
+        _say_tint(node, lose)
     return made
 
 
@@ -89,16 +99,27 @@ def _mixed(tree: Any, node: Any, lose: Lose) -> Any:
     special = "EMISSION" if adds else "BSDF_TRANSPARENT"
     place = kinds.index(special) if special in kinds else -1
     if place < 0 or (place == 1 and not adds and share.is_linked):
-        lose("colour", node.bl_label, "only the heavier of its two shaders is carried over")
+        effect = "light" if "EMISSION" in kinds else "colour"
+        lose(effect, node.bl_label, "only the heavier of its two shaders is carried over")
         return _principled(tree, pair[not adds and share.default_value > 0.5], lose)
     made = _principled(tree, pair[1 - place], lose)
     if adds:
+        if made.inputs["Emission Strength"].default_value > 0 or made.inputs["Emission Strength"].is_linked:
+            lose("light", node.bl_label, "only one of its two lights is carried over")
         for name, ours in _LIGHT.items():
             _give(pair[place].inputs[name], made.inputs[ours])
     else:
+        _say_tint(pair[place], lose)
+        if made.inputs["Alpha"].default_value < 1 or made.inputs["Alpha"].is_linked:
+            lose("colour", "Alpha", "of what is mixed with something transparent is not carried over")
         _give(share, made.inputs["Alpha"])
         made.inputs["Alpha"].default_value = abs(place - share.default_value)
     return made
+
+
+def _say_tint(transparent: Any, lose: Lose) -> None:
+    if transparent.inputs["Color"].is_linked or min(transparent.inputs["Color"].default_value[:3]) < 1:
+        lose("colour", transparent.bl_label, "lets all colours through")
 
 
 def _unfit(part: Any) -> Any:

@@ -234,8 +234,6 @@ def test_materials_of_0_6_have_its_defaults_or_are_the_nearest(
          "light", "gamma"),
         ('<shape type="disk"><bsdf type="phong"><texture name="exponent" type="checkerboard"/></bsdf></shape>',
          "colour", "exponent"),
-        ('<shape type="disk"><bsdf type="ward"><texture name="diffuseReflectance" type="checkerboard"/></bsdf></shape>',
-         "colour", "diffuseReflectance"),
         (f'<shape type="disk">{MIXTURE.format(".5, .2")}</shape>', "colour", "mixturebsdf"),
         ('<shape type="disk"><bsdf type="coating"><bsdf type="diffuse"/></bsdf></shape>', "colour", "coating"),
         ('<shape type="disk"><bsdf type="mask"><rgb name="opacity" value=".9 .1 .1"/><bsdf type="diffuse"/></bsdf>'
@@ -468,7 +466,7 @@ def test_the_camera_says_where_the_room_is_and_which_axis_is_up(write: Callable[
         ),
         (
             f'{SPHERE}<emitter type="constant"><float name="radiance" value="1e39"/></emitter>',
-            "line 2: <float> 'radiance': 9.9.*38",
+            r"line 2: <float> 'radiance': 1e\+39",
         ),
         (
             '<shape type="sphere"><transform name="to_world"><scale value="inf"/></transform></shape>',
@@ -501,7 +499,7 @@ def test_what_is_wrong_in_0_6_is_named(write: Callable[..., Path], loaded: Loade
 
 
 def test_terms_before_0_4_are_refused(write: Callable[..., Path], read: Read) -> None:
-    with pytest.raises(SpecError, match="is of Mitsuba 0.3.0"):
+    with pytest.raises(SpecError, match=r"is of Mitsuba 0\.3\.0"):
         read(write('<luminaire type="point"/>', "0.3.0"))
 
 
@@ -553,3 +551,31 @@ def test_a_spec_of_shapes_without_ids_is_told_of_the_import(write: Callable[...,
                  "objects": [{"name": "ball", "shapes": ["Ball"], "at": [0, 0, 0], "box": everywhere}]}  # fmt: skip
     with pytest.raises(SpecError, match=r"no ids; `photonfarm scene import`"):
         parse_spec(described, where="spec")
+
+
+def test_a_phong_with_a_texture_keeps_its_texels(write: Callable[..., Path], loaded: Loaded) -> None:
+    texture = '<texture name="diffuseReflectance" type="checkerboard"><rgb name="color0" value="0.8"/></texture>'
+    scene, made = loaded(write(f'<shape type="rectangle"><bsdf type="phong">{texture}</bsdf></shape>', "0.6.0"))
+    assert [(change.effect, change.name) for change in scene.changes] == [(None, "phong")]
+    assert "RoughPlastic" in str(made.shapes()[0].bsdf())
+
+
+def test_shapes_of_a_group_and_copied_files_keep_apart(write: Callable[..., Path], loaded: Loaded) -> None:
+    group = '<shape type="shapegroup" id="g"><shape type="cube"/><shape type="sphere"/></shape>'
+    instances = '<shape type="instance"><ref id="g"/></shape>' * 2
+    assert len(loaded(write(f'{group}{instances}<shape type="cube" id="g_1"/>'))[1].shapes()) == 5
+
+
+@pytest.mark.parametrize("kind", ["rotate", "matrix", "translate"])
+def test_transforms_that_are_no_numbers_are_refused(write: Callable[..., Path], read: Read, kind: str) -> None:
+    step = {"rotate": '<rotate x="1" angle="nan"/>', "translate": '<translate x="nan"/>',
+            "matrix": f'<matrix value="nan {"0 " * 15}"/>'}[kind]  # fmt: skip
+    with pytest.raises(SpecError, match="line 2"):
+        read(write(f'<shape type="cube"><transform name="to_world">{step}</transform></shape>'))
+
+
+def test_a_spectrum_that_lamps_refer_to_is_not_cut_to_what_reflects(write: Callable[..., Path], read: Read) -> None:
+    spectrum = '<texture type="regular" id="L"><string name="values" value="10, 20, 30"/></texture>'
+    lamp = '<shape type="sphere"><emitter type="area"><ref name="radiance" id="L"/></emitter></shape>'
+    (found,) = read(write(spectrum + lamp)).root.iter("rgb")
+    assert max(map(float, found.get("value", "").split(","))) > 10

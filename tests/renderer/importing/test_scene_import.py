@@ -137,7 +137,7 @@ def test_a_light_is_added_to_a_room_that_the_sun_does_not_reach(
 ) -> None:
     result = run(case("gltf-sun-outside-closed-room/scene.gltf"), "--out", "dark")
     assert result.exit_code == 0, result.output
-    assert "one is added under the ceiling" in result.stdout
+    assert "one is added above what cameras see" in result.stdout
     spec = load_spec("dark.toml")
     assert [light.name for light in spec.lights] == ["ceiling-light"]
     assert spec.view.free_space is not None
@@ -216,3 +216,11 @@ def test_real_rooms_are_imported_without_their_ready_specs(
         pytest.skip("PHOTONFARM_SCENES names no folder that has it")
     assert run(found).exit_code == 0
     assert groups <= {group.name for group in load_spec(f"{scene}.toml").groups}
+
+
+def test_files_of_like_names_are_copied_apart(quick: None, gltf: Any, run: Callable[..., Result]) -> None:
+    for number, name in enumerate(("chair", "Chair", "Chair_2")):
+        mesh = trimesh.creation.box(bounds=[(2 * number, 0, 0), (2 * number + 1, 1, 1)])
+        gltf.node(name, gltf.mesh(mesh.vertices.astype("<f4"), mesh.faces.astype("<u4")))
+    assert run(gltf.write(), "--out", "it").exit_code == 0
+    assert len(list(Path("it-scene/meshes").iterdir())) == 3

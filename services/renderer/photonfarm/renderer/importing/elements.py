@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from photonfarm.shared.scene.located_xml import line_of
+from photonfarm.shared.scene.located_xml import Located, line_of
 
 
 def scene() -> Element:
@@ -102,8 +102,10 @@ def place(node: Element) -> str:
 
 
 def copied(node: Element) -> Element:
-    """A copy of an element and all in it; ids in it become those of nothing, as two may not be the same."""
-    copy = Element(node.tag, {key: value for key, value in node.attrib.items() if key != "id" or node.tag == "ref"})
+    """A copy of an element and all in it without ids, which must be unique; references keep theirs."""
+    copy = type(node)(node.tag, {key: value for key, value in node.attrib.items() if key != "id" or node.tag == "ref"})
+    if isinstance(node, Located) and isinstance(copy, Located):
+        copy.file, copy.line = node.file, node.line
     copy.text, copy.tail = node.text, node.tail
     copy.extend(copied(part) for part in node)
     return copy

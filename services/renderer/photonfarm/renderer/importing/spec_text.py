@@ -92,7 +92,7 @@ depth = 4
         if self.source.lower().endswith(".obj"):
             static += "; if the scene lies on its side, try --up z, as OBJ does not say what is up"
         lights = [f"{listed(lamps, len(lamps))} may move"] * bool(lamps) + list(self._fixed_lights())
-        lights += ["one is added under the ceiling"] * self.adds_light
+        lights += ["one is added above what cameras see"] * self.adds_light
         return [
             self._extent(),
             f"may move: {', '.join(things) or static}",

@@ -124,13 +124,14 @@ class _Reader:
         for visit in visits:
             for each in (*visit.above, visit):
                 each.meshes += "mesh" in visit.node
-        most = max(1.0, OBJECT_SHARE * sum("mesh" in node for node in self.file.all("nodes")))
+        most = max(1.0, OBJECT_SHARE * sum("mesh" in visit.node for visit in visits))
         for visit in visits:
             visit.owner = next((each.name for each in visit.above if each.meshes <= most), visit.name)
 
     def _roots(self) -> list[int]:
         if not (count := len(self.file.all("scenes"))):
-            raise SpecError("has no scene, so nothing is to be rendered; export one with a scene")
+            below = {child for node in self.file.all("nodes") for child in node.get("children", ())}
+            return [number for number in range(len(self.file.all("nodes"))) if number not in below]
         scene = self.file.entry("scenes", self.file.document.get("scene", 0))
         if count > 1:
             self.scene.changes.note(f"{scene.get('name', 'one')!r} of {count} is read", name="scenes")
@@ -181,9 +182,9 @@ class _Reader:
         """The meshes of a primitive: none if it has no triangles, and two where some of its images are mirrored."""
         self.file.report(primitive, "geometry", place)
         mode, attributes, material = primitive.get("mode", _LISTS), primitive["attributes"], primitive.get("material")
-        if mode not in (_LISTS, _STRIPS, _FANS):
-            name = _OTHERS.get(mode, f"mode {mode}")
-            self.scene.changes.lose("geometry", name, "points and lines have no surface", place)
+        if mode not in (_LISTS, _STRIPS, _FANS) or "POSITION" not in attributes:
+            name = _OTHERS.get(mode, f"mode {mode}") if "POSITION" in attributes else "no POSITION"
+            self.scene.changes.lose("geometry", name, "points, lines and what is nowhere have no surface", place)
             return []
         position = self.file.entry("accessors", attributes["POSITION"])
         compressed = ", ".join(COMPRESSED & set(primitive.get("extensions", ())))
@@ -209,7 +210,7 @@ class _Reader:
         if "indices" in primitive:
             order = self.file.array(primitive["indices"])[:, 0]
         if order.dtype.kind != "u" or order.max(initial=0) >= max(vertices, 1):
-            raise SpecError(f"indices are {order.dtype} up to {order.max()}, and POSITION has {vertices} vertices")
+            raise SpecError(f"indices ({order.dtype}) name vertex {order.max()}, and POSITION has {vertices}")
         if mode == _LISTS:
             return order[: len(order) // 3 * 3].reshape(-1, 3).astype(np.uint32)
         i = np.arange(len(order) - 2)

@@ -70,7 +70,8 @@ class GltfFile:
             if not version.startswith("2."):
                 raise SpecError(f"is glTF of version {version!r}; only version 2 is read")
             _check_types({key: value for key, value in self.document.items() if key in _OF_TYPES})
-            refused = ", ".join(sorted(_unknown(self.all("extensionsRequired"))))
+            required = [name for name in self.all("extensionsRequired") if "KHR_materials_" not in name]
+            refused = ", ".join(sorted(_unknown(required)))  # those of materials are said of each
             if refused:
                 raise SpecError(f"extensionsRequired has {refused}, which is not read; export without it")
             for name in _unknown(self.document.get("extensions", ())):
@@ -129,6 +130,8 @@ class GltfFile:
 
     def _read(self, uri: str, what: str) -> bytes:
         if uri.startswith("data:"):
+            if ";base64," not in uri[:100]:
+                raise SpecError(f"{what} is in an uri that is not base64, which is not read")
             return base64.b64decode(uri.partition(",")[2])
         name = unquote(uri).replace("\\", "/")
         try:

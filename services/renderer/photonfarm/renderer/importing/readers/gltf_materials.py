@@ -256,6 +256,8 @@ def _eta(entry: Node, passes: bool, writer: Writer) -> Map:
     root = math.sqrt(min(reflectance, 0.99))
     tinted = np.ptp(colour) > 0 or any(name.endswith("Texture") for name in gloss)
     eta = (1 + root) / (1 - root)
+    if ior < 1 and passes:
+        writer.lose("KHR_materials_ior", f"{ior:g} is no index of what refracts")
     if _SPECULAR in entry and ((reflectance > 0 and tinted) or (passes and abs(ior - eta) > 1e-6)):
         writer.lose(_SPECULAR, "its reflection has no colour, no image and, on glass, no strength of its own")
     return constant(max(float(ior) if passes else eta, _DULLEST))

@@ -54,9 +54,9 @@ class Upgrade:
                 if kind in _UPGRADES:
                     _UPGRADES[kind](self, node)
                 if kind in _NEAREST:
-                    meaning = f"became {_NEAREST[kind]!r}, the nearest in Mitsuba 3"
-                    self.changes.note(meaning, elements.place(node), name=kind)
-                    node.set("type", _NEAREST[kind])
+                    made = node.get("type") if node.get("type") != kind else _NEAREST[kind]
+                    self.changes.note(f"became {made!r}, the nearest in Mitsuba 3", elements.place(node), name=kind)
+                    node.set("type", str(made))
         except ValueError as error:
             raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
 
@@ -136,6 +136,8 @@ def _bitmap(upgrade: Upgrade, texture: Element) -> None:
     is_float = Path(name).suffix.lower() in (".exr", ".hdr", ".rgbe", ".pfm")
     gamma = float(_taken(texture, "gamma", "1" if is_float else "-1"))
     channels = _taken(texture, "channel", "rgb") if not is_float else "rgb"
+    if channels not in (*"rgba", "rgb", "rgba"):
+        upgrade.lose("colour", "channel", f"{channels!r} is left out", texture)
     if gamma == 1 or channels == "a":
         elements.put_value(texture, "raw", True)
     if is_float and gamma != 1:
@@ -219,15 +221,16 @@ def _glossy(upgrade: Upgrade, bsdf: Element) -> None:
         metal.extend(part for part in bsdf if part.get("name") in ("alpha_u", "alpha_v"))  # 0.1 by default in both
     stated = elements.child(bsdf, "diffuse_reflectance")
     matt = elements.put_value(diffuse, "reflectance", (0.5, 0.5, 0.5)) if stated is None else stated
+    if matt.tag != "rgb":  # whose texels a blend would darken
+        matt.set("name", "diffuse_reflectance")
+        bsdf[:] = [matt, *(part for part in metal if part.get("name") == "alpha")]
+        bsdf.set("type", "roughplastic")
+        return
     matt.set("name", "reflectance")
     diffuse[:] = [matt]
-    base = np.array(numbers_of(matt.get("value", "")) or [1 - float(shine.max())])
+    base = np.array(numbers_of(matt.get("value", "")))
     total = min(1.0, float(base.max() + shine.max()))  # as 0.6 does, to conserve energy
-    if matt.tag == "rgb":
-        put(matt, base * total / max(float(base.max()), 1e-9))
-    else:
-        said = f"its texture becomes {float(base[0]):.2g} times as bright: the shares of a blend add up to 1"
-        upgrade.lose("colour", "diffuse_reflectance", said, bsdf)
+    put(matt, base * total / max(float(base.max()), 1e-9))
     put(elements.put_value(metal, "specular_reflectance", 0.0), np.resize(shine * total / max(*shine, 1e-9), 3))
     bsdf[:] = [diffuse, metal]
     elements.put_value(bsdf, "weight", float(shine.max() / max(1e-9, base.max() + shine.max())))

@@ -37,7 +37,8 @@ _AROUND = ("constant", "envmap", "sunsky", "timed_sunsky")
 
 _HERE = {"integrator": "all light is computed here", "sensor": "cameras are perspective here"}
 
-_USUAL = ("perspective", "path", "bdpt", "volpath", "volpathmis", "mlt", "pssmlt", "photonmapper", "sppm", "vpl")
+_USUAL = ("perspective", "path", "bdpt", "volpath", "volpathmis", "mlt", "pssmlt", "erpt", "ptracer",
+          "photonmapper", "ppm", "sppm", "vpl", "adaptive", "irrcache", "prb", "prb_basic")  # fmt: skip
 """The cameras and integrators that mean the same picture as photonfarm's own."""
 
 
@@ -178,6 +179,10 @@ def _elements(state: Any, files: _Files) -> Element:
             vars(part).update(file=str(files.originals[str(copies[node.file_index])]), line=line)
         if node.props.id():
             element.set("id", node.props.id())
+        for name in node.props:
+            value = node.props[name]
+            if node.props.type(name).name == "Transform" and not np.isfinite(np.array(value.matrix)).all():
+                raise SpecError(f"{elements.place(element)}: {name} has a number that is none")
         for part in element:
             if part.get("name", "").startswith("_arg_"):
                 del part.attrib["name"]
@@ -196,7 +201,7 @@ def _want_numbers(part: Element) -> None:
     texts = [text for key, text in holder.items() if key != "name" and part.tag in _NUMBERS]
     for word in re.findall(r"[^\s,:]+", " ".join(texts)):
         if not abs(float(word)) <= LARGEST:
-            raise SpecError(f"{elements.place(part)}: {word} is no number that can be rendered with")
+            raise SpecError(f"{elements.place(part)}: {float(word):g} is no number that can be rendered with")
 
 
 def _camera(root: Element) -> tuple[Vector | None, Vector]:

@@ -75,11 +75,15 @@ def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[
 
 def _libraries(folder: Path, stated: str, changes: Changes) -> Iterator[Path]:
     """The files of a statement, which may be several, and have spaces in their names."""
-    for name in re.findall(r"\S.*?\.mtl(?=[\"'\s]|$)", stated, re.IGNORECASE) or [stated]:
-        if file := _located(folder, name, changes):
+    words = stated.split()
+    while words:
+        ends = range(len(words), 0, -1)
+        end = next((end for end in ends if _found(folder, " ".join(words[:end]))), len(words))
+        if file := _located(folder, " ".join(words[:end]), changes):
             yield file
         else:
-            changes.lose("colour", "mtllib", "material files are not there", name)
+            changes.lose("colour", "mtllib", "material files are not there", " ".join(words))
+        words = words[end:]
 
 
 def _located(folder: Path, name: str, changes: Changes) -> Path | None:

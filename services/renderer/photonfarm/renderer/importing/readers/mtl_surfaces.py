@@ -58,7 +58,13 @@ class Surface:
                 material.say(_LOST.get(key, _UNKNOWN), word)
         illum = material.number("illum", 2)
         if illum not in _LIT:  # 10 is seen by its shadows alone
-            material.say(("colour" if illum == 10 else None, "is lit as by model 2 here"), f"illum {illum:g}")
+            material.say(
+                (
+                    "colour" if illum == 10 else None,
+                    "is lit as by model 1 here" if illum == 0 else "is lit as by model 2 here",
+                ),
+                f"illum {illum:g}",
+            )
         opacity, glow = self._opacity(illum), self._glow()
         tint = material.cut("tf", WHITE) if opacity else WHITE
         if illum in _GLASS and opacity and not self._has_image:
@@ -68,7 +74,7 @@ class Surface:
             return writer.light(glow, None, "map_Ke")
         if illum in _GLASS:
             effect: Effect | None = None if {"d", "tr"} & set(material.lines) else "colour"  # many state d 1
-            material.say((effect, "is of glass, and none here by its opacity or its images"), f"illum {illum:g}")
+            material.say((effect, "is of glass, and is not here, by its d, Tr or images"), f"illum {illum:g}")
         if min(tint) < 1:
             material.say(("colour", "does not tint the light that passes through"), "Tf")
         self._put_gloss(writer.put_layers(top, opacity, self._normals(writer)), illum, writer)
@@ -128,19 +134,24 @@ class Surface:
             return None
         if key != "norm":
             material.say((None, "has the colours of a normal map, and is taken for one"), lines[key][1])
-        return writer.normals(normals, image.triple("bm", 1.0)[0], f"{key} -s", mirrored=self.mirrored)
+        return writer.normals(normals, image.triple("bm", 1.0)[0], f"{key} -s", mirrored=self.mirrored, of_all=True)
 
     def _put_gloss(self, place: Element, illum: float, writer: Writer) -> None:
         material, ks, colour = self.material, self.material.colour("ks"), self._colour()
         alpha = max(math.sqrt(2 / (max(material.number("ns", 30.0), 0.0) + 2)), 0.02)
-        if _PBR & set(material.lines) or (max(ks) > _SHINES and illum not in (0, 1, *_MIRRORS)):
-            if max(ks) > _SHINES:
-                material.say((None, "becomes the gloss of plastic, by Ns alone"), "Ks")
-            if alpha <= _SMOOTH and not (self.coloured or _PBR & set(material.lines)):
-                parts = {"diffuse_reflectance": colour, "alpha": constant(alpha)}
+        is_glossy, is_pbr = max(ks) > _SHINES, bool(_PBR & set(material.lines))
+        if is_pbr or (is_glossy and illum not in (0, 1, *_MIRRORS)):
+            is_plastic = alpha <= _SMOOTH and not (self.coloured or is_pbr)
+            if is_glossy:
+                is_tinted = max(ks) - min(ks) > 0.1 * max(ks) and not (is_plastic or is_pbr)
+                said = "becomes the gloss of plastic, by Ns" + ", without its colour" * is_tinted
+                material.say(("colour" if is_tinted else None, said), "Ks")
+            if is_plastic:
+                tint = constant(*(max(part, 0) / max(ks) for part in ks))
+                parts = {"diffuse_reflectance": colour, "alpha": constant(alpha), "specular_reflectance": tint}
                 writer.put_surface(place, "roughplastic", parts)
-                return
-            writer.put_surface(place, "principled", self._parts(colour, math.sqrt(alpha)), painted=self.coloured)
+            else:
+                writer.put_surface(place, "principled", self._parts(colour, math.sqrt(alpha)), painted=self.coloured)
             return
         below = place
         if max(ks) > _SHINES and illum in _MIRRORS:

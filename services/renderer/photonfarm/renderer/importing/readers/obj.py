@@ -98,6 +98,7 @@ class _File:
             elif word != "#MRGB" or rest.strip("fF"):  # ZBrush's colours of vertices, which may be plain white
                 effect = _EFFECTS.get(word, "geometry")
                 meaning = "is left out" if effect else "has no surface, and is left out"
+                meaning = meaning if word in _EFFECTS else "is not read of OBJ, and is left out"
                 self.changes.say(effect, word, meaning, f"line {line}")
 
     def _add_row(self, line: int, word: str, texts: list[str]) -> None:
@@ -242,8 +243,10 @@ def _mesh(corner: _Ints, tables: _Tables, material: Material) -> Mesh:
     _, pair = np.unique(corner[:, 1] * (len(normals) + 1) + corner[:, 2], return_inverse=True)
     _, first, which = np.unique(corner[:, 0] * (pair.max() + 1) + pair, return_index=True, return_inverse=True)
     v, vt, vn = corner[first].T
-    placed = ~np.isnan(uvs[vt].sum(axis=1, keepdims=True))
-    if material.has_images and not placed.all():
+    placed = np.isfinite(uvs[vt].sum(axis=1, keepdims=True))
+    if material.has_images and not placed[vt >= 0].all():
+        material.say(("colour", "is no number on some faces, and images lie wrongly there"), "vt")
+    if material.has_images and (vt < 0).any():
         material.say((None, "some faces have none, and show one point of the images"), "vt")
     return Mesh(
         points[v, :3],

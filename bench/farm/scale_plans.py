@@ -22,7 +22,7 @@ def main() -> int:
 def costs(folder: Path, count: int) -> Costs:
     """A worker's start, keys of all samples, and a further submission, with so many plans."""
     from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.plan.sampling import modification_keys
+    from photonfarm.shared.scene.modification import modification_keys
     from photonfarm.shared.scene.spec_loading import NamedSpec
     from photonfarm.shared.store import SceneReader, Store
     from photonfarm.shared.store.write import plans
@@ -41,7 +41,7 @@ def costs(folder: Path, count: int) -> Costs:
 
         found = store.scene(spec.scene_id).plans()
         rows = np.concatenate([plan.rows.sample_modification for plan in found])
-        return modification_keys(spec, plans.vectors_at(found, "modification", rows[rows >= 0]))
+        return modification_keys(spec.scene_id, plans.vectors_at(found, "modification", rows[rows >= 0]))
 
     opened, of_keys = timed(start), timed(keys)
     more = timed(lambda: store.plan(spec, Request(modifications=FURTHER), dry_run=True))

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.keys import Stream, make_key, seed_of, view_key
-from photonfarm.shared.plan import sampling
+from photonfarm.shared.core.keys import Stream, make_key, seed_of, uniform_of, view_key
+from photonfarm.shared.scene.view import view_keys
 
 
 def test_a_key_is_the_same_on_every_machine_and_in_every_version() -> None:
@@ -26,7 +26,7 @@ def test_the_key_of_a_view_is_the_documented_one_also_of_many_at_once() -> None:
     views = np.arange(18, dtype=np.float32).reshape(3, 6)
     wanted = [make_key("view", key, view) for key, view in zip(keys, views, strict=True)]
     assert [view_key(key, view) for key, view in zip(keys, views, strict=True)] == wanted
-    assert sampling.view_keys(keys, views) == wanted
+    assert view_keys(keys, views) == wanted
 
 
 def test_seed_zero_is_a_seed_like_any_other() -> None:
@@ -48,6 +48,13 @@ def test_a_stream_is_uniform_in_mean_variance_and_lag_one_correlation() -> None:
     assert abs(z_mean) < 4
     assert abs(z_lag) < 4
     assert u.var() == pytest.approx(1 / 12, rel=0.01)
+
+
+def test_the_streams_of_many_keys_are_those_of_each() -> None:
+    """2000 keys and 7 numbers after 5: several blocks of the generator, and several chunks of keys."""
+    keys = [make_key("test", i) for i in range(2000)]
+    found = uniform_of(keys, "placement", 7, first=5)
+    assert found.tolist() == [Stream(key, "placement").uniform(12)[5:].tolist() for key in keys]
 
 
 def test_a_stream_repeats_for_its_key_and_purpose_and_for_no_other() -> None:

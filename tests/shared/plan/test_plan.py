@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import Stream, make_key
-from photonfarm.shared.plan import sampling
-from photonfarm.shared.plan.request import UNUSED, PlannedContent, PlannedRows, Request, expand, sample_key
+from photonfarm.shared.plan.request import UNUSED, PlannedContent, PlannedRows, Request, expand
 from photonfarm.shared.scene.modification import Modification, rest, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.shared.scene.view import sample_view, sample_views
 from photonfarm.shared.store import SceneStore, Store
 
 Triple = tuple[bytes, bytes, int]
@@ -234,7 +233,7 @@ class OneByOne:
     def plan(self, request: Request) -> PlannedRows | None:
         new = []
         for modification, view, pass_ in self.named(request):
-            key = sample_key(self.spec.scene_id, modification, view, pass_)
+            key = make_key("sample", self.spec.scene_id, modification.vector, view, pass_)
             if key not in self.samples:
                 self.samples.add(key)
                 new.append((modification.vector, view, pass_, key))
@@ -295,7 +294,8 @@ def test_plans_equal_those_made_sample_by_sample_to_the_bit(name: str, wanted: l
         found = expand(
             oracle.spec, request, PlannedContent(known), first_job=first_row // shard_rows, shard_rows=shard_rows
         )
-        named = {sample_key(oracle.spec.scene_id, *sample) for sample in oracle.named(request)}
+        scene_id, every = oracle.spec.scene_id, oracle.named(request)
+        named = {make_key("sample", scene_id, modification.vector, view, pass_) for modification, view, pass_ in every}
         assert found.new + found.known == len(named)
         if expected is None:
             assert found.rows is None
@@ -313,26 +313,15 @@ def test_a_fixed_camera_has_one_view_of_each_configuration_and_no_sample_twice(s
     assert len(found) == len(set(found)) == len({modification for modification, *_ in found})
 
 
-def test_many_streams_at_once_are_the_streams_one_by_one() -> None:
-    """2000 keys and 7 numbers each: several blocks of the generator, and several of streams."""
-    keys = [make_key("test", i) for i in range(2000)]
-    found = sampling._uniform(keys, 7)
-    assert found.tolist() == [Stream(key, "placement").uniform(7).tolist() for key in keys]
-
-
 def test_views_that_are_drawn_again_are_drawn_again_among_many() -> None:
     """The origin is within 1e-4 of the look-at point in one of 10 000 first draws: in 40 000, not once with 2 %."""
     tiny = 1e-5
     spec = samples.small_spec(view={"origin": box([0, 0, 0], [1, 0, 0]), "look_at": box([0, 0, 0], [tiny, 0, 0])})
     key = make_key("modification")
     count = 40_000
-    views = sampling.view_vectors(spec, [key] * count, 0, np.arange(count))
-    near = sampling._looking_at_themselves(
-        spec, np.array([[x, 0, 0, 0, 0, 0] for x in (0.5e-4, 0.99e-4, 1.1e-4)], np.float32)
-    )
-    assert near == [0, 1]
+    views = sample_views(spec, [key] * count, 0, range(count), np.ones((count, 0, 4), np.float32))
     assert (np.abs(views[:, 0] - views[:, 3]) >= 0.999e-4).all()
-    first = sampling._uniform([make_key("view", key, 0, i) for i in range(count)], 6)
+    first = np.array([Stream(make_key("view", key, 0, i), "placement").uniform(6) for i in range(count)])
     again = np.flatnonzero(first[:, 0] < 0.9e-4)
     assert len(again)
     for i in (0, count - 1, *again.tolist()):

@@ -13,8 +13,9 @@ from click.testing import CliRunner, Result
 
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.plan.request import MAX_SAMPLES, Request, sample_key
+from photonfarm.shared.plan.request import MAX_SAMPLES, Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -81,7 +82,7 @@ def test_new_passes_have_keys_of_their_own_made_of_content(scene: SceneStore) ->
         rows = scene.job_rows(job)
         for s in rows.samples:
             modification, view = rows.modifications[s.modification_row], rows.views[s.view_row]
-            assert s.key == sample_key(scene.scene_id, modification, view.vector, s.pass_)
+            assert s.key == make_key("sample", scene.scene_id, modification.vector, view.vector, s.pass_)
 
 
 def test_a_job_of_a_top_up_edits_the_scene_least(scene: SceneStore) -> None:

@@ -9,14 +9,19 @@ from scipy import stats
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.plan import sampling
 from photonfarm.shared.plan.request import PlannedContent, Request, expand
 from photonfarm.shared.scene.camera_path import CameraPath, kept_clear, orbit
 from photonfarm.shared.scene.free_space import FreeSpace, packed
-from photonfarm.shared.scene.modification import Modification, rest, sample_modification
+from photonfarm.shared.scene.modification import (
+    Modification,
+    modification_keys,
+    rest,
+    sample_modification,
+    sample_modifications,
+)
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.scene.view import in_free_space, sample_view
+from photonfarm.shared.scene.view import in_free_space, sample_view, sample_views
 
 BOX = {"min": [0.0, 0.0, 0.0], "max": [4.0, 1.0, 2.0]}
 FREE = np.ones((8, 2, 4), np.bool_)
@@ -64,16 +69,16 @@ def test_cameras_are_uniform_in_what_is_free_of_their_configuration() -> None:
 
 def test_many_views_at_once_are_those_that_are_drawn_one_by_one() -> None:
     spec = with_space()
-    vectors = sampling.modification_vectors(spec, 0, 1500)
-    keys = sampling.modification_keys(spec, vectors)
-    index = np.arange(1500) % 3
-    found = sampling.view_vectors(spec, keys, 7, index, vectors)
-    drawn_at_once = sampling.view_vectors(with_all_free(spec), keys, 7, index, vectors)
+    vectors = sample_modifications(spec, 0, range(1500))
+    keys = modification_keys(spec.scene_id, vectors)
+    index = [number % 3 for number in range(1500)]
+    found = sample_views(spec, keys, 7, index, vectors)
+    drawn_at_once = sample_views(with_all_free(spec), keys, 7, index, vectors)
     again = (found != drawn_at_once).any(axis=1)
     assert 0.1 < again.mean() < 0.6, "or this test asks nothing"
     for i in range(1500):
         configuration = Modification.from_vector(vectors[i])
-        np.testing.assert_array_equal(found[i], sample_view(spec, keys[i], 7, int(index[i]), configuration).vector)
+        np.testing.assert_array_equal(found[i], sample_view(spec, keys[i], 7, index[i], configuration).vector)
 
 
 def with_all_free(spec: SceneSpec) -> SceneSpec:
@@ -133,7 +138,7 @@ def test_a_configuration_without_any_place_for_a_camera_is_refused_and_does_not_
     with pytest.raises(SpecError):
         sample_view(spec, key, 0, 0)
     with pytest.raises(SpecError):
-        sampling.view_vectors(spec, [key], 0, np.zeros(1, np.int64))
+        sample_views(spec, [key], 0, [0], rest(spec).vector[None])
     gone = Modification(np.zeros((1, 3), np.float32), np.zeros(1, np.bool_))
     assert in_free_space(spec, sample_view(spec, key, 0, 0, gone).origin[None], gone.vector[None])[0]
 

@@ -58,10 +58,9 @@ def places_of(units: Iterable[Key]) -> list[int]:
 
     They are the first 8 bytes of the content key ("hold out", unit).
     """
-    from photonfarm.shared.core.keys import encoded, key_of  # numpy is slow to load, and the constant needs none
+    from photonfarm.shared.core.keys import make_key  # numpy is slow to load, and the constant needs none
 
-    begin = encoded("hold out")
-    return [int.from_bytes(key_of(begin + encoded(unit))[:8], "little") for unit in units]
+    return [int.from_bytes(make_key("hold out", unit)[:8], "little") for unit in units]
 
 
 def enough(units: Iterable[Key], least: float = HOLD_OUT) -> float | None:

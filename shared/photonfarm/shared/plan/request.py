@@ -29,15 +29,15 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import KEY_BYTES, Key, make_key
 from photonfarm.shared.core.models import Frozen, sentences
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.sampling import contents, modification_keys, modification_vectors, sample_keys, view_vectors
-from photonfarm.shared.scene.modification import Modification, rest
+from photonfarm.shared.scene.modification import Modification, modification_keys, rest, sample_modifications
 from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import sample_views
 
 SHARD_ROWS = 32
 """The default number of samples per job, if neither the caller nor an older plan of the scene sets it."""
 
 MAX_SHARD_ROWS = 4096
-MAX_SAMPLES = 10_000_000
+MAX_SAMPLES = 1_000_000
 """The most samples of one request: its plan is made in memory, at some 0.5 to 1 kB each, more with many groups."""
 
 UNUSED = -1
@@ -283,9 +283,10 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
     modifications, counts = _configurations(spec, request)
     of_view = np.repeat(np.arange(len(counts)), counts)
     index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
-    of_modification = modification_keys(spec, modifications)
-    standing = None if spec.view.free_space is None else modifications[of_view]
-    views = view_vectors(spec, [of_modification[m] for m in of_view.tolist()], request.seed, index, standing)
+    keys = modification_keys(spec.scene_id, modifications)
+    views = sample_views(
+        spec, [keys[m] for m in of_view.tolist()], request.seed, index.tolist(), modifications[of_view]
+    )
     modification_row = np.array([known.modifications.get(c, UNUSED) for c in contents(modifications)], np.int64)
     view_row = np.array([known.views.get(c, UNUSED) for c in view_contents(modification_row[of_view], views)], np.int64)
 
@@ -301,9 +302,20 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
     return found, len(distinct)
 
 
+def sample_keys(scene_id: str, modifications: F32, views: F32, passes: Iterable[int]) -> list[Key]:
+    """The content keys of samples of configurations (N, G, 4) and views (N, 6), by the numbers of their passes (N,)."""
+    samples = zip(modifications, views, passes, strict=True)
+    return [make_key("sample", scene_id, modification, view, int(pass_)) for modification, view, pass_ in samples]
+
+
 def sample_key(scene_id: str, modification: Modification, view: F32, pass_: int) -> Key:
     """The content key of one sample; `view` is the view's vector (6,)."""
-    return make_key("sample", scene_id, modification.vector, view, pass_)
+    return sample_keys(scene_id, modification.vector[None], view[None], [pass_])[0]
+
+
+def contents(array: F32) -> list[bytes]:
+    """The bytes of each row of an array, little-endian."""
+    return [row.tobytes() for row in np.ascontiguousarray(array, "<f4")]
 
 
 def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.int64]]:
@@ -314,7 +326,7 @@ def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.
     each = request.views_per_modification
     if not spec.groups:
         return rest(spec).vector[None], np.array([request.modifications * each])
-    vectors = modification_vectors(spec, request.seed, request.modifications)
+    vectors = sample_modifications(spec, request.seed, range(request.modifications))
     counts = Counter(contents(vectors))
     distinct = np.frombuffer(b"".join(counts), "<f4").reshape(-1, len(spec.groups), 4)
     return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)

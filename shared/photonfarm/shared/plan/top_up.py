@@ -30,9 +30,11 @@ from photonfarm.shared.plan.request import (
     Request,
     SamplesToPlan,
     pack,
+    sample_keys,
 )
-from photonfarm.shared.plan.sampling import modification_keys, sample_keys, view_keys
+from photonfarm.shared.scene.modification import modification_keys
 from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import view_keys
 
 _A_SHARE = re.compile(r"(?:\d|\d?\.\d{1,25})(?:e-\d{1,3})?")
 """A number as Python writes one between 0 and 1, such as 0.3333333333333333 or 1e-05."""
@@ -143,7 +145,7 @@ class PlannedViews:
     def modification_keys(self, views: Rows | Mask) -> list[Key]:
         """The content key of the configuration of each of some views, by their places here."""
         rows, of_view = np.unique(self.modification_row[views], return_inverse=True)
-        keys = modification_keys(self.spec, self.known.vectors("modification", rows))
+        keys = modification_keys(self.spec.scene_id, self.known.vectors("modification", rows))
         return [keys[m] for m in of_view.tolist()]
 
     def view_keys(self, views: Rows | Mask) -> list[Key]:

@@ -1,16 +1,19 @@
 """The modification vector: where each movable group stands, and whether it is there at all.
 
-Shape letters: G movable groups of a scene, its objects first and then its lights, in the order of the spec.
+Shape letters: N configurations; G movable groups of a scene, its objects first and then its lights, in the order of
+the spec.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.keys import Key, Stream, make_key
+from photonfarm.shared.core.keys import Key, make_key, uniform_of
+from photonfarm.shared.core.records import F32
 from photonfarm.shared.scene.spec import SceneSpec
 
 
@@ -33,7 +36,7 @@ class Modification:
 
     def key(self, scene_id: str) -> Key:
         """The content key of this configuration of that scene."""
-        return make_key("modification", scene_id, self.vector)
+        return modification_keys(scene_id, self.vector[None])[0]
 
 
 def rest(spec: SceneSpec) -> Modification:
@@ -41,18 +44,30 @@ def rest(spec: SceneSpec) -> Modification:
     return Modification(np.zeros((len(spec.groups), 3), np.float32), np.ones(len(spec.groups), np.bool_))
 
 
-def sample_modification(spec: SceneSpec, seed: int, index: int) -> Modification:
-    """The `index`-th random configuration of a scene under a master seed [supplement 2.4].
+def sample_modifications(spec: SceneSpec, seed: int, indices: Iterable[int]) -> F32:
+    """The random configurations of a scene with these numbers under a master seed, as vectors (N, G, 4).
 
     Each group's position is uniform in its box and independent of the others; each is removed independently with its
-    own probability; intersecting or unrealistic placements are not rejected. A static scene gives the rest state. The
-    position of a removed group is zeroed, so that equal configurations have equal keys.
+    own probability; intersecting or unrealistic placements are not rejected [supplement 2.4]. A static scene gives the
+    rest state. The position of a removed group is zeroed, so that equal configurations have equal keys.
     """
-    stream = Stream(make_key("modification", spec.scene_id, seed, index), "placement")
-    modification = rest(spec)
-    for i, group in enumerate(spec.groups):
-        position = stream.uniform_in(group.box.low, group.box.high)
-        modification.present[i] = stream.uniform(1)[0] >= group.removal_probability
-        if modification.present[i]:
-            modification.translation[i] = position - np.array(group.at)
-    return modification
+    scene_id, count = spec.scene_id, len(spec.groups)
+    keys = [make_key("modification", scene_id, seed, index) for index in indices]
+    uniform = uniform_of(keys, "placement", 4 * count).reshape(len(keys), count, 4)
+    vectors = np.zeros(uniform.shape, np.float32)
+    for g, group in enumerate(spec.groups):
+        position = group.box.low + uniform[:, g, :3] * (group.box.high - group.box.low)
+        present = uniform[:, g, 3] >= group.removal_probability
+        vectors[:, g, :3] = np.where(present[:, None], position - np.array(group.at), 0.0)
+        vectors[:, g, 3] = present
+    return vectors
+
+
+def sample_modification(spec: SceneSpec, seed: int, index: int) -> Modification:
+    """The `index`-th random configuration of a scene; see `sample_modifications`."""
+    return Modification.from_vector(sample_modifications(spec, seed, [index])[0])
+
+
+def modification_keys(scene_id: str, vectors: F32) -> list[Key]:
+    """The content keys of configurations (N, G, 4) of a scene."""
+    return [make_key("modification", scene_id, vector) for vector in vectors]

@@ -6,13 +6,14 @@ view is measured along the image's width. `depth` is the distance along the forw
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import Key, Stream, make_key
+from photonfarm.shared.core.keys import Key, make_key, uniform_of, view_key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import SceneSpec, ViewSpec
@@ -88,30 +89,48 @@ def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
+_ENDS = ("low", "high")
+
 MOST_DRAWS = 1000
 """The draws of a camera's position after which it is given up: then fewer than one in a hundred is free, or so."""
+
+
+def sample_views(
+    spec: SceneSpec, modification_keys: Sequence[Key], seed: int, indices: Sequence[int], modifications: F32
+) -> F32:
+    """Random views of configurations (N, G, 4) with these keys, under a master seed, as vectors (N, 6).
+
+    `indices` (N,) are their numbers within each configuration. Origin and look-at point are uniform in their boxes and
+    independent [supplement 2.2]. Both are drawn again where they are nearer to each other than 1e-4 of the boxes' joint
+    diagonal and, in a spec with free space, where the origin is not in it. Then origins are uniform in what is free in
+    the configuration. Raises SpecError where almost nothing is free.
+    """
+    keys = [make_key("view", key, seed, index) for key, index in zip(modification_keys, indices, strict=True)]
+    low, high = (np.concatenate([getattr(box, end) for box in (spec.view.origin, spec.view.look_at)]) for end in _ENDS)
+    corners = np.concatenate([low, high]).reshape(-1, 3)
+    least = 1e-4 * np.linalg.norm(np.ptp(corners, axis=0))
+    vectors, left = np.empty((len(keys), 6), np.float32), np.arange(len(keys))
+    for draw in range(MOST_DRAWS):
+        if not len(left):
+            return vectors
+        vectors[left] = low + uniform_of([keys[i] for i in left.tolist()], "placement", 6, 6 * draw) * (high - low)
+        origin, target = vectors[left, :3], vectors[left, 3:].astype(np.float64)
+        is_kept = np.linalg.norm(target - origin, axis=1) >= least
+        left = left[~(is_kept & in_free_space(spec, origin, modifications[left]))]
+    raise nowhere(spec)
 
 
 def sample_view(
     spec: SceneSpec, modification_key: Key, seed: int, index: int, modification: Modification | None = None
 ) -> View:
-    """The `index`-th random view of one configuration under a master seed [supplement 2.2].
+    """The `index`-th random view of one configuration, or of the scene at rest; see `sample_views`."""
+    standing = (rest(spec) if modification is None else modification).vector[None]
+    return View.from_vector(sample_views(spec, [modification_key], seed, [index], standing)[0])
 
-    Origin and look-at point are uniform in their boxes and independent. Both are drawn again where they are nearer to
-    each other than 1e-4 of the boxes' joint diagonal and, in a spec with free space, where the origin is not in it.
-    Then origins are uniform in what is free in this configuration, which is `modification`, or else the scene at rest.
-    Raises SpecError where almost nothing is free.
-    """
-    stream = Stream(make_key("view", modification_key, seed, index), "placement")
-    boxes = (spec.view.origin, spec.view.look_at)
-    diagonal = np.linalg.norm(np.max([b.high for b in boxes], axis=0) - np.min([b.low for b in boxes], axis=0))
-    vector = (rest(spec) if modification is None else modification).vector[None]
-    for _ in range(MOST_DRAWS):
-        origin, target = (stream.uniform_in(box.low, box.high).astype(np.float32) for box in boxes)
-        apart = np.linalg.norm(target.astype(np.float64) - origin.astype(np.float64)) >= 1e-4 * diagonal
-        if apart and in_free_space(spec, origin[None], vector)[0]:
-            return View(origin, target)
-    raise nowhere(spec)
+
+def view_keys(modification_keys: Iterable[Key], vectors: F32) -> list[Key]:
+    """The content keys of views (N, 6) of configurations with these keys."""
+    return [view_key(key, vector) for key, vector in zip(modification_keys, vectors, strict=True)]
 
 
 def nowhere(spec: SceneSpec) -> SpecError:

@@ -12,9 +12,9 @@ import plain_reader
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.keys import seed_of
+from photonfarm.shared.core.keys import make_key, seed_of
 from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.plan.request import Request, sample_key
+from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.format import schema
@@ -136,7 +136,7 @@ def same(reader: SceneReader, row: int, plain: Arrays) -> None:
         np.testing.assert_array_equal(plain[name], values, err_msg=name)
     assert plain["pass"] == sample.pass_
     np.testing.assert_allclose(plain["rays"], Camera.of(sample.view, reader.spec).rays(), atol=1e-6)
-    key = sample_key(reader.spec.scene_id, sample.modification, sample.view.vector, sample.pass_)
+    key = make_key("sample", reader.spec.scene_id, sample.modification.vector, sample.view.vector, sample.pass_)
     named = [(key, "half A"), (key, "half B"), (reader.modification_key(row), "photons")]
     assert plain["seeds"].tolist() == [seed_of(*purpose) for purpose in named]
 

@@ -23,9 +23,8 @@ from photonfarm.renderer.scene.visibility import sight_shares
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.waiting import Log
-from photonfarm.shared.plan.sampling import modification_vectors
 from photonfarm.shared.scene.free_space import FreeSpace, packed
-from photonfarm.shared.scene.modification import Modification, rest
+from photonfarm.shared.scene.modification import Modification, rest, sample_modifications
 from photonfarm.shared.scene.spec import Box, SceneSpec, shape_ids
 from photonfarm.shared.scene.view import in_free_space
 
@@ -141,5 +140,5 @@ def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
 def _share(spec: SceneSpec, space: FreeSpace) -> float:
     """The share of the box of origins that is free, in the mean over random configurations."""
     with_space = spec.model_copy(update={"view": spec.view.model_copy(update={"free_space": space})})
-    vectors = np.repeat(modification_vectors(with_space, 0, CONFIGURATIONS), ORIGINS, axis=0)
+    vectors = np.repeat(sample_modifications(with_space, 0, range(CONFIGURATIONS)), ORIGINS, axis=0)
     return float(in_free_space(with_space, _inside(spec.view.origin, len(vectors)), vectors).mean())

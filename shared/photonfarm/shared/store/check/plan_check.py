@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError, StoreError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.plan.request import UNUSED, PlannedRows
-from photonfarm.shared.plan.sampling import sample_keys
+from photonfarm.shared.plan.request import UNUSED, PlannedRows, sample_keys
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import schema
 from photonfarm.shared.store.io.storage import Storage

@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, store_errors
 from photonfarm.shared.core.keys import Key, view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
-from photonfarm.shared.plan.sampling import modification_keys, view_keys
-from photonfarm.shared.scene.modification import Modification
+from photonfarm.shared.scene.modification import Modification, modification_keys
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View
+from photonfarm.shared.scene.view import View, view_keys
 from photonfarm.shared.store.format import schema
 from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.format.shards import Shard
@@ -254,7 +253,7 @@ class SceneReader:
         if not len(chosen):
             return []
         distinct, place = np.unique(self._modification_row[chosen], return_inverse=True)
-        keys = modification_keys(self.spec, plans.vectors_at(self._plans, "modification", distinct))
+        keys = modification_keys(self._scene_id, plans.vectors_at(self._plans, "modification", distinct))
         return [keys[i] for i in place.tolist()]
 
     def view_keys(self, rows: Sequence[int]) -> list[Key]:

@@ -16,7 +16,8 @@ from photonfarm.shared.core.errors import CorruptError, StoreError
 from photonfarm.shared.core.keys import Key, view_key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import UNUSED
-from photonfarm.shared.plan.sampling import modification_keys, view_keys
+from photonfarm.shared.scene.modification import modification_keys
+from photonfarm.shared.scene.view import view_keys
 from photonfarm.shared.store.format import schema
 from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import renew_copy
@@ -112,7 +113,7 @@ class SceneMatch:
         """The distances of the modifications in some rows from the wanted one; infinite if other groups are present."""
         vectors = _inputs(self._plans, "modification")[rows]
         if isinstance(wanted, bytes):
-            return _unless_equal(modification_keys(self._scene.spec, vectors), wanted)
+            return _unless_equal(modification_keys(self._scene.spec.scene_id, vectors), wanted)
         if wanted.size != vectors[0].size:
             return np.full(len(rows), np.inf)
         target = wanted.reshape(vectors.shape[1:])
@@ -129,7 +130,7 @@ class SceneMatch:
             return np.asarray(np.linalg.norm(apart, axis=-1).max(axis=1))
         seen, first = np.unique(view, return_index=True)  # by some sample
         of_view = _inputs(self._plans, "modification")[modification[first[np.searchsorted(seen, rows)]]]
-        keys = modification_keys(self._scene.spec, of_view)
+        keys = modification_keys(self._scene.spec.scene_id, of_view)
         return _unless_equal(view_keys(keys, vectors), wanted)
 
     # ------------------------------------------------------------------------------------------------------- describing

@@ -78,7 +78,7 @@ def test_a_scene_in_the_place_of_a_spec(here: Path, name: str) -> None:
         (["a.obj", "b.glb", "c.png"], ["rooms: is a folder; name the scene's file in it: a.obj, b.glb"]),
         (
             ["a.xml", "b.xml", "c.xml", "d.obj", "e.obj"],
-            ["name the scene's file in it: a.xml, b.xml, c.xml and 2 more"],
+            ["name the scene's file in it: a.xml, b.xml, c.xml, d.obj and 1 more"],
         ),
     ],
 )

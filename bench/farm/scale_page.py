@@ -172,9 +172,6 @@ None of this changes the store's format, or what a commit guarantees; each has a
   times: listings by workers × markers, and commands that grew faster than the workers. Now one looks, and Redis keeps
   for two seconds what it found (`queue.look`). When nothing is left, every worker that ends with its work looks once
   more for itself. (`test_queue_look.py`)
-- **The whole plan in every worker.** A worker read all inputs of all plans and kept them. Now it reads the chunks of
-  65 536 rows that its job lies in, and keeps two of each input (`plan_rows`). Whoever fills the queue reads the chunks
-  of what it queues, so that damage still keeps jobs from being queued. (`test_plan_rows.py`)
 - **Looks at a bucket.** Each look listed every marker, a request per thousand. Now it asks for the few that are missing
   among the first ones, and lists what lies behind (`followed_markers`); all are listed again every ten minutes, or when
   something cannot be read. (`test_followed_markers.py`)

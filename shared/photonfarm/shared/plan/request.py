@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Literal, Protocol, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,47 +89,6 @@ class Request(Frozen):
             raise SpecError(f"the request: {'; '.join(sentences(error))}") from error
 
 
-InputName = Literal["modification", "view", "sample_modification", "sample_view", "sample_pass", "sample_key"]
-"""The name of one of a plan's inputs."""
-
-
-class InputRows(Protocol):
-    """What `PlannedRows` has, in memory or read when it is needed; reading raises CorruptError."""
-
-    @property
-    def modification(self) -> F32:
-        """See `PlannedRows`, as for the others."""
-
-    @property
-    def view(self) -> F32:
-        """See `PlannedRows`."""
-
-    @property
-    def sample_modification(self) -> NDArray[np.int64]:
-        """See `PlannedRows`."""
-
-    @property
-    def sample_view(self) -> NDArray[np.int64]:
-        """See `PlannedRows`."""
-
-    @property
-    def sample_pass(self) -> NDArray[np.int32]:
-        """See `PlannedRows`."""
-
-    @property
-    def sample_key(self) -> NDArray[np.uint8]:
-        """See `PlannedRows`."""
-
-    def some(self, name: InputName, rows: NDArray[np.int64]) -> NDArray[Any]:
-        """The values of an input in some rows, counted within the plan; raises IndexError for a row too many."""
-
-    def load(self) -> PlannedRows:
-        """All inputs, in memory."""
-
-    def check(self, rows: NDArray[np.int64]) -> None:
-        """Raise CorruptError if the inputs cannot be read in some rows."""
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PlannedRows:
     """The inputs of a plan, R rows each; row numbers run through all plans of a scene."""
@@ -153,27 +112,11 @@ class PlannedRows:
             np.zeros((rows, KEY_BYTES), np.uint8),
         )
 
-    def some(self, name: InputName, rows: NDArray[np.int64]) -> NDArray[Any]:
-        """The values of an input in some rows; raises IndexError for a row too many."""
-        return self.of(name)[rows]
-
-    def of(self, name: InputName) -> NDArray[Any]:
-        """An input by its name."""
-        values: NDArray[Any] = getattr(self, name)
-        return values
-
-    def load(self) -> PlannedRows:
-        """The rows themselves."""
-        return self
-
-    def check(self, rows: NDArray[np.int64]) -> None:
-        """Do nothing: they have been read."""
-
 
 class PlannedContent:
     """The content of a scene's older plans, for lookup; each table is built at its first use."""
 
-    def __init__(self, plans: Iterable[tuple[int, InputRows]] = ()) -> None:
+    def __init__(self, plans: Iterable[tuple[int, PlannedRows]] = ()) -> None:
         """Take the plans in their order, each with the number of its first row."""
         self.plans = list(plans)
 

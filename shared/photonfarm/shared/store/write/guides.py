@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from bisect import bisect_left
 from collections.abc import Callable, Sequence, Set
 from dataclasses import replace
 from pathlib import Path
@@ -36,9 +35,6 @@ GUIDES = "guides"
 """The folder of a scene's guides, below the scene's."""
 
 SETTINGS = "settings.json"
-
-LOOKED_AT = 65536
-"""The rows of views that are looked at together for what lacks guides."""
 
 NOISY = ("direct", "gloss", "point_light")
 """The guides that are sampled, with seeds of their own; they are rounded."""
@@ -158,21 +154,12 @@ def beside(plan: StoredPlan, guides: str) -> StoredPlan:
 
 
 def jobs_with_views(found: Sequence[StoredPlan], among: Sequence[int] | None = None) -> list[int]:
-    """Which jobs of plans, or which of some of them that ascend, have new views.
-
-    They are looked at a few at a time, so that little of the plans is held.
-    """
-    if among is None:
-        among = [job for plan in found for job in range(plan.first_job, plan.end_job)]
+    """Which jobs of plans, or which of some of them, have new views, in order."""
     having: list[int] = []
     for plan in found:
-        jobs = np.array(among[bisect_left(among, plan.first_job) : bisect_left(among, plan.end_job)], np.int64)
-        at_once = max(LOOKED_AT // plan.shard_rows, 1)
-        for some in (jobs[first : first + at_once] for first in range(0, len(jobs), at_once)):
-            rows = (some[:, None] - plan.first_job) * plan.shard_rows + np.arange(plan.shard_rows)
-            views = plan.rows.some("view", rows.ravel())[:, 0].reshape(rows.shape)
-            having += some[~np.isnan(views).all(axis=1)].tolist()
-    return having
+        has_views = ~np.isnan(plan.rows.view[:, 0]).reshape(-1, plan.shard_rows).all(axis=1)
+        having += (plan.first_job + np.flatnonzero(has_views)).tolist()
+    return having if among is None else sorted(set(having) & set(among))
 
 
 def has_guides(found: Sequence[StoredPlan], done: Set[int]) -> NDArray[np.bool_]:

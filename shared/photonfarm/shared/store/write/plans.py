@@ -6,8 +6,6 @@ Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job
 from __future__ import annotations
 
 import contextlib
-import json
-from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -24,8 +22,6 @@ from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import (
     UNUSED,
     Expansion,
-    InputName,
-    InputRows,
     PlannedContent,
     PlannedRows,
     Request,
@@ -36,9 +32,7 @@ from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format import declarations, schema
-from photonfarm.shared.store.format.plain_inputs import read_plain
 from photonfarm.shared.store.io.storage import Storage
-from photonfarm.shared.store.write.plan_rows import StoredRows
 
 PLANS = "plans"
 NAME_DIGITS = 6
@@ -63,7 +57,7 @@ _REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StoredPlan:
-    """One plan of a scene with its inputs, in memory or read when they are needed."""
+    """One plan of a scene with its inputs."""
 
     number: int
     folder: str  # its name in the storage
@@ -71,7 +65,7 @@ class StoredPlan:
     first_job: int
     jobs: int
     shard_rows: int
-    rows: InputRows
+    rows: PlannedRows
 
     @property
     def end_job(self) -> int:
@@ -95,8 +89,8 @@ class StoredPlan:
 
     def samples_in(self, job: int) -> int:
         """The number of samples in one of its jobs."""
-        own = (job - self.first_job) * self.shard_rows + np.arange(self.shard_rows)
-        return int(np.count_nonzero(self.rows.some("sample_modification", own) != UNUSED))
+        first = (job - self.first_job) * self.shard_rows
+        return int(np.count_nonzero(self.rows.sample_modification[first : first + self.shard_rows] != UNUSED))
 
     def shard(self, name: str, array: schema.ArraySchema, job: int) -> str:
         """The file of one job's rows of an array."""
@@ -184,27 +178,14 @@ def build(
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
-    """The plans of a scene in order with all their inputs, keeping those already loaded; all, or those before `until`.
+    """The plans of a scene in order, keeping those already loaded; all, or those before `until`.
 
     Raises CorruptError if one is missing or is not as it was written: later rows refer to its rows, and its samples
     would be planned again without end.
     """
     with store_errors("read the plans", f"{storage.where}/{scene}"):
-        found = declared(storage, scene, loaded, until=until)
-        for plan in found:
-            plan.rows.load()
-    return found
-
-
-def declared(storage: Storage, scene: str, known: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
-    """The plans of a scene in order, keeping those already known, whose inputs are read when they are needed.
-
-    It costs one listing, and one file of each new plan. Raises CorruptError if a plan is missing, or if that file is
-    not as it was written.
-    """
-    with store_errors("read the plans", f"{storage.where}/{scene}"):
-        end = count(storage, scene, len(known)) if until is None else until
-        return known + [_declared(storage, scene, n) for n in range(len(known), end)]
+        end = count(storage, scene, len(loaded)) if until is None else until
+        return loaded + [_load(storage, scene, number) for number in range(len(loaded), end)]
 
 
 def count(storage: Storage, scene: str, loaded: int = 0) -> int:
@@ -222,22 +203,17 @@ def count(storage: Storage, scene: str, loaded: int = 0) -> int:
     return found - 1 if is_being_written else found
 
 
-def _declared(storage: Storage, scene: str, number: int) -> StoredPlan:
-    """A plan by its attributes; raises CorruptError if it is missing or they are not as they were written."""
+def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
+    """A plan; raises CorruptError if it is missing or not as it was written."""
+    import zarr
+
     name = folder(scene, number)
     with _unreadable(storage, name):
-        attributes = json.loads(storage.read(f"{name}/zarr.json"))["attributes"]
-        check_version(attributes, f"{storage.where}/{name}")
-        about = about_plan(attributes)
-    rows = StoredRows(storage, name, lambda: _load(storage, name))
+        group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
+        check_version(group.attrs, f"{storage.where}/{name}")
+        about = about_plan(dict(group.attrs))
+        rows = PlannedRows(*(schema.read_input(storage, f"{name}/{each}", group[each]) for each in INPUTS))
     return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
-
-
-def _load(storage: Storage, name: str) -> PlannedRows:
-    """The inputs of a plan; raises CorruptError if one is not as it was written."""
-    with store_errors("read a plan", f"{storage.where}/{name}"), _unreadable(storage, name):
-        _, inputs = read_plain(storage, name, INPUTS) or _through_zarr(storage, name)
-        return PlannedRows(**inputs)
 
 
 @contextlib.contextmanager
@@ -249,15 +225,6 @@ def _unreadable(storage: Storage, name: str) -> Iterator[None]:
         raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {REWRITE}") from error
-
-
-def _through_zarr(storage: Storage, name: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-    """The attributes of a plan and its inputs, as zarr-python reads them; raises what it raises, and CorruptError."""
-    import zarr
-
-    group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
-    check_version(group.attrs, f"{storage.where}/{name}")
-    return dict(group.attrs), {each: schema.read_input(storage, f"{name}/{each}", group[each]) for each in INPUTS}
 
 
 def reason(error: Exception) -> str:
@@ -288,19 +255,14 @@ def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:
 
 def modification_at(plans: list[StoredPlan], row: int) -> Modification:
     """The modification in a modification row."""
-    return Modification.from_vector(_at(plans, "modification", row))
+    plan = plan_of(plans, row)
+    return Modification.from_vector(plan.rows.modification[row - plan.first_row])
 
 
 def view_at(plans: list[StoredPlan], row: int) -> View:
     """The view in a view row."""
-    return View.from_vector(_at(plans, "view", row))
-
-
-def _at(plans: list[StoredPlan], name: InputName, row: int) -> NDArray[Any]:
-    """An input in one row of the scene."""
     plan = plan_of(plans, row)
-    value: NDArray[Any] = plan.rows.some(name, np.array([row - plan.first_row]))[0]
-    return value
+    return View.from_vector(plan.rows.view[row - plan.first_row])
 
 
 def vectors_at(plans: list[StoredPlan], kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
@@ -316,11 +278,11 @@ def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:
 
 def _samples(plan: StoredPlan, rows: range) -> list[SampleRow | None]:
     """The inputs of the samples in some rows of a plan, None for unused ones."""
-    within = np.arange(rows.start, rows.stop) - plan.first_row
+    own, inputs = slice(rows.start - plan.first_row, rows.stop - plan.first_row), plan.rows
     modification, view, pass_ = (
-        plan.rows.some(name, within).tolist() for name in ("sample_modification", "sample_view", "sample_pass")
+        each[own].tolist() for each in (inputs.sample_modification, inputs.sample_view, inputs.sample_pass)
     )
-    keys = plan.rows.some("sample_key", within)
+    keys = inputs.sample_key[own]
     return [
         None if modification[i] == UNUSED else SampleRow(row, modification[i], view[i], pass_[i], keys[i].tobytes())
         for i, row in enumerate(rows)
@@ -347,14 +309,6 @@ def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
         frozenset(row for row in modifications if row in own),
         frozenset(row for row in views if row in own),
     )
-
-
-def check_inputs(plans: list[StoredPlan], jobs: list[int]) -> None:
-    """Raise CorruptError if inputs of some jobs, which ascend, are damaged; what was read before is not read again."""
-    for plan in plans:
-        own = np.array(jobs[bisect_left(jobs, plan.first_job) : bisect_left(jobs, plan.end_job)], np.int64)
-        first = (own - plan.first_job) * plan.shard_rows
-        plan.rows.check(np.concatenate([first, first + plan.shard_rows - 1]))  # a job may lie in two chunks
 
 
 def complete_rows(plans: list[StoredPlan], committed: set[int]) -> NDArray[np.bool_]:

@@ -33,9 +33,6 @@ from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
 SCENES = "scenes"
 
-CHECKED_JOBS = 10_000
-"""How many of the missing jobs are looked at for damaged inputs: as many as are queued. The next ones follow later."""
-
 _SCENE_ID = re.compile("[0-9a-f]{32}")
 
 
@@ -83,13 +80,8 @@ class SceneStore:
     # ------------------------------------------------------------------------------------------------------------ plans
 
     def plans(self) -> list[StoredPlan]:
-        """The plans that are there by now, in order, with all their inputs."""
+        """The plans that are there by now, in order."""
         self._plans = plans.load_all(self.storage, self.name, self._plans)
-        return self._plans
-
-    def _declared(self) -> list[StoredPlan]:
-        """The plans that are there by now, in order, whose inputs are read when they are needed."""
-        self._plans = plans.declared(self.storage, self.name, self._plans)
         return self._plans
 
     def plan(
@@ -146,7 +138,7 @@ class SceneStore:
     def job_rows(self, job: int) -> JobRows:
         """The inputs and outputs of a job; raises IndexError for a job of no plan."""
         if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
-            self._declared()
+            self.plans()
         return plans.job_rows(self._plans, job)
 
     def job_writer(self, job: int) -> JobWriter:
@@ -161,7 +153,7 @@ class SceneStore:
 
     def jobs(self) -> int:
         """The number of planned jobs; they are numbered from 0."""
-        found = self._declared()
+        found = self.plans()
         return found[-1].end_job if found else 0
 
     def committed_jobs(self) -> set[int]:
@@ -172,8 +164,7 @@ class SceneStore:
         """The jobs that are planned and not committed, or lack the guides that the scene has, in order.
 
         `followed` is for callers who ask often, as in `progress`: they may be told late of jobs that a repair has set
-        aside, and should ask without it before they take nothing to be missing. Raises CorruptError if inputs of the
-        first jobs are damaged: nobody could render them.
+        aside, and should ask without it before they take nothing to be missing.
         """
         rendered, guided = self._followed
         committed = rendered.look() if followed else self.committed_jobs()
@@ -182,9 +173,7 @@ class SceneStore:
         unguided = self.guides.lacks(
             self._plans, [job for job in jobs if job in committed], guided.look if followed else None
         )
-        missing = sorted(uncommitted.union(unguided))
-        plans.check_inputs(self._plans, missing[:CHECKED_JOBS])
-        return missing
+        return sorted(uncommitted.union(unguided))
 
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
@@ -202,13 +191,13 @@ class SceneStore:
         """The scene's progress; costs one listing of the markers, and of those of guides.
 
         It costs those who ask often less if it is `followed`: what a repair sets aside may then be seen late
-        (`FollowedMarkers`), and damage in inputs that are not needed is not seen.
+        (`FollowedMarkers`).
         """
         if followed:
             committed, guided = (each.look() for each in self._followed)
         else:
             committed, guided = self.committed_jobs(), self.guides.committed_jobs()
-        found = self._declared() if followed else self.plans()
+        found = self.plans()
         complete = plans.complete_rows(found, committed)
         usable = complete.copy()
         if self.guides.settings() is not None and found:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from obj_scenes import SQUARE
 from PIL import Image
 
 from photonfarm.renderer.importing.imported import ImportedScene
@@ -165,5 +166,43 @@ def case() -> Callable[[str], Path]:
         if not file.exists():
             pytest.skip(f"{name} is not there")
         return file
+
+    return make
+
+
+@pytest.fixture
+def write_obj(tmp_path: Path) -> Callable[[str, str], Path]:
+    """Function (faces, materials) → an OBJ file, with images beside it."""
+    pixels = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "four.png")
+    for name, value in (("full.png", 255), ("none.png", 0)):
+        Image.fromarray(np.full((2, 2), value, np.uint8)).save(tmp_path / name)
+
+    def make(faces: str, materials: str) -> Path:
+        (tmp_path / "it.mtl").write_text(materials)
+        (tmp_path / "it.obj").write_text(f"mtllib it.mtl\n{SQUARE}{faces}\n")
+        return tmp_path / "it.obj"
+
+    return make
+
+
+@pytest.fixture
+def obj(tmp_path: Path) -> Callable[[str | bytes], Path]:
+    """Function (text) → an OBJ file."""
+
+    def make(text: str | bytes) -> Path:
+        (tmp_path / "it.obj").write_bytes(text if isinstance(text, bytes) else text.encode())
+        return tmp_path / "it.obj"
+
+    return make
+
+
+@pytest.fixture
+def write_xml(tmp_path: Path) -> Callable[..., Path]:
+    """Function (content, version) → a scene file."""
+
+    def make(content: str, version: str = "3.0.0") -> Path:
+        (tmp_path / "scene.xml").write_text(f'<scene version="{version}">\n{content}\n</scene>')
+        return tmp_path / "scene.xml"
 
     return make

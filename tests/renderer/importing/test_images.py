@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.importing.readers import images
+from photonfarm.renderer.importing import images
 from photonfarm.shared.core.errors import SpecError
 
 

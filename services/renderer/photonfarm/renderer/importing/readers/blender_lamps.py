@@ -7,22 +7,19 @@ point is the limit r → 0. Objects scale areas and the cones of spots, not radi
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing import elements, images
 from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.readers import images
+from photonfarm.renderer.importing.meshes import Floats
+from photonfarm.renderer.importing.spots import WIDEST, Profile, cone_image, put_cone
 
-Floats = NDArray[np.float64]
 Lamp = dict[str, Any]
 Sky = list[float] | str
-Profile = Callable[[Floats, Floats], Floats]
 
 AXES = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """The map of Blender's coordinates, z up, to glTF's, y up."""
@@ -35,8 +32,6 @@ PARTS = 16
 
 SHARP = math.radians(1.0)
 """A sun that is no wider is one direction; a wider one is a disc of the sky."""
-
-WIDEST = math.radians(89.5)
 
 
 class Lamps:
@@ -159,20 +154,6 @@ class Lamps:
         self._scene.objects[made.get("id", "")] = name
         self._scene.changes.note("cameras see it, which they do in Blender only if told to", f"lamp {name!r}")
         return made
-
-
-def cone_image(profile: Profile, cut: float, file: Path) -> Path:
-    """The image of a spot within an angle; `profile`: its share at tangents (x, y) off the axis."""
-    texels = 1024 if cut < math.radians(80) else 2048  # as tangents are large there
-    y, x = np.meshgrid(*[math.tan(cut) * (2 * (np.arange(texels) + 0.5) / texels - 1)] * 2, indexing="ij")
-    return images.save(profile(x, y).astype(np.float32), file)
-
-
-def put_cone(spot: Element, cut: float, file: Path) -> None:
-    """Let a spot end at an angle and fade as an image says."""
-    elements.put_value(spot, "cutoff_angle", math.degrees(cut))
-    elements.put_value(spot, "beam_width", math.degrees(cut) * 0.999)
-    elements.put_value(elements.put_bitmap(spot, "texture", file, raw=True), "wrap_mode", "clamp")
 
 
 def _intensity(lamp: Lamp, strength: Floats) -> Floats:

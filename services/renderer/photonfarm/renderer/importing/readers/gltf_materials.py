@@ -15,11 +15,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from photonfarm.renderer.importing import images
 from photonfarm.renderer.importing.imported import Ids
 from photonfarm.renderer.importing.meshes import Floats
-from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.gltf_file import GltfFile, Node, extension, numbers
-from photonfarm.renderer.importing.readers.surfaces import Lie, Map, Writer, constant
+from photonfarm.renderer.importing.surfaces import Lie, Map, Writer, constant
 
 _OLD = "KHR_materials_pbrSpecularGlossiness"
 _PASSES, _COAT, _SPECULAR = "KHR_materials_transmission", "KHR_materials_clearcoat", "KHR_materials_specular"

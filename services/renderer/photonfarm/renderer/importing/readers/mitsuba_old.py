@@ -14,9 +14,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing import elements, images
 from photonfarm.renderer.importing.changes import Changes, Effect
-from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.mitsuba_spectra import numbers_of, of_old, put
 from photonfarm.shared.core.errors import SpecError
 

@@ -8,8 +8,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.readers import images
+from photonfarm.renderer.importing import elements, images
 
 Colour = NDArray[np.float64]
 """Linear sRGB, (3,)."""

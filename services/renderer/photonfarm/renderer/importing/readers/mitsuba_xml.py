@@ -21,7 +21,7 @@ from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.located_xml import line_of, parse
 
 OLDEST, MITSUBA_2 = (0, 4), (2,)
-"""Mitsuba 3 reads what is of this version or newer."""
+"""The oldest version that is read, and the first one that Mitsuba 3 reads as it is."""
 
 _NUMBERS = ("float", "rgb", "vector", "spectrum", "transform")
 """The elements that hold numbers."""

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as Pillow
 
+from photonfarm.renderer.importing import images
 from photonfarm.renderer.importing.changes import Changes, Effect
-from photonfarm.renderer.importing.readers import images
-from photonfarm.renderer.importing.readers.surfaces import Lie, Map
+from photonfarm.renderer.importing.surfaces import Lie, Map
 from photonfarm.shared.core.errors import SpecError
 
 Meaning = tuple[Effect | None, str]

@@ -9,11 +9,10 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing import elements, images
 from photonfarm.renderer.importing.changes import Effect
-from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.mtl import RELIEFS, WHITE, Material, Meaning
-from photonfarm.renderer.importing.readers.surfaces import Map, Writer, constant
+from photonfarm.renderer.importing.surfaces import Map, Writer, constant
 
 _PRINCIPLED = {"pr": ("roughness", 0.5), "pm": ("metallic", 0.0), "ps": ("sheen", 0.0), "pc": ("clearcoat", 0.0),
                "aniso": ("anisotropic", 0.0)}  # fmt: skip

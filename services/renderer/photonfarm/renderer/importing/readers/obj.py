@@ -16,10 +16,10 @@ import numpy as np
 from mapbox_earcut import triangulate_float64
 from numpy.typing import NDArray
 
+from photonfarm.renderer.importing import images
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh, unit
-from photonfarm.renderer.importing.readers import images
 from photonfarm.renderer.importing.readers.mtl import WHITE, Material, read_libraries, statements
 from photonfarm.renderer.importing.readers.mtl_surfaces import Surface
 from photonfarm.shared.core.errors import SpecError

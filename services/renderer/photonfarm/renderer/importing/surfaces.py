@@ -13,9 +13,8 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
-from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing import elements, images
 from photonfarm.renderer.importing.changes import Changes, Effect
-from photonfarm.renderer.importing.readers import images
 
 _COLOURS = ("base_color", "reflectance", "diffuse_reflectance")  # the properties that may be images of colour
 _MOST_PADDING = 8192  # texels by which an image grows where it is clamped along one axis alone

@@ -1,0 +1,86 @@
+"""What tests of OBJ and MTL have in common: small texts, and what rays find of what is made of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from photonfarm.renderer.importing.imported import ImportedScene
+
+Loaded = Callable[[Path], tuple[ImportedScene, Any]]
+
+
+SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
+
+
+FOUR = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
+
+
+CORNERS = ((0.25, 0.75), (0.75, 0.75), (0.25, 0.25), (0.75, 0.25))
+"""Where four.png has the middles of its texels on the square."""
+
+
+WHOLE = "usemtl it\nf 1/1 2/2 3/3 4/4"
+
+
+def hit(made: Any, x: float, y: float, side: float = 5) -> Any:
+    """What a ray down at (x, y) meets, or up if it comes from below."""
+    return made.ray_intersect(mi.Ray3f(mi.Point3f(x, y, side), mi.Vector3f(0, 0, -1 if side > 0 else 1)))
+
+
+def meets(made: Any, x: float, y: float) -> bool:
+    """Whether a ray down at (x, y) meets anything."""
+    return bool(np.array(hit(made, x, y, 50).is_valid()).ravel()[0])
+
+
+def reflectance(made: Any, x: float, y: float) -> np.ndarray:
+    """The diffuse reflectance of what a ray down at (x, y) meets."""
+    si = hit(made, x, y)
+    return np.array(si.bsdf().eval_diffuse_reflectance(si)).ravel()
+
+
+def opacity(made: Any, x: float, y: float) -> float:
+    """The opacity of what a ray down at (x, y) meets."""
+    si = hit(made, x, y)
+    return 1 - float(np.array(si.bsdf().eval_null_transmission(si)).ravel()[0])
+
+
+def emission(made: Any, x: float, y: float, side: float = 5) -> np.ndarray:
+    """What is emitted towards a ray down at (x, y)."""
+    si = hit(made, x, y, side)
+    return np.array(si.emitter(made).eval(si)).ravel()
+
+
+def scattered(made: Any, *light: float) -> float:
+    """What of light from a direction the square at (0.4, 0.3) sends upwards."""
+    si = hit(made, 0.4, 0.3)
+    towards = si.to_local(mi.Vector3f(*(part / float(np.linalg.norm(light)) for part in light)))
+    return float(np.array(si.bsdf().eval(mi.BSDFContext(), si, towards)).ravel()[0])
+
+
+def area(made: Any) -> float:
+    """The area of all shapes."""
+    return sum(float(np.array(shape.surface_area()).ravel()[0]) for shape in made.shapes())
+
+
+def said(scene: ImportedScene) -> str:
+    """All changes."""
+    return "\n".join(map(str, scene.changes))
+
+
+def lost(scene: ImportedScene) -> dict[str, str]:
+    """The effects of all changes that are refused, by their names."""
+    return {change.name: change.effect for change in scene.changes if change.effect is not None}
+
+
+Obj = Callable[[str | bytes], Path]
+
+
+Write = Callable[[str, str], Path]
+
+
+FOUR_V = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"

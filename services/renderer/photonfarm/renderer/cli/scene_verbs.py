@@ -17,7 +17,8 @@ from photonfarm.shared.core.waiting import waiting
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="SPEC",
-              help="The spec to write; the scene goes into a folder beside it.  [default: as PATH]")  # fmt: skip
+              help="The spec to write; the scene goes into a folder beside it.  "
+                   "[default: in this folder, named as PATH]")  # fmt: skip
 @click.option("--up", type=click.Choice(["x", "y", "z"]),
               help="The axis that points up.  [default: as the file says, or else y]")  # fmt: skip
 @click.option("--accept", multiple=True, metavar="NAME",
@@ -45,7 +46,7 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
         return
     for line in (*map(str, made.changes), *made.found):
         click.echo(line)
-    command = f"photonfarm up {quote(str(made.spec))} --modifications 64"
+    command = f"photonfarm up {quote(str(made.spec))} --modifications 64 --train-steps 0"
     click.echo(f"{made.spec} and {made.folder} are written; see it by: {command}")
 
 

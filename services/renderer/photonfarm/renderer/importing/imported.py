@@ -73,7 +73,7 @@ class ImportedScene:
         Mitsuba's shine from the front alone, so a second sheet behind the first shines from the back.
         """
         if light is not None and mesh.normals is not None:
-            self.changes.note("emits light, and so gets the normals of its faces", made)
+            self.changes.note("lights are flat here: smooth normals of their meshes are left out", made)
         mesh = mesh.usable(made, self.changes, smooth=light is None)
         if not len(mesh.faces):
             return

@@ -197,7 +197,9 @@ def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
             element[:] = [part for part in element if part.get("name") != "face_normals"]
             elements.put_value(element, "face_normals", True)
     if smooth:
-        scene.changes.note(f"{listed(sorted(smooth))}: emits light, and so got the normals of its faces")
+        scene.changes.note(
+            f"{listed(sorted(smooth))}: lights are flat here: smooth normals of their meshes are left out"
+        )
 
 
 def shapes_of_things(

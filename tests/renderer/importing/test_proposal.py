@@ -163,6 +163,48 @@ def test_a_lamp_moves_with_what_it_stands_on_and_hangs_by(
     assert all(movable.thing.emits for movable in found.movables)
 
 
+@pytest.mark.parametrize("at", [(4.2, 1.45, 0.8), (4.2, 1.8, 0.8), (0.9, 1.05, 3.2)])
+def test_a_lamp_stays_around_a_light_without_a_shape_and_it_is_said_why(
+    room: None, put: Callable[..., None], gltf: Any, tmp_path: Path, at: Any
+) -> None:
+    put("Foot", (4.05, 0, 0.65), (4.35, 1.3, 0.95))
+    put("Shade", (4, 1.3, 0.6), (4.4, 1.6, 1))  # the light is in it, or 20 cm above it
+    put("Desk", (0.5, 0, 3), (1.3, 0.75, 3.7))
+    put("DeskLamp", (0.8, 0.75, 3.1), (1, 1, 3.3))  # a light is 5 cm above it
+    gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point", "name": "Bulb"}]}}
+    gltf.node("Bulb", translation=list(at), extensions={"KHR_lights_punctual": {"light": 0}})
+    found, _ = proposed(gltf.write(), tmp_path)
+    lamp, desk = ["Foot", "Shade"], ["Desk", "DeskLamp"]
+    ((reason, names),) = found.stays.items()
+    assert "light that has no shape" in reason
+    assert names == (lamp if at[0] > 4 else desk)
+    moves = sorted(movable.thing.name for movable in found.movables)
+    assert moves == (["Desk", "Table"] if at[0] > 4 else ["Foot", "Table"])
+
+
+@pytest.mark.parametrize("height", [0.05, 0.4, 1.9])
+def test_nothing_is_proposed_to_stand_over_a_light_without_a_shape(tmp_path: Path, height: float) -> None:
+    def cube(name: str, half: str, at: str, more: str = "") -> str:
+        move = f"<scale value='{half}'/><translate value='{at}'/>"
+        return f"<shape type='cube' id='{name}'><transform name='to_world'>{move}</transform>{more}</shape>"
+
+    shell = cube("Shell", "2.5 1.3 2", "2.5 1.3 2", "<boolean name='flip_normals' value='true'/>")
+    places = [(1.2, 1), (1.2, 3), (4, 1), (4, 3)]
+    at = [f"x='{x}' y='{height}' z='{z}'" for x, z in places]
+    points = [f"<emitter type='point'><point name='position' {place}/></emitter>" for place in at[:2]]
+    spots = [
+        f"<emitter type='spot'><transform name='to_world'><translate {place}/></transform></emitter>"
+        for place in at[2:]
+    ]
+    file = tmp_path / "room.xml"
+    content = "".join([shell, cube("Wardrobe", "0.3 0.95 0.3", "2.5 0.95 2"), *points, *spots])
+    file.write_text(f"<scene version='3.0.0'>{content}</scene>")
+    (movable,) = proposed(file, tmp_path)[0].movables
+    low, high = (movable.box.low - movable.thing.size / 2)[:2], (movable.box.high + movable.thing.size / 2)[:2]
+    assert (high - low > 0.7).all()
+    assert all(((place < low) | (place > high)).any() for place in places)
+
+
 def test_a_tube_moves_though_it_is_nearly_as_long_as_the_room(
     room: None, put: Callable[..., None], gltf: Any, tmp_path: Path
 ) -> None:

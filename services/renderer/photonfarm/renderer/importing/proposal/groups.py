@@ -54,6 +54,7 @@ IN_WALL = "in a wall or window"
 IN_CEILING = "set into the ceiling, which has a hole there"
 LARGE = "as large as the room or its ceiling"
 HELD = "on or in something that stays, or in the air"
+AT_LIGHT = "around or beside a light that has no shape"
 MANY = "as only the largest are proposed to move"
 OUTSIDE = "outside the room"
 NO_ROOM = "as nothing is proposed to move where there is no room"
@@ -88,7 +89,7 @@ class Found(NamedTuple):
     room: Room
     pieces: Pieces
     things: list[Thing]  # the largest first
-    stays: dict[str, list[str]]  # the names of lights that stay, by the reason
+    stays: dict[str, list[str]]  # the names of lights that stay, and of what stays with one, by the reason
 
     @property
     def moving(self) -> set[int]:
@@ -114,20 +115,21 @@ class _Search:
         why = np.where(glows, self._why_fixed(), MOVES)
         loose = np.where(glows, why == MOVES, ~self._is_shell()) & (not self.room.is_stage)
         group = self._grouped(loose, glows)
-        things = []
+        things, lit = [], self._at_lights(group)
         for number, built_in in enumerate(self._built_in(group)):
             thing = self._thing(np.flatnonzero(group == number), bool(built_in))
-            if isinstance(thing, Thing):
+            if isinstance(thing, Thing) and not lit[number]:
                 things.append(thing)
             else:
-                why[group == number] = thing
+                why[group == number] = AT_LIGHT if isinstance(thing, Thing) else thing
         things.sort(key=self._order)
         kept = [thing for emits in (False, True) for thing in [t for t in things if t.emits == emits][:MOST]]
         for thing in things:
             if thing not in kept:
                 why[thing.pieces] = MANY
         stays: dict[str, list[str]] = {}
-        for name, reason in {self._called(pieces.shape[one]): why[one] for one in np.flatnonzero(glows)}.items():
+        told = np.flatnonzero(glows | (why == AT_LIGHT))
+        for name, reason in {self._called(pieces.shape[one]): why[one] for one in told}.items():
             if reason != MOVES:
                 stays.setdefault(str(reason), []).append(name)
         return Found(self.room, pieces, _named_apart(kept), stays)
@@ -212,11 +214,17 @@ class _Search:
         joined = []
         for number in np.flatnonzero(~held & ~stands):
             others = ends[ends != number]
-            gap = np.maximum(0, np.maximum(low[others] - high[number], low[number] - high[others]))
-            distance = np.linalg.norm(gap, axis=1)
+            distance = _distance(low[others], high[others], low[number], high[number])
             if distance.min(initial=np.inf) < FLOATS * room.height:
                 joined.append((number, others[int(np.argmin(distance))]))
         return np.array(joined, np.int64).reshape(-1, 2)
+
+    def _at_lights(self, group: Labels) -> NDArray[np.bool_]:
+        """Which groups are around a light without a shape or, where none is, nearest to it and near, (T,)."""
+        light = self.surfaces.lights[:, None]
+        distance = _distance(*self._bounds(group), light, light)
+        nearest = distance.min(axis=1, initial=FLOATS * self.room.height, keepdims=True)
+        return np.asarray((distance <= nearest).any(axis=0))
 
     def _built_in(self, group: Labels) -> NDArray[np.bool_]:
         """Which groups share much of their surface with the room, above the floor, or reach into its walls, (T,)."""
@@ -299,6 +307,12 @@ class _Search:
         shining = {self._called(shape) for shape in self.pieces.shape[members] if self.surfaces.emits[shape]}
         wishes = [name for name in counting if is_furniture(name)] + [name for name in ordered if name in shining]
         return group_name([*wishes, ordered[0]][0])
+
+
+def _distance(low: Points, high: Points, from_low: Points, from_high: Points) -> NDArray[np.float64]:
+    """The distances of boxes from others, by their corners (…, 3); 0 where they meet."""
+    gap = np.maximum(0, np.maximum(low - from_high, from_low - high))
+    return np.asarray(np.linalg.norm(gap, axis=-1))
 
 
 def _merged(group: Labels, pairs: Labels) -> Labels:

@@ -46,16 +46,17 @@ class FloorPlan:
     room: Room
     fixed: Points  # (M, 3)
     flat: Mask  # (M,): which of them lie on what is level
+    lights: Points  # (L, 3): where lights without a shape are
     cell: float
     shape: tuple[int, int]
 
     @classmethod
-    def of(cls, pieces: Pieces, room: Room, fixed_pieces: Mask) -> Self:
+    def of(cls, pieces: Pieces, room: Room, fixed_pieces: Mask, lights: Points) -> Self:
         """The plan of a room; `fixed_pieces` (N,) are those that do not move."""
         cell = float(room.size[:2].max()) / CELLS
         a, b = (int(n) for n in np.maximum(np.ceil(room.size[:2] / cell), 1))
         chosen = fixed_pieces[pieces.sample_piece]
-        return cls(room, pieces.sample[chosen], pieces.sample_flat[chosen], cell, (a, b))
+        return cls(room, pieces.sample[chosen], pieces.sample_flat[chosen], lights, cell, (a, b))
 
     def _marked(self, points: Points) -> Mask:
         place = np.floor((points[:, :2] - self.room.low[:2]) / self.cell).astype(np.int64)
@@ -64,15 +65,18 @@ class FloorPlan:
         mask[tuple(place[inside].T)] = True
         return mask
 
+    def met(self, points: Points, half: Points) -> Mask:
+        """Where a box of half-lengths `half` (2,), by its middle, holds one of the points, or leaves the room."""
+        size = 2 * np.ceil(half / self.cell).astype(int) + 1
+        return np.asarray(ndimage.maximum_filter(self._marked(points), size=tuple(size), mode="constant", cval=1))
+
     def free(self, bottom: float, top: float, half: Points, level: float) -> Mask:
         """Where the middle of a box of half-lengths `half` (2,) may be: at a floor or ceiling, and nothing in its way.
 
         `level` is the height of that, which may have small gaps, and does not count if there is next to none.
         """
         height = self.fixed[:, 2]
-        blocked = self._marked(self.fixed[(height > bottom) & (height < top)])
-        reach = np.ceil(half / self.cell).astype(int)
-        blocked = ndimage.maximum_filter(blocked, size=tuple(2 * reach + 1), mode="constant", cval=1)
+        blocked = self.met(self.fixed[(height > bottom) & (height < top)], half)
         there = self._marked(self.fixed[self.flat & (np.abs(height - level) < NEAR_FLOOR * self.room.height)])
         there |= ndimage.binary_closing(there, iterations=2, border_value=0)
         free: Mask = ~blocked & (there | (there.mean() <= 0.05))
@@ -133,7 +137,7 @@ class Proposal:
     movables: list[Movable]
     views: list[View]  # the best first; the others are for scenes in which nothing of it is free
     light: Ceiling  # for a scene that has none, or too little
-    stays: dict[str, list[str]]  # the names of lights that do not move, by the reason
+    stays: dict[str, list[str]]  # the names of lights that do not move, and of what stays with one, by the reason
     has_others: bool  # whether things stand in other rooms, too
     shape: NDArray[np.int32]  # (F,): the number of each triangle's shape
     thing: NDArray[np.int64]  # (F,): the number of the movable that it belongs to, or −1
@@ -153,7 +157,7 @@ def propose(scene: Any, frame: Frame, camera: Points | None, objects: Mapping[st
     views = _around(surfaces.main(), frame, camera)
     plan, movables = None, []
     if not room.is_stage:
-        plan = FloorPlan.of(pieces, room, moves < 0)
+        plan = FloorPlan.of(pieces, room, moves < 0, surfaces.lights)
         movables = [_movable(thing, plan) for thing in things]
         origin = _origin(plan, scene, frame)
         views.insert(0, View(origin, _look_at(movables, room, origin)))
@@ -223,13 +227,14 @@ def _place(
     plan: FloorPlan, middle: Points, size: Points, bottom: float, top: float, *, hangs: bool
 ) -> tuple[Points, Points] | None:  # fmt: skip
     """The corners (2,) of where the middle (2,) of something may be, near to where it is; None if nowhere."""
-    room, clear = plan.room, NEAR * plan.room.height
+    room, clear, height = plan.room, NEAR * plan.room.height, plan.lights[:, 2]
+    lights = plan.lights[(height > bottom - clear) & (height < top + clear)]
     if hangs:
         top = min(top, room.high[2] - PLANE * room.height)
         bottom = min(bottom, top - clear)
     else:
         bottom += clear
-    free = plan.free(bottom, top, size / 2, room.high[2] if hangs else room.floor)
+    free = plan.free(bottom, top, size / 2, room.high[2] if hangs else room.floor) & ~plan.met(lights, size / 2)
     return plan.box_around(free, middle, RANGE * room.size[:2])
 
 

@@ -73,6 +73,7 @@ class Surfaces:
     shape: NDArray[np.int32]  # (F,)
     area: NDArray[np.float64]  # (F,)
     facing_up: NDArray[np.float64]  # (F,): the height component of the normal, without its sign
+    lights: Points  # (L, 3): where lights without a shape are
 
     @classmethod
     def of(cls, scene: Any, frame: Frame) -> Self:
@@ -88,7 +89,8 @@ class Surfaces:
         length = np.linalg.norm(across, axis=1)
         facing = np.abs(across[:, 2]) / np.maximum(length, 1e-30)
         emits = np.array([shape.is_emitter() for shape in shapes])
-        return cls([shape.id() for shape in shapes], emits, corners, geometry.face_shape, length / 2, facing)
+        ids, lights = [shape.id() for shape in shapes], frame.inward(_lights_without_shape(scene))
+        return cls(ids, emits, corners, geometry.face_shape, length / 2, facing, lights)
 
     @property
     def extent(self) -> Box:
@@ -109,6 +111,19 @@ class Surfaces:
         area = np.bincount(self.shape, self.area, len(self.ids))[order]
         kept = order[part == np.argmax(np.bincount(part, area))]
         return Box(low[kept].min(axis=0), high[kept].max(axis=0))
+
+
+def _lights_without_shape(scene: Any) -> NDArray[np.float64]:
+    """Where the points, spots and projectors of a scene are, (L, 3)."""
+    import mitsuba as mi
+
+    places = []
+    for light in scene.emitters():
+        if mi.has_flag(light.flags(), mi.EmitterFlags.DeltaPosition):
+            box = light.bbox()  # of a point, that is all that says where it is; a projector has none
+            place = box.min if box.valid() else light.world_transform().translation()
+            places.append(np.array(place, np.float64).ravel())
+    return np.array(places).reshape(-1, 3)
 
 
 def bounds(label: NDArray[np.integer[Any]], count: int, lower: Points, upper: Points) -> tuple[Points, Points]:

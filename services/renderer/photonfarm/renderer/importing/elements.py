@@ -56,13 +56,6 @@ def mesh_shape(parent: Element, shape_id: str, *, faceted: bool) -> Element:
     return shape
 
 
-def area_light(radiance: Sequence[float]) -> Element:
-    """An emitter that lets a shape emit a colour."""
-    emitter = Element("emitter", type="area")
-    put_value(emitter, "radiance", radiance)
-    return emitter
-
-
 def put_sky(scene: Element) -> None:
     """Surround a scene by white light."""
     put_value(SubElement(scene, "emitter", type="constant"), "radiance", (1.0, 1.0, 1.0))

@@ -20,10 +20,10 @@ ID_LENGTH = 64
 
 
 class Ids:
-    """Distinct ids of shapes and materials, made of names that may be anything."""
+    """Distinct ids of shapes and materials, made of names that may be anything; those in `root` are taken."""
 
-    def __init__(self) -> None:
-        self._taken: set[str] = set()
+    def __init__(self, root: Element | None = None) -> None:
+        self._taken = {node.get("id", "") for node in ([] if root is None else root.iter())}
 
     def make(self, name: str, otherwise: str = "shape") -> str:
         """An id like `name`, with a number behind it if the name itself is taken."""
@@ -34,13 +34,6 @@ class Ids:
             made = f"{stem}_{number}"
         self._taken.add(made)
         return made
-
-    def keep(self, name: str) -> bool:
-        """Take a name as it is; False if it is taken."""
-        if name in self._taken:
-            return False
-        self._taken.add(name)
-        return True
 
 
 @dataclass(slots=True)

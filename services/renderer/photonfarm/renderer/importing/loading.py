@@ -166,8 +166,7 @@ def _move(scene: ImportedScene, node: Element, by: Floats, factor: float) -> Non
         for axis, part in zip("xyz", by, strict=True):
             place.set(axis, f"{(float(place.get(axis, '0')) + part) * factor:.10g}")
         return
-    transform = elements.child(node, "to_world")
-    if transform is None:
+    if (transform := elements.child(node, "to_world")) is None:
         transform = SubElement(node, "transform", name="to_world")
     SubElement(transform, "translate", {axis: f"{part:.10g}" for axis, part in zip("xyz", by, strict=True)})
     SubElement(transform, "scale", value=f"{factor:g}")
@@ -197,9 +196,8 @@ def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
             element[:] = [part for part in element if part.get("name") != "face_normals"]
             elements.put_value(element, "face_normals", True)
     if smooth:
-        scene.changes.note(
-            f"{listed(sorted(smooth))}: lights are flat here: smooth normals of their meshes are left out"
-        )
+        meaning = "lights are flat here: smooth normals of their meshes are left out"
+        scene.changes.note(f"{listed(sorted(smooth))}: {meaning}")
 
 
 def shapes_of_things(
@@ -209,9 +207,7 @@ def shapes_of_things(
 
     `shape_of` and `thing_of` (F,) are the numbers of each face's shape and thing, which is −1 for the room.
     """
-    ids = Ids()
-    for node in scene.root.iter():
-        ids.keep(node.get("id", ""))
+    ids = Ids(scene.root)
     found: list[list[str]] = [[] for _ in range(int(thing_of.max(initial=-1)) + 1)]
     split = []
     for number, shape in enumerate(loaded.shapes()):

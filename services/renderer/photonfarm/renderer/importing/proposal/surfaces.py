@@ -24,7 +24,6 @@ Labels = NDArray[np.int64]
 SECTIONS = 24
 """Of round shapes, of which a scene may have thousands: 576 triangles of a sphere, within 1 % of it."""
 
-
 SAMPLES_PER_CELL = 4.0
 """Points on a surface for each area of a cell's side, so that few cells that it crosses have none."""
 
@@ -114,16 +113,12 @@ class Surfaces:
 
 
 def _lights_without_shape(scene: Any) -> NDArray[np.float64]:
-    """Where the points, spots and projectors of a scene are, (L, 3)."""
+    """Where the points, spots and projectors of a scene are, (L, 3); of these, projectors have no box."""
     import mitsuba as mi
 
-    places = []
-    for light in scene.emitters():
-        if mi.has_flag(light.flags(), mi.EmitterFlags.DeltaPosition):
-            box = light.bbox()  # of a point, that is all that says where it is; a projector has none
-            place = box.min if box.valid() else light.world_transform().translation()
-            places.append(np.array(place, np.float64).ravel())
-    return np.array(places).reshape(-1, 3)
+    lights = [each for each in scene.emitters() if mi.has_flag(each.flags(), mi.EmitterFlags.DeltaPosition)]
+    places = [box.min if (box := each.bbox()).valid() else each.world_transform().translation() for each in lights]
+    return np.array([np.array(place).ravel() for place in places], np.float64).reshape(-1, 3)
 
 
 def bounds(label: NDArray[np.integer[Any]], count: int, lower: Points, upper: Points) -> tuple[Points, Points]:

@@ -150,7 +150,7 @@ class Lamps:
         """Add a black shape that emits."""
         made = SubElement(self._scene.root, "shape", type=kind, id=self._scene.ids.make(name, "lamp"))
         elements.put_value(SubElement(made, "bsdf", type="diffuse"), "reflectance", (0.0, 0.0, 0.0))
-        made.append(elements.area_light(radiance.tolist()))
+        elements.put_value(SubElement(made, "emitter", type="area"), "radiance", radiance.tolist())
         self._scene.objects[made.get("id", "")] = name
         self._scene.changes.note("cameras see it, which they do in Blender only if told to", f"lamp {name!r}")
         return made

@@ -269,8 +269,7 @@ def _sky(upgrade: Upgrade, emitter: Element) -> None:
         own = _taken(emitter, f"{part}_scale", scale)
         elements.put_value(emitter, f"{part}_scale", float(own) if part in kind else 0.0)
     elements.put_value(emitter, "sun_aperture", 0.5358 * (float(_taken(emitter, "sun_radius_scale", "1")) or 0.02))
-    placed = elements.child(emitter, "to_world")
-    if placed is None:
+    if (placed := elements.child(emitter, "to_world")) is None:
         placed = SubElement(emitter, "transform", name="to_world")
     of_place = Element("matrix", value="0 -1 0 0 0 1 1 0 0")
     is_of_place = elements.child(emitter, "sun_direction") is None

@@ -154,11 +154,8 @@ def expand(root: Element, changes: Changes, scratch: Path) -> None:
     """Put copies of its group's shapes, which can move and be sampled as lights, in the place of each instance."""
     groups = {group.get("id"): group for group in root.findall("shape[@type='shapegroup']")}
     copies: dict[Element, list[Element]] = {}
-    ids = Ids()
-    for node in root.iter():
-        ids.keep(node.get("id", ""))
+    ids, made = Ids(root), 0
     mirrored = cache(partial(_mirrored, scratch=scratch))
-    made = 0
     for number, instance in enumerate(root.findall("shape[@type='instance']"), 1):
         ref, placed = instance.find("ref"), elements.child(instance, "to_world")
         group = instance.find("shape") if ref is None else groups.get(ref.get("id"))
@@ -191,8 +188,7 @@ def _placed(shape: Element, matrix: Floats, mirrored: Callable[[Element], Elemen
         own = SubElement(copy, "transform", name="to_world")
     SubElement(own, "matrix", value=" ".join(map(repr, matrix.ravel().tolist())))
     if is_mirrored and kind == "sphere":
-        flipped = elements.child(copy, "flip_normals")
-        if flipped is not None:
+        if (flipped := elements.child(copy, "flip_normals")) is not None:
             copy.remove(flipped)
         elements.put_value(copy, "flip_normals", flipped is None or flipped.get("value") != "true")
     return copy

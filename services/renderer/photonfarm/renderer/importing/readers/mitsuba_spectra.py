@@ -61,8 +61,7 @@ def of_new(texture: Element, *, shines: bool) -> Colour | None:
 
 def put(node: Element, colour: Colour) -> None:
     """Let an element be a colour, of the same name."""
-    node.tag = "rgb"
-    node[:] = []
+    node.tag, node[:] = "rgb", []
     node.attrib = {"name": node.get("name", ""), "value": elements.numbers(colour.tolist())}
 
 

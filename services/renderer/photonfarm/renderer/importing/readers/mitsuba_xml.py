@@ -276,9 +276,7 @@ def _want_vertices(root: Element) -> None:
 
 def _name_shapes(scene: ImportedScene) -> None:
     """Give ids to shapes without one, by material and order, and say so."""
-    ids, shapes = Ids(), scene.root.findall("shape")
-    for node in scene.root.iter():
-        ids.keep(node.get("id", ""))
+    ids, shapes = Ids(scene.root), scene.root.findall("shape")
     unnamed = [shape for shape in shapes if not shape.get("id")]
     for shape in unnamed:
         shape.set("id", ids.make(_material(shape), "shape"))

@@ -57,13 +57,8 @@ class Surface:
                 material.say(_LOST.get(key, _UNKNOWN), word)
         illum = material.number("illum", 2)
         if illum not in _LIT:  # 10 is seen by its shadows alone
-            material.say(
-                (
-                    "colour" if illum == 10 else None,
-                    "is lit as by model 1 here" if illum == 0 else "is lit as by model 2 here",
-                ),
-                f"illum {illum:g}",
-            )
+            lit: Effect | None = "colour" if illum == 10 else None
+            material.say((lit, f"is lit as by model {1 if illum == 0 else 2} here"), f"illum {illum:g}")
         opacity, glow = self._opacity(illum), self._glow()
         tint = material.cut("tf", WHITE) if opacity else WHITE
         if illum in _GLASS and opacity and not self._has_image:

@@ -34,6 +34,12 @@ def test_images_lie_on_surfaces_as_their_transforms_say(
     assert colour_at(scene, 0.75, 0.75) == top_right
 
 
+def test_it_is_said_by_how_much_samples_get_brighter(quad: Callable[..., Path], read: Read) -> None:
+    said = {change.meaning: change.places for change in read(quad(pbrMetallicRoughness={"metallicFactor": 0})).changes}
+    (places,) = [places for meaning, places in said.items() if "brighter" in meaning and "1.47 times" in meaning]
+    assert places == ["material 'paint'"]
+
+
 def test_roughness_is_the_green_channel_and_metallic_the_blue_one_raw_and_times_their_factors(
     gltf: Any, quad: Callable[..., Path], read: Read
 ) -> None:

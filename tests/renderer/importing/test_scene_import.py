@@ -90,11 +90,19 @@ def test_files_that_cannot_be_imported_end_with_the_exit_code_of_the_cause(
     monkeypatch.delenv(blender.VARIABLE, raising=False)
     monkeypatch.setenv("PATH", "")
     for made in ("a.txt", "nothing", "den.blend"):
-        Path(made).touch()
+        Path(made).write_text(made)
     error = run(name).exception
     assert isinstance(error, kind)
     assert error.exit_code == code
     assert name in str(error)
+
+
+@pytest.mark.parametrize("name", ["den.xml", "den.obj", "den.gltf", "den.glb", "den.blend", "den.fbx"])
+def test_an_empty_file_is_told_in_the_same_words_whatever_its_kind(run: Callable[..., Result], name: str) -> None:
+    Path(name).touch()
+    error = run(name).exception
+    assert isinstance(error, SpecError)
+    assert str(error) == f"{name}: is empty"
 
 
 def test_a_blender_that_fails_is_quoted_in_one_sentence(
@@ -104,7 +112,7 @@ def test_a_blender_that_fails_is_quoted_in_one_sentence(
     program.write_text("#!/bin/sh\necho Error: not a blend file\nexit 1\n")
     program.chmod(0o755)
     monkeypatch.setenv(blender.VARIABLE, str(program))
-    Path("den.blend").touch()
+    Path("den.blend").write_text("den")
     error = run("den.blend").exception
     assert isinstance(error, SpecError)
     assert "not a blend file" in str(error)

@@ -21,7 +21,7 @@ Reader = Callable[[Path, Path, Log], ImportedScene]
 
 
 def reader_of(path: Path) -> Reader:
-    """The reader of a file, by its ending; raises SpecError for an unknown one and for what is no file or not there."""
+    """The reader of a file, by its ending; raises SpecError for an unknown one, and for no file or an empty one."""
     if path.is_dir():
         there = sorted(each.name for each in path.iterdir() if each.suffix.lower() in _READERS)
         remedy = f"; name the scene's file in it: {listed(there)}" if there else ", and holds no scene"
@@ -34,5 +34,7 @@ def reader_of(path: Path) -> Reader:
         )
     if not path.is_file():
         raise SpecError(f"{path}: is not there")
+    if not path.stat().st_size:
+        raise SpecError(f"{path}: is empty")
     read: Reader = import_module(f"{__name__}.{_READERS[suffix]}").read
     return read

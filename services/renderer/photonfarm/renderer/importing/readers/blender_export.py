@@ -80,8 +80,6 @@ def main() -> None:
 
 def _open(file: str) -> None:
     suffix = Path(file).suffix.lower()
-    if not Path(file).stat().st_size:
-        sys.exit("fault: is empty")
     try:
         if suffix == ".blend":
             bpy.ops.wm.open_mainfile(filepath=file, load_ui=False, use_scripts=False)

@@ -227,7 +227,7 @@ def _opened(path: Path) -> tuple[dict[str, Any], bytes]:
         end = 20 + int.from_bytes(data[12:16], "little")
         text, binary = data[20:end], data[end + 8 :]
     if not text.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"{"):
-        raise SpecError("is no glTF: it is neither JSON nor binary glTF" if data else "is empty")
+        raise SpecError("is no glTF: it is neither JSON nor binary glTF")
     return json.loads(text), binary
 
 

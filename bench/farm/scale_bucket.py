@@ -92,7 +92,7 @@ def _steps(url: str, samples: int, requests: Requests, direct: dict[str, str]) -
     def first_job() -> None:
         fresh = Store(url).scene(spec.scene_id)
         fresh.jobs()
-        fresh.is_done(jobs - 1)
+        fresh.is_committed(jobs - 1)
         fresh.job_rows(jobs - 1)
 
     found["worker"] = requests.of(first_job)

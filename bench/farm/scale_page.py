@@ -144,18 +144,18 @@ def _files() -> str:
     from photonfarm.shared.store.format import schema
 
     spec = NamedSpec.load(SPEC).spec
-    outputs, guides = len(schema.output_arrays(spec)) - 1, len(schema.guide_arrays(spec))
+    outputs = len(schema.output_arrays(spec)) - 1  # radiance_wide is rare
     rows = []
     for shard_rows in (8, 32, 256, 4096):
         jobs = TARGETS["samples"] / shard_rows
-        files = jobs * (outputs + 1 + guides + 1)
+        files = jobs * (outputs + 1)
         size = SAMPLE_BYTES * shard_rows
         rows.append([shard_rows, f"{jobs:,.0f}", f"{files:,.0f}", f"{size / 1e6:,.0f} MB", f"{jobs / 1000:,.0f}"])
     header = [
         "samples of a job", "jobs; names in a folder of markers, and of an array", "files", "bytes of a job",
         "LISTs for all markers",
     ]  # fmt: skip
-    return f"""A job of `{SPEC}` is {outputs} shards and a marker, and with guides {guides} more and a marker.
+    return f"""A job of `{SPEC}` is {outputs} shards and a marker.
 {TARGETS["samples"]:,.0f} samples of about {SAMPLE_BYTES / 1e6:g} MB are then:
 
 {results.table(header, rows)}

@@ -34,7 +34,7 @@ def costs(folder: Path, count: int) -> Costs:
 
     def start() -> object:
         scene = Store(folder / "store").scene(spec.scene_id)
-        return scene, scene.jobs(), scene.is_done(0), scene.job_rows(0)
+        return scene, scene.jobs(), scene.is_committed(0), scene.job_rows(0)
 
     def keys() -> object:
         import numpy as np

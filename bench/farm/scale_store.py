@@ -108,7 +108,7 @@ def worker(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
         store = _store(folder)
         scene = store.scenes()[0]
         job = scene.jobs() - 1
-        return store, scene.is_done(job), scene.job_rows(job)
+        return store, scene.is_committed(job), scene.job_rows(job)
 
     return timed(begin)
 

@@ -92,16 +92,21 @@ class Contents:
         return Pool(**of)
 
 
-_KINDS = ("halves", "buffers", "visibility", "photons")
+_KINDS = ("halves", "buffers", "guides", "visibility", "photons")
 
 
 class Pool:
     """Contents for any number of samples, dealt in turn; goes through a file, for other processes."""
 
     def __init__(
-        self, halves: list[F32], buffers: list[ViewBuffers], visibility: list[Visibility], photons: list[Photons]
+        self,
+        halves: list[F32],
+        buffers: list[ViewBuffers],
+        guides: list[Guides],
+        visibility: list[Visibility],
+        photons: list[Photons],
     ) -> None:
-        self._of: dict[str, list[Any]] = dict(zip(_KINDS, (halves, buffers, visibility, photons), strict=True))
+        self._of: dict[str, list[Any]] = dict(zip(_KINDS, (halves, buffers, guides, visibility, photons), strict=True))
         self._dealt = dict.fromkeys(self._of, 0)
 
     def halves(self, *_: Any) -> F32:
@@ -111,6 +116,10 @@ class Pool:
     def buffers(self, *_: Any) -> ViewBuffers:
         """The next buffers."""
         return self._next("buffers")
+
+    def guides(self, *_: Any) -> Guides:
+        """The next guides."""
+        return self._next("guides")
 
     def visibility(self, *_: Any) -> Visibility:
         """What the next view sees."""
@@ -147,7 +156,7 @@ class Pool:
                 yield kind(**{field.name: arrays[f"{what}/{i}/{field.name}"] for field in fields(kind)})
 
         halves = [values for name, values in arrays.items() if name.startswith("halves/")]
-        kinds = (("buffers", ViewBuffers), ("visibility", Visibility), ("photons", Photons))
+        kinds = (("buffers", ViewBuffers), ("guides", Guides), ("visibility", Visibility), ("photons", Photons))
         return cls(halves, *(list(records(*kind)) for kind in kinds))
 
 
@@ -160,20 +169,10 @@ def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
             if kind == "modification" and scene.spec.photons.paths:
                 out.photons(row, contents.photons(modification))
             elif kind == "view":
-                out.view(row, contents.buffers(modification, view), contents.visibility(modification, view))
+                of = modification, view
+                out.view(row, contents.buffers(*of), contents.guides(*of), contents.visibility(*of))
             elif kind == "sample":
                 out.radiance(row, contents.halves(modification, view))
-        out.commit(FIGURES)
-
-
-def commit_guides(scene: SceneStore, job: int, contents: Contents) -> None:
-    """Give a job's new views their guides."""
-    rows = scene.job_rows(job)
-    with scene.guide_writer(job) as out:
-        for kind, row, sample in in_order(rows):
-            if kind == "view":
-                modification = rows.modifications[sample.modification_row]
-                out.guides(row, contents.guides(modification, rows.views[row]))
         out.commit(FIGURES)
 
 

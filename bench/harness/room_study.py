@@ -74,16 +74,15 @@ def named_room(name: str) -> SceneSpec:
 
 
 def render(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], processes: int) -> None:
-    """Plan what is not planned yet of the requests, and render all that is missing, with guides of every view."""
+    """Plan what is not planned yet of the requests, and render all that is missing."""
     scene = planned(spec, store, requests, SHARD_ROWS)
     jobs = [(str(store.root), spec.scene_id, job) for job in scene.missing_jobs()]
     in_processes(render_job, jobs, processes, "rendered")
 
 
 def planned(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], shard_rows: int) -> SceneStore:
-    """The scene in a store, with all requests planned and guides wanted; a store of an experiment keeps its jobs."""
+    """The scene in a store, with all requests planned; a store of an experiment keeps its jobs."""
     scene = store.add(spec)
-    scene.guides.want(spec.guides)
     for request in requests:
         scene.plan(request, shard_rows=None if scene.plans() else shard_rows)
     return scene
@@ -146,11 +145,6 @@ class ChosenSamples(StoreSource):
         self._has_answered = False
         if not self._looked_at:
             raise ValueError(f"{root}: none of {len(complete)} samples is held out")
-
-    def follow_guides(self) -> None:
-        """Read guides too; the reader begins anew for them, and looks at what is there once more."""
-        super().follow_guides()
-        super().refresh()
 
     def refresh(self) -> NDArray[np.int64]:
         """The chosen samples at the first call, and the one that is held out; none after it."""

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.harness.contents import Contents, Pool, commit, commit_guides, view_row
+from bench.harness.contents import Contents, Pool, commit, view_row
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
@@ -22,6 +22,7 @@ from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format import schema
 from photonfarm.shared.store.format.schema import ArraySchema
 from photonfarm.shared.store.format.shards import ShardWriter, encode
+from photonfarm.shared.store.read.batch import GUIDE_NAMES
 
 COUNTS = (1, 2, 4, 8)
 
@@ -63,8 +64,8 @@ def measure(
             request = Request(modifications=modifications, views_per_modification=views, passes=passes)
             scene = filled(spec, contents, request, folder / f"{views}-{passes}")
             samples = scene.progress().committed_samples
-            before = (size(scene.folder) - size(scene.folder / "base")) / samples
-            rows.append(StoreSize(views, passes, samples, before, before + guided(scene, contents) / samples, 0.0))
+            whole_bytes = (size(scene.folder) - size(scene.folder / "base")) / samples
+            rows.append(StoreSize(views, passes, samples, whole_bytes - guided(scene) / samples, whole_bytes, 0.0))
     whole = whole_samples(scene, contents, folder / "whole")
     rows = [replace(row, saving=whole.total / row.bytes_per_sample) for row in rows]
     return rows, whole, size(scene.folder / "base")
@@ -86,12 +87,9 @@ def filled(spec: SceneSpec, contents: Contents | Pool, request: Request, folder:
     return scene
 
 
-def guided(scene: SceneStore, contents: Contents) -> int:
-    """Bytes of the guides of all views of a store, which are committed to it."""
-    scene.guides.want(scene.spec.guides)
-    for job in scene.missing_jobs():
-        commit_guides(scene, job, contents)
-    return size(scene.folder / "guides")
+def guided(scene: SceneStore) -> int:
+    """Bytes of the guides of all views of a store."""
+    return sum(size(folder) for folder in scene.folder.glob("plans/*/*") if folder.name in GUIDE_NAMES)
 
 
 def size(folder: Path) -> int:

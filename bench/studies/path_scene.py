@@ -189,9 +189,5 @@ def rendered(store: Store, spec: SceneSpec, half_spp: int) -> Rendered:
     plans = [plan for plan in scene.plans() if isinstance(plan.request, Request)]
     jobs = [job for plan in plans for job in range(plan.first_job, plan.end_job)]
     figures = [scene.marker(job)["figures"] for job in jobs]
-    guides = [scene.guides.marker(job)["figures"]["core_s"] for job in jobs]
-    each = [
-        (found["core_s"] + guided) / len(scene.job_rows(job).samples)
-        for job, found, guided in zip(jobs, figures, guides, strict=True)
-    ]
+    each = [found["core_s"] / len(scene.job_rows(job).samples) for job, found in zip(jobs, figures, strict=True)]
     return Rendered(Path(store.root), half_spp, median(each), sum(found["redrawn"] for found in figures))

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bench.harness import results
-from bench.harness.contents import Contents, commit, commit_guides
+from bench.harness.contents import Contents, commit
 from bench.harness.scenes import square
 from bench.trainer.rounded_convolutions import round_factors
 from photonfarm.shared.core.estimate import Estimate, clean_error
@@ -224,11 +224,9 @@ def bias(seeds: int, steps: int) -> list[Trained]:
         scene = Store(Path(folder), create=True).add(spec)
         contents = Contents(spec)
         scene.write_base(*contents.base)
-        scene.guides.want(spec.guides)
         scene.plan(Request(modifications=SAMPLES // 2, views_per_modification=2), shard_rows=32)
         for job in range(scene.jobs()):
             commit(scene, job, contents)
-            commit_guides(scene, job, contents)
         found = []
         for seed in range(seeds):
             settings = preset("small", seed=seed, max_steps=steps, hold_out=0.25, device="cpu")

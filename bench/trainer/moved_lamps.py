@@ -37,7 +37,7 @@ from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photon
 from photonfarm.shared.plan.hold_out import units_of
 from photonfarm.shared.scene.files import BUILTIN_EMITTING, SceneFile
 from photonfarm.shared.scene.modification import Modification, sample_modification
-from photonfarm.shared.scene.spec import GuideSpec, Light, Movable, SceneSpec, shape_ids
+from photonfarm.shared.scene.spec import Light, Movable, SceneSpec, shape_ids
 from photonfarm.shared.scene.spec_loading import find_scene, load_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
@@ -220,22 +220,21 @@ class Stage:
 
     spec: SceneSpec
     base: Base
-    guides: GuideSpec  # what these are rendered with
     scene: SceneRenderer  # with as many samples per pixel in a half as a reference has
 
     @classmethod
     def of(cls, store: Store, scene_id: str, half_spp: int) -> Self:
-        """A scene of a store; where that has no guides, they are rendered as the spec says."""
+        """A scene of a store."""
         stored = store.scene(scene_id)
-        spec, guides = located(stored.spec), stored.guides.settings() or stored.spec.guides
-        return cls(spec, stored.base(), guides, load_scene(in_passes(spec, half_spp)))
+        spec = located(stored.spec)
+        return cls(spec, stored.base(), load_scene(in_passes(spec, half_spp)))
 
     def look(self, modification: Modification, view: View) -> Look:
         """Render a view, and what a network is given of it, which is what `photonfarm infer` gives.
 
         The seeds of the halves are of this benchmark alone, so that no guide and no sample has their noise.
         """
-        frames = frames_of(self.spec, modification, [view], self.base[1], lambda _: self.scene, self.guides)
+        frames = frames_of(self.spec, modification, [view], self.base[1], lambda _: self.scene)
         key = view_key(modification.key(self.spec.scene_id), view.vector)
         halves = self.scene.render_halves(view, [seed_of(key, f"{NAME}, half {half}") for half in "AB"])
         known = frames.buffers(0), frames.visibility(0), 0, frames.guides_of(0)
@@ -272,7 +271,7 @@ def measured(name: str, arguments: argparse.Namespace) -> LampStudy:
     if not lamps(stage.spec).any():
         raise SpecError(f"{name}: none of its movable groups shines, and this is about lamps that move")
     candidates = [candidate_of(group, stage.spec, stage.base) for group in runs]
-    if stage.guides.light_samples:
+    if stage.spec.guides.light_samples:
         candidates.insert(0, PredictorGroup(KNOWN, (), (known_light,), Needs(points=False, guides=True)))
     views = stage.views(source, rows)
     found = tuple(views.row(candidate) for candidate in candidates)

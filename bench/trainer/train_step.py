@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from bench.harness import results
-from bench.harness.contents import Contents, commit, commit_guides
+from bench.harness.contents import Contents, commit
 from bench.harness.scenes import square
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
@@ -117,14 +117,11 @@ def filled(spec: SceneSpec, root: Path) -> str:
     contents = Contents(spec)
     scene = Store(root, create=True).add(spec)
     scene.write_base(*contents.base)
-    scene.guides.want(spec.guides)
     scene.plan(Request(modifications=SAMPLES // 2, views_per_modification=2), shard_rows=2 * RENDERED)
     commit(scene, 0, contents)
     pool = contents.pool()
     for job in range(1, scene.jobs()):
         commit(scene, job, pool)
-    for job in range(scene.jobs()):
-        commit_guides(scene, job, contents)
     return scene.scene_id
 
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,8 +22,8 @@ from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.format.schema import guide_arrays
-from photonfarm.shared.store.write.guides import NOISY
+from photonfarm.shared.store.format.schema import output_arrays
+from photonfarm.shared.store.write.rounding import NOISY_GUIDES
 
 FOLDER = Path(__file__).parent  # on sys.path, it makes this module known to a process of its own
 
@@ -81,10 +82,11 @@ class AnalyticScene:
 
     def guides(self, view: View, key: bytes, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
         """All that `schema` has, of the view's level; what is noisy follows from the key."""
-        shapes = {name: array.shape for name, array in guide_arrays(self.spec).items()}
+        arrays = output_arrays(self.spec)
+        shapes = {field.name: arrays[field.name].shape for field in fields(Guides)}
         found = {name: np.full(shape, self._level(view), np.float32) for name, shape in shapes.items()}
         found["point_light"] += np.abs(lit[0])
-        for number, name in enumerate(NOISY):
+        for number, name in enumerate(NOISY_GUIDES):
             noise = np.random.default_rng([number, *key]).gamma(1.0, 1.0, shapes[name])
             found[name] *= noise.astype(np.float32) if wanted.light_samples else 0
         return Guides(**found)

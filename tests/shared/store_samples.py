@@ -1,6 +1,6 @@
 """A small scene and made-up outputs for the tests of plan and store."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
-from photonfarm.shared.store.format.schema import guide_arrays
+from photonfarm.shared.store.format.schema import output_arrays
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
 
@@ -104,7 +104,7 @@ def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGUR
         for row, photons_ in given.photons.items():
             out.photons(row, photons_)
         for row, buffers in given.buffers.items():
-            out.view(row, buffers, given.visibility[row])
+            out.view(row, buffers, guides(scene.spec, row), given.visibility[row])
         for row, halves in given.radiance.items():
             out.radiance(row, halves)
         return out.commit(figures, **options)
@@ -118,17 +118,10 @@ def commit_all(scene: SceneStore) -> None:
 
 def guides(spec: SceneSpec, row: int) -> Guides:
     """Guides that their types hold exactly, a function of the row of their view; of all that `schema` has."""
-    found = {}
-    for i, (name, array) in enumerate(guide_arrays(spec).items()):
+    found, arrays = {}, output_arrays(spec)
+    for i, name in enumerate(field.name for field in fields(Guides)):
+        array = arrays[name]
         found[name] = values(100 * row + i, array.shape)
         if array.dtype.itemsize == 4:
             found[name] += np.float32(1 / 3)  # what is rounded to fewer bits shows it
     return Guides(**found)
-
-
-def commit_guides(scene: SceneStore, job: int, figures: Figures = FIGURES) -> bool:
-    """Hand the guides of a job's new views to the store, and commit them."""
-    with scene.guide_writer(job) as out:
-        for row in sorted(scene.job_rows(job).new_views):
-            out.guides(row, guides(scene.spec, row))
-        return out.commit(figures)

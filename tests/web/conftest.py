@@ -46,7 +46,7 @@ def farm(scene: SceneStore, run: Path, store: Store, connection: redis.Redis, co
     name = queue.job_name(scene.scene_id, 2)
     for worker, job in (("ada", name), ("bob", None), ("eve", None)):
         queue.beat(connection, worker, "elsewhere", job, ttl_s=60, process=1)
-    queue.report_activity(connection, "ada", queue.Activity("renders samples", 1, 2, 1, name), ttl_s=60)
+    queue.report_activity(connection, "ada", queue.Activity("renders samples", 1, 2, name), ttl_s=60)
     queue.report_idle(connection, "bob", "the disk is full", {scene.scene_id: "room.xml is missing"}, ttl_s=60)
     for _ in range(queue.FAILURES_ALLOWED):
         queue.record_failure(connection, name, "ValueError: 7 is odd")

@@ -21,7 +21,7 @@ from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.read.reader import SceneReader, StoredSample
 
 IMAGES = ("radiance", "albedo", "normal", "depth")
-"""The images that every sample has. Samples of a scene with guides also have the images that `Guides` names."""
+"""The images that every sample has, beside those that `Guides` names."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,7 +124,7 @@ class Sample:
 
     @property
     def guides(self) -> dict[str, F32]:
-        """The guides, images that networks may be given, by name; empty unless the scene is read with guides.
+        """The guides, images that networks may be given, by name; empty if the scene was opened without.
 
         `photonfarm.shared.core.records.Guides` describes each. A guide is also an attribute of the sample.
         """

@@ -22,20 +22,16 @@ if TYPE_CHECKING:
 Split = Literal["train", "held-out", "all"]
 
 
-def open_scene(store: str | Path, scene: str, *, guides: bool | None = None) -> Scene:
+def open_scene(store: str | Path, scene: str, *, guides: bool = True) -> Scene:
     """A scene of a store, with the samples that are complete now.
 
     `store` is a folder, or the URL of a bucket (`s3://bucket/prefix`). `scene` is a scene's name, its id, or the
-    beginning of its id. With `guides` each sample carries the guides of its view, and is complete only once they are
-    there; None reads guides if the scene has some.
+    beginning of its id. With `guides` each sample carries the guides of its view; without them less is read.
 
-    Raises StoreError if there is no such store, or no such scene in it (the message names the scenes that exist), and
-    SpecError if `guides` is True and the scene has none.
+    Raises StoreError if there is no such store, or no such scene in it (the message names the scenes that exist).
     """
     opened = Store(store)
     found = opened.scene(scene_named(opened, scene))
-    if guides is None:
-        guides = found.guides.settings() is not None
     return Scene(store, found.scene_id, guides=guides)
 
 
@@ -46,13 +42,11 @@ class Scene:
     """
 
     def __init__(
-        self, store: str | Path, scene_id: str, *, guides: bool = False, rows: Sequence[int] | None = None
+        self, store: str | Path, scene_id: str, *, guides: bool = True, rows: Sequence[int] | None = None
     ) -> None:
         """Use `open_scene`. With `rows` the scene consists of these samples alone, and does not change."""
         self._store, self._id, self._guides = store, scene_id, guides
         self._reader = SceneReader(store, scene_id)
-        if guides:
-            self._reader.follow_guides()
         self._reader.refresh()
         self._frozen = rows is not None
         self._rows = self._reader.rows if rows is None else np.asarray(rows, np.int64)
@@ -128,7 +122,7 @@ class Scene:
         return self._sample(int(number))
 
     def _sample(self, row: int) -> Sample:
-        return Sample(self._reader.read(row), self._reader, self._id, self._read_base()[1])
+        return Sample(self._reader.read(row, guides=self._guides), self._reader, self._id, self._read_base()[1])
 
     def _read_base(self) -> tuple[Geometry, BasePointCloud]:
         if self._base is None:

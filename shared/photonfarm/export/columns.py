@@ -18,7 +18,7 @@ BUFFERS = ("albedo", "normal", "depth")
 """The buffers that every view has."""
 
 GUIDES = tuple(field.name for field in fields(Guides))
-"""The guides, which views of a scene with guides have too."""
+"""The guides of a view."""
 
 HALVES = ("A", "B")
 """The names of the two half-estimates."""
@@ -71,19 +71,18 @@ class Contents:
         return next(column.shape[:2] for column in self.columns if column.name == HALVES[0])
 
 
-def buffers_named(text: str, *, has_guides: bool) -> tuple[str, ...]:
+def buffers_named(text: str) -> tuple[str, ...]:
     """The buffers that `--buffers` asks for: "all", "none", or names with commas between them.
 
     Raises SpecError for a name that is not there.
     """
-    there = (*BUFFERS, *GUIDES) if has_guides else BUFFERS
+    there = (*BUFFERS, *GUIDES)
     if text in ("all", "none"):
         return there if text == "all" else ()
     asked = [name.strip() for name in text.split(",")]
     for name in asked:
         if name not in there:
-            lacks = "the scene has no guides, which `photonfarm store upgrade` adds; " if name in GUIDES else ""
-            raise SpecError(f"--buffers: {name!r} is not there: {lacks}allowed are all, none, or {', '.join(there)}")
+            raise SpecError(f"--buffers: {name!r} is not there: allowed are all, none, or {', '.join(there)}")
     return tuple(name for name in there if name in asked)
 
 
@@ -126,7 +125,7 @@ def _facts(spec: SceneSpec) -> list[Column]:
 
 def _stored(spec: SceneSpec, name: str) -> Column:
     """A buffer or guide in the type that the store has: its values are the stored ones."""
-    array = (schema.output_arrays(spec) | schema.guide_arrays(spec))[name]
+    array = schema.output_arrays(spec)[name]
     return Column(name, array.dtype.name, array.shape, *_declared(name))
 
 
@@ -140,5 +139,5 @@ def _seen(spec: SceneSpec) -> list[Column]:
 
 def _declared(name: str) -> tuple[str, str]:
     """Unit and convention of an array, as the store's format declares them."""
-    (found,) = (each for each in (*declarations.OUTPUTS, *declarations.GUIDES) if each.name == name)
+    (found,) = (each for each in declarations.OUTPUTS if each.name == name)
     return found.unit, found.convention

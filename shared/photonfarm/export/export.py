@@ -61,8 +61,7 @@ def export_scene(
     form = format_named(request.to)
     opened = Store(store)
     stored = scene_or_spec(opened, scene)
-    has_guides = stored.guides.settings() is not None
-    buffers = buffers_named(request.buffers, has_guides=has_guides)
+    buffers = buffers_named(request.buffers)
     configurations.check_extras(stored.spec, request.extras)
     contents = _contents(form, stored.spec, buffers, request)
     settings = _settings(buffers, contents, request)
@@ -70,8 +69,6 @@ def export_scene(
     wanted = Manifest(scene=name, store=opened.store_id, settings=settings, constants=contents.about)
     with folder.held(out, wanted) as found:
         job = _Export(form, out, contents, found, log, on_progress)
-        if not has_guides:
-            log(f"without guides: scene {name.name} has none; `photonfarm store upgrade` adds them")
         return job.run(_snapshot(store, stored, settings, log), request)
 
 
@@ -100,8 +97,7 @@ def _snapshot(store: str | Path, stored: SceneStore, settings: ExportSettings, l
     guides = not set(GUIDES).isdisjoint(settings.buffers)
     with waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
         snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
-    with_them = " with their guides" if guides else ""
-    log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete{with_them}")
+    log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete")
     return snapshot
 
 
@@ -193,9 +189,7 @@ def _chosen(snapshot: Snapshot, request: ExportRequest) -> list[int]:
         rows = [row for row in rows if snapshot.split_of(row) == request.split]
     if not rows:
         narrowed = " that is asked for (--rows, --split)" if len(snapshot.rows) else ""
-        guides = " with its guides (without them: --buffers albedo,normal,depth)" if snapshot.has_guides else ""
         raise IncompleteError(
-            f"scene {snapshot.spec.name}: no sample{narrowed} is complete{guides}; `photonfarm status` shows what is "
-            "missing"
+            f"scene {snapshot.spec.name}: no sample{narrowed} is complete; `photonfarm status` shows what is missing"
         )
     return rows

@@ -32,7 +32,6 @@ class Snapshot:
         self._stored = stored
         self._scene = Scene(place, stored.scene_id, guides=guides)  # it is not refreshed
         self.spec: SceneSpec = self._scene.spec
-        self.has_guides = guides
         self._plans = stored.plans()
         self._place = {row: place for place, row in enumerate(self._scene.rows.tolist())}
         self._held_out = set(self._scene.split("held-out", hold_out=hold_out).rows.tolist())

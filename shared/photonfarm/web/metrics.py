@@ -94,9 +94,9 @@ def _of_scenes(scenes: Sequence[SceneView]) -> Iterator[Metric]:
     planned = {labels: scene.jobs[1] for labels, scene in of.items()}
     yield _gauge("jobs_planned", "Planned render jobs.", planned, *names)
     sizes = {labels: scene.size_bytes for labels, scene in of.items()}
-    yield _counter("committed_bytes", "Bytes of committed jobs, without guides.", sizes, *names)
+    yield _counter("committed_bytes", "Bytes of committed jobs.", sizes, *names)
     core_s = {labels: scene.core_s for labels, scene in of.items()}
-    yield _counter("render_core_seconds", "Processor time that committed jobs took, without guides.", core_s, *names)
+    yield _counter("render_core_seconds", "Processor time that committed jobs took.", core_s, *names)
 
 
 def _of_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:

@@ -15,7 +15,7 @@ from photonfarm.shared.core.records import F32, BasePointCloud, arrays_of
 from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.plan.sample_costs import relative_variance
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.store import SceneReader, Store, StoredSample
+from photonfarm.shared.store import SceneReader, StoredSample
 from photonfarm.web import images
 from photonfarm.web.server import NotThereError
 
@@ -43,7 +43,6 @@ class SceneSamples:
         self._place, self._scene_id = place, scene_id
         self._lock = threading.RLock()
         self._reader = SceneReader(place, scene_id)
-        self._guided: SceneReader | None = None
         self._wall: deque[int] = deque(maxlen=WALL)
         self._noise: OrderedDict[int, float] = OrderedDict()  # by row, of those whose pictures were made
         self._opened: OrderedDict[int, StoredSample] = OrderedDict()
@@ -186,23 +185,15 @@ class SceneSamples:
         return sample
 
     def _open(self, row: int) -> StoredSample:
-        """A sample with its guides, if it has some."""
+        """A sample with its guides."""
         with self._lock:
             self._check(row)
             if row not in self._opened:
-                self._opened[row] = self._with_guides().read(row)
+                self._opened[row] = self._reader.read(row, guides=True)
                 while len(self._opened) > OPENED:
                     self._opened.popitem(last=False)
             self._opened.move_to_end(row)
             return self._opened[row]
-
-    def _with_guides(self) -> SceneReader:
-        if self._guided is None:
-            guided = Store(self._place).scene(self._scene_id).guides.settings() is not None
-            self._guided = SceneReader(self._place, self._scene_id, guides=guided) if guided else self._reader
-        if self._guided is not self._reader:
-            self._guided.refresh()
-        return self._guided
 
     def _base_cloud(self) -> BasePointCloud:
         with self._lock:

@@ -224,7 +224,7 @@ def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
     name = job_name(scene.scene_id, 0)
     with heart.working(name):
         heart.doing("renders samples", 3, 8)
-        wanted = {"ada": queue.Activity("renders samples", 3, 8, 3, name)}
+        wanted = {"ada": queue.Activity("renders samples", 3, 8, name)}
         assert _once(lambda: queue_status(connection).activities == wanted)
         heart.doing(jobs.RENDERS_GUIDES, 5, 8)
         assert _once(lambda: queue_status(connection).activities["ada"].samples == 0)

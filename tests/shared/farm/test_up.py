@@ -40,7 +40,7 @@ def test_further_passes_are_told_apart_from_samples(store: Store, tmp_path: Path
 
 def test_what_workers_do_and_why_they_do_not_stands_in_the_line(store: Store, tmp_path: Path) -> None:
     scene = store.scene(store.plan(samples.small_spec(), Request(modifications=6), shard_rows=4).scene_id)
-    doing = {"ada": Activity("renders samples", 3, 4, 3), "bob": Activity("loads the scene")}
+    doing = {"ada": Activity("renders samples", 3, 4), "bob": Activity("loads the scene")}
     status = QueueStatus(1, 2, 2, {}, IdleReports({}, {}), doing)
     working = up._Farm(scene, tmp_path, 0, lambda: StoreQueue(status, [])).look()
     assert progress_line(working, 90.0) == (

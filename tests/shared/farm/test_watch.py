@@ -53,8 +53,8 @@ def test_progress_pace_and_time_left_are_of_what_workers_have_in_hand_too(
     (before,) = watch.look().scenes
     assert (before.samples, before.jobs, before.rate, before.left_s) == ((0, 8), (0, 4), None, None)
     samples.commit(scene, 0, samples.outputs(scene, 0))
-    doing = queue.Activity("renders samples", 1, 2, 1, queue.job_name(scene.scene_id, 1))
-    stranger = queue.Activity("renders samples", 5, 9, 5, f"{'ab' * 16}-1")
+    doing = queue.Activity("renders samples", 1, 2, queue.job_name(scene.scene_id, 1))
+    stranger = queue.Activity("renders samples", 5, 9, f"{'ab' * 16}-1")
     queue.beat(connection, "ada", "elsewhere", doing.job, ttl_s=60, process=1)
     queue.report_activity(connection, "ada", doing, ttl_s=60)
     queue.report_activity(connection, "eve", stranger, ttl_s=60)

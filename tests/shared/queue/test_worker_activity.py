@@ -18,7 +18,7 @@ def scene(store: Store) -> SceneStore:
 
 
 def test_an_activity_is_read_as_it_was_reported_and_is_gone_once_cleared(connection: Redis) -> None:
-    doing = queue.Activity("renders samples", 3, 8, 3, f"{'ab' * 16}-7")
+    doing = queue.Activity("renders samples", 3, 8, f"{'ab' * 16}-7")
     queue.report_activity(connection, "ada", doing, ttl_s=60)
     assert queue.queue_status(connection).activities == {"ada": doing}
     assert str(doing) == "renders samples 3/8"

@@ -119,9 +119,7 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(
             f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
         )
-        if isinstance(result, DryRun) and result.guide_views:
-            click.echo(f"guides of {result.guide_views} views that are planned would be asked for too")
-        if isinstance(result, DryRun) and (result.planned or result.guide_views):
+        if isinstance(result, DryRun) and result.planned:
             _cost(result)
         return
     queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"

@@ -45,29 +45,23 @@ def document(
 
 def scenes(found: Sequence[SceneStatus]) -> None:
     """Print a table of a store's scenes."""
-    with_guides = any(s.views_guided is not None for s in found)
     print_table(
         (
             (
                 s.name, s.scene_id, f"{s.samples_complete}/{s.samples_planned}",
-                f"{s.jobs_committed}/{s.jobs_planned}", *([_guided(s)] if with_guides else []),
+                f"{s.jobs_committed}/{s.jobs_planned}",
                 f"{s.size_bytes / 1e6:.1f} MB", f"{s.core_s:.0f} s", str(s.redrawn),
             )
             for s in found
             if not s.error
         ),
-        ("scene", "id", "samples", "jobs", *(["guides"] if with_guides else []), "size", "core time", "redrawn"),
+        ("scene", "id", "samples", "jobs", "size", "core time", "redrawn"),
     )  # fmt: skip
     for s in found:
         unread = f"cannot be read: {s.error}" if s.error else ""
         for message in filter(None, (unread, unread_markers(s), lost_plan(s))):
             click.echo(f"{s.name} {s.scene_id}: {message}")
     click.echo()
-
-
-def _guided(scene: SceneStatus) -> str:
-    """How many of a scene's planned views have guides, as text."""
-    return "none" if scene.views_guided is None else f"{scene.views_guided}/{scene.views_planned} views"
 
 
 def queue(

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from rich.console import Console
@@ -21,9 +21,6 @@ from photonfarm.shared.store.check.check import CheckProgress, SceneReport, Stor
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import WrittenView
 from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
-
-if TYPE_CHECKING:
-    from photonfarm.shared.farm.upgrade import SceneUpgrade, Upgrade
 
 
 @contextlib.contextmanager
@@ -90,8 +87,7 @@ def _wrong(scene: SceneReport) -> int:
 
 
 def _scene(scene: SceneReport) -> None:
-    guides = f", guides of {scene.guide_jobs} jobs" if scene.guide_jobs else ""
-    read = f"{scene.jobs} jobs, {scene.samples} samples{guides}, {scene.size_bytes / 1e6:,.1f} MB"
+    read = f"{scene.jobs} jobs, {scene.samples} samples, {scene.size_bytes / 1e6:,.1f} MB"
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
         click.echo(f"  A against B: {halves_in_words(scene.halves)}")
@@ -108,8 +104,7 @@ def _scene(scene: SceneReport) -> None:
 
 
 def _named(finding: Finding) -> str:
-    of = "guides of job" if finding.guides else "job"
-    job, row = (f"{what} {n}" if n is not None else "" for what, n in ((of, finding.job), ("row", finding.row)))
+    job, row = (f"{what} {n}" if n is not None else "" for what, n in (("job", finding.job), ("row", finding.row)))
     return ", ".join(part for part in (job, row, finding.file or "") if part) + f": {finding.detail}"
 
 
@@ -125,9 +120,7 @@ def _document(report: StoreReport) -> dict[str, Any]:
 
 
 def _group(group: FindingGroup) -> dict[str, Any]:
-    first = [
-        {"job": f.job, "guides": f.guides, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first
-    ]  # fmt: skip
+    first = [{"job": f.job, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first]
     cause = group.cause
     return {"cause": cause.label, "means": cause.sentence, "remedy": cause.remedy.value, "count": group.count,
             "first": first}  # fmt: skip
@@ -178,8 +171,6 @@ def _sample(sample: FoundSample, store: str | Path) -> None:
     click.echo(f"  view          {sample.view_key}  row {sample.view_row}: {view}")
     for job, committed in dict(zip(sample.jobs, sample.committed, strict=True)).items():
         click.echo(f"  job           {job}: {'committed' if committed else 'missing'}")
-    if sample.guided is not None:
-        click.echo(f"  guides        of job {sample.jobs[1]}: {'committed' if sample.guided else 'missing'}")
     for place in sample.places:
         held = "" if place.there else "  (not there)"
         click.echo(f"  {place.array:<16} {place.file}  inner chunk {place.chunk}, index {place.index}{held}")
@@ -191,51 +182,12 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
     """The command lines that read a sample, and those that render what is missing of it."""
     listed = {}
     if sample.complete:
-        scene = f"open_scene({str(store)!r}, {sample.scene_id!r}, guides={bool(sample.guided)})"
+        scene = f"open_scene({str(store)!r}, {sample.scene_id!r})"
         program = f"from photonfarm.data import open_scene; print({scene}.row({sample.row}).radiance)"
         listed["look at it"] = shlex.join(["python", "-c", program])
     lacking = {job for job, committed in zip(sample.jobs, sample.committed, strict=True) if not committed}
-    if sample.guided is False:
-        lacking.add(sample.jobs[1])  # a committed job is rendered again for its guides alone
     for job in dict.fromkeys(sample.jobs):
         if job in lacking:
             words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
             listed[f"render job {job}"] = shlex.join(words)
     return listed
-
-
-# -------------------------------------------------------------------------------------------------------------- upgrade
-
-
-def upgrade(result: Upgrade, store: str | Path, as_json: bool) -> None:
-    """Print the outcome of an upgrade, scene by scene, and the command that continues it.
-
-    Raises StoreError at the end if a scene cannot be upgraded.
-    """
-    if as_json:
-        print_json(asdict(result))
-    else:
-        for scene in result.scenes:
-            _upgraded(scene, dry_run=result.dry_run)
-        if any(scene.jobs_lacking for scene in result.scenes) and not result.dry_run:
-            queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
-            command = shlex.join(["photonfarm", "work", "--until-complete", "--store", str(store)])
-            click.echo(f"{queued}; go on with: {command}")
-    if result.failed:
-        raise StoreError("; ".join(f"scene {scene_id}: {error}" for scene_id, error in result.failed.items()))
-
-
-def _upgraded(scene: SceneUpgrade, *, dry_run: bool) -> None:
-    asked = "guides are asked for already"
-    if scene.asked:
-        asked = "guides would be asked for" if dry_run else "guides are asked for"
-    click.echo(f"{scene.name} {scene.scene_id}: {asked}, with {scene.light_samples} light samples")
-    jobs = "1 job" if scene.jobs_lacking == 1 else f"{scene.jobs_lacking} jobs"
-    click.echo(f"  {scene.views_lacking} of {scene.views} views lack them: {jobs} to render")
-    most = scene.guide_bytes_per_sample / 1e3
-    if scene.bytes_per_sample is None:
-        click.echo(f"  no sample is complete; guides take at most {most:,.1f} kB per sample")
-    else:
-        before = scene.bytes_per_sample / 1e3
-        sizes = f"{before:,.1f} kB per sample without guides, at most {before + most:,.1f} kB with them"
-        click.echo(f"  {sizes} (less once compressed)")

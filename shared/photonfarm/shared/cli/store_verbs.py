@@ -1,4 +1,4 @@
-"""The verbs `photonfarm store …`, which need neither Mitsuba nor torch; only `upgrade` uses Redis."""
+"""The verbs `photonfarm store …`, which need neither Mitsuba, torch nor Redis."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from photonfarm.shared.cli.options import json_option, redis_option, store_option
+from photonfarm.shared.cli.options import json_option, store_option
 from photonfarm.shared.core.errors import IncompleteError, StoreError
 
 
@@ -142,39 +142,3 @@ def merge(
             raise StoreError("no sample that is planned fits; `photonfarm store find` shows what there is")
         what = "no complete sample fits" if least == 1 else f"no view that fits has {least} complete passes (--least)"
         raise IncompleteError(f"{what}; `photonfarm store find` shows what there is")
-
-
-@click.command()
-@store_option
-@scene_option
-@click.option("--light-samples", type=click.IntRange(0, 64), default=None, metavar="N",
-              help="Shadow rays of each of a pixel's 16 sub-pixels, 0: none, for scenes that have no guides yet.  "
-              "[default: 3]")  # fmt: skip
-@redis_option
-@click.option("--no-queue", is_flag=True, help="Only ask for guides; idle workers find them by themselves.")
-@click.option("--dry-run", is_flag=True, help="Say what would be rendered and stored; write and queue nothing.")
-@json_option
-def upgrade(
-    store: str | Path,
-    scene: str | None,
-    light_samples: int | None,
-    redis_url: str,
-    no_queue: bool,
-    dry_run: bool,
-    as_json: bool,
-) -> None:
-    """Add guides to scenes that an older photonfarm has rendered; no sample is rendered again.
-
-    Guides are images that the renderer computes of each view for networks: noise-free buffers, and direct light with
-    noise of its own. Workers render them job by job, and readers see them arrive; all else in the store stays as it is.
-    A scene that has guides, or has been asked for some, keeps its settings. It may be stopped and repeated at any time.
-
-    Exit codes: 0 asked for, also before; 4 the store or one of its scenes cannot be read, and the others are done; 5
-    Redis does not answer, and workers find by themselves what is to be rendered.
-    """
-    from photonfarm.shared.cli import show_store
-    from photonfarm.shared.farm.upgrade import upgrade as upgraded
-
-    url = None if no_queue else redis_url
-    result = upgraded(store, url, scene=scene, light_samples=light_samples, dry_run=dry_run)
-    show_store.upgrade(result, store, as_json)

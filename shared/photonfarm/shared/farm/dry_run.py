@@ -7,8 +7,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import BackendError, StoreError
 from photonfarm.shared.core.processes import usable_cores
@@ -18,10 +16,9 @@ from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.format.schema import bytes_of_rows, most_guide_bytes
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.format.schema import bytes_of_rows
 from photonfarm.shared.store.io.storage import is_vacant
-from photonfarm.shared.store.write.guides import jobs_with_views, used_views
 
 VERB = ("scene", "cost")  # of the renderer
 
@@ -49,7 +46,6 @@ class DryRun(Submission):
 
     extent: Extent = field(kw_only=True)
     size_bytes: int = field(kw_only=True)  # before compression
-    guide_views: int = field(default=0, kw_only=True)  # planned before, without guides, which would be asked for now
     cores: int = field(kw_only=True)  # of this machine, as far as this process may use them
     costs: SampleCosts | None = field(default=None, kw_only=True)
     core_s: float | None = field(default=None, kw_only=True)  # to render what would be planned
@@ -67,13 +63,13 @@ def rehearse(
     log: Callable[[str], None],
     shard_rows: int | None = None,
 ) -> DryRun:
-    """What `submission.submit` would plan, and the guides that it would ask for.
+    """What `submission.submit` would plan.
 
     With `measure`, also its cost, and how the same cost would be spent best; `log` is called with the reason if the
     cost is unknown. Raises SpecError and StoreError as `submit` does.
     """
     found = _counted(named.spec, request, store, shard_rows)
-    if not (measure and (found.planned or found.guide_views)):
+    if not (measure and found.planned):
         return found
     try:
         costs = costs_by_renderer(named.name, min(max(SHARE_S * found.planned, LEAST_S), MOST_S))
@@ -85,32 +81,15 @@ def rehearse(
 
 def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
     """What would be planned, and its size."""
-    guide_views = guide_bytes = 0
     if is_vacant(store):
         new, known, extent = wanted.samples, 0, wanted.extent(loaded)
     else:
         opened = Store(store)
-        if opened.has_scene(loaded.scene_id):
-            guide_views, guide_bytes = _guides_of_older_views(opened.scene(loaded.scene_id), loaded)
         planned = opened.plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
         new, known, extent = planned.new, planned.known, planned.extent
     of = bytes_of_rows(loaded)
-    size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications + guide_bytes
-    return DryRun(
-        loaded.scene_id, None, new, known, None, True,
-        extent=extent, size_bytes=size, guide_views=guide_views, cores=usable_cores(),
-    )  # fmt: skip
-
-
-def _guides_of_older_views(scene: SceneStore, loaded: SceneSpec) -> tuple[int, int]:
-    """How many views of older plans would be asked guides for, and their size; SpecError if these are others."""
-    scene.guides.check(loaded.guides)
-    found = scene.plans()
-    if scene.guides.settings() is not None or not found:
-        return 0, 0
-    views = int(np.count_nonzero(used_views(found)))
-    jobs = len(jobs_with_views(found))
-    return views, most_guide_bytes(loaded, views, jobs, found[0].shard_rows)
+    size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
+    return DryRun(loaded.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=usable_cores())
 
 
 def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
@@ -142,7 +121,6 @@ def _priced(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts)
     """
     of, spp, static = found.extent, 2 * spec.transport.half_spp, not spec.groups
     core_s = costs.seconds(spp, configurations=of.configurations, views=of.views, samples=found.planned)
-    core_s += costs.guides_s * found.guide_views
     timed = replace(found, costs=costs, core_s=core_s, wall_s=core_s / found.cores)
     if found.planned_before or not found.planned:
         return timed

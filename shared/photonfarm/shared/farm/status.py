@@ -14,7 +14,6 @@ from photonfarm.shared.core.errors import CorruptError, QueueError, StoreError, 
 from photonfarm.shared.store import SceneStatus, Store
 from photonfarm.shared.store.format.markers import COMMITTED
 from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.write.guides import GUIDES
 from photonfarm.shared.store.write.scene_store import SCENES
 from photonfarm.shared.store.write.store import FAILURES_FOLDER
 
@@ -85,7 +84,7 @@ def since_commit_s(store: Store) -> float | None:
         return None
     scenes = [store.storage.root / SCENES / scene_id for scene_id in store.scene_ids()]
     with store_errors("look for the last commit", store.storage.where):
-        folders = [folder for scene in scenes for folder in (scene / COMMITTED, scene / GUIDES / COMMITTED)]
+        folders = [scene / COMMITTED for scene in scenes]
         times = [folder.stat().st_mtime for folder in folders if folder.is_dir()]
     return max(0.0, time.time() - max(times)) if times else None
 
@@ -122,7 +121,7 @@ def is_missing(store: Store, name: str) -> bool:
 
     job = RenderArguments.of(name)
     with contextlib.suppress(CorruptError, IndexError):
-        return store.has_scene(job.scene_id) and not store.scene(job.scene_id).is_done(job.job)
+        return store.has_scene(job.scene_id) and not store.scene(job.scene_id).is_committed(job.job)
     return False
 
 
@@ -142,7 +141,7 @@ def unread_markers(scene: SceneStatus) -> str:
     if not scene.markers_unreadable:
         return ""
     return (
-        f"{scene.markers_unreadable} of {_markers(scene)} markers cannot be read, and size, core time and "
+        f"{scene.markers_unreadable} of {scene.jobs_committed} markers cannot be read, and size, core time and "
         f"redrawn leave them out: {scene.marker_error}; `photonfarm store check` names each"
     )
 
@@ -152,11 +151,6 @@ def lost_plan(scene: SceneStatus) -> str:
     if not scene.markers_without_plan:
         return ""
     return (
-        f"{scene.markers_without_plan} of {_markers(scene)} markers are of jobs that no plan has; "
+        f"{scene.markers_without_plan} of {scene.jobs_committed} markers are of jobs that no plan has; "
         "`photonfarm store check` reports whether the last plan is missing"
     )
-
-
-def _markers(scene: SceneStatus) -> int:
-    """The number of a scene's markers, including those of guides."""
-    return scene.jobs_committed + scene.guide_jobs

@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError, SpecError, store_errors
@@ -53,16 +52,11 @@ def submit(
 
     Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
     Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
-    QueueError; in the last case the plan is kept, and idle workers queue it later. Guides are asked for before the
-    plan, so that no worker renders it without them.
+    QueueError; in the last case the plan is kept, and idle workers queue it later.
     """
     opened = Store(store, create=True)
-    scene = opened.add(named.spec)
-    scene.guides.check(named.spec.guides)
-    rows: dict[str, Any] = {"shard_rows": shard_rows, "usual_rows": rows_per_job(named.spec, request, workers)}
-    scene.plan(Request(), **rows, dry_run=True)  # what is refused leaves no wish for guides behind
-    scene.guides.want(named.spec.guides)
-    planned = opened.plan(named.spec, request, **rows)
+    usual = rows_per_job(named.spec, request, workers)
+    planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual)
     queued = _queued(opened, redis_url, retry=retry)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)
 

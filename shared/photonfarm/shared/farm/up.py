@@ -288,11 +288,11 @@ class _Farm:
         passes = found.committed_passes, found.planned_passes
         samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
         named = {self.scene.scene_id: self.scene.spec.name}
-        missing = found.planned_samples - found.usable_samples
+        missing = found.planned_samples - found.committed_samples
         activities = status.activities if status and missing else {}  # a report may be seconds old
         return FarmProgress(
             samples, passes, trained.step, self.steps, trained.note,
-            min(sum(each.samples for each in activities.values()), found.planned_samples - found.committed_samples),
+            min(sum(each.done for each in activities.values()), found.planned_samples - found.committed_samples),
             tuple(f"{name} {each}" for name, each in sorted(activities.items())),
             tuple(map(str, waits(self._queue, named, 0))),
         )  # fmt: skip

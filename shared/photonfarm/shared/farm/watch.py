@@ -127,7 +127,7 @@ class FarmWatch:
             seen = self._seen[scene.scene_id] = _Seen()
         for job in sorted(committed - seen.core_s.keys()):
             _add(scene, job, seen)
-        in_hand = sum(each.samples for each in activities if _is_of(each, scene.scene_id))
+        in_hand = sum(each.done for each in activities if _is_of(each, scene.scene_id))
         in_hand = min(in_hand, progress.planned_samples - progress.committed_samples)  # a report may be seconds old
         done = progress.committed_samples + in_hand
         rate = self._pace(seen, done)

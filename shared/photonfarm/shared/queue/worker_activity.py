@@ -23,9 +23,8 @@ class Activity:
     """What a worker is doing; printable."""
 
     phase: str  # such as "renders samples"
-    done: int = 0  # samples or views of its job that are ready
+    done: int = 0  # samples of its job that are rendered, and not committed yet
     total: int = 0  # of so many; 0: the phase has no parts
-    samples: int = 0  # of its job that are rendered, and not committed yet
     job: str | None = None  # its name
 
     def __str__(self) -> str:
@@ -35,9 +34,7 @@ class Activity:
 
 def report_activity(connection: Redis, worker: str, activity: Activity, *, ttl_s: float) -> None:
     """Report what a worker is doing; expires after `ttl_s`."""
-    value = (
-        f"{activity.done} {activity.total} {activity.samples} {activity.job or '-'} {activity.phase[:PHASE_LETTERS]}"
-    )
+    value = f"{activity.done} {activity.total} {activity.job or '-'} {activity.phase[:PHASE_LETTERS]}"
     connection.set(DOING + worker, value, px=int(ttl_s * 1000))
 
 
@@ -55,9 +52,8 @@ def read_activities(connection: Redis) -> Mapping[str, Activity]:
 
 
 def _parsed(value: str) -> Activity | None:
-    words = value.split(" ", 4)
-    if len(words) != 5 or not all(word.isascii() and word.isdecimal() and len(word) <= 6 for word in words[:3]):
+    words = value.split(" ", 3)
+    if len(words) != 4 or not all(word.isascii() and word.isdecimal() and len(word) <= 6 for word in words[:2]):
         return None
-    done, total, samples = map(int, words[:3])
-    job = words[3] if is_job_name(words[3]) else None
-    return Activity(printable(words[4])[:PHASE_LETTERS], done, total, samples, job)
+    job = words[2] if is_job_name(words[2]) else None
+    return Activity(printable(words[3])[:PHASE_LETTERS], int(words[0]), int(words[1]), job)

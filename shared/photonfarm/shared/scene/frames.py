@@ -34,7 +34,7 @@ class Frames:
     point_seen: NDArray[np.bool_]  # (F, P) and (F, K), as in `Visibility`
     photon_seen: NDArray[np.bool_]  # (F, K)
     photons: Photons | None  # of the configuration; None for a scene without
-    guides: Guides | None = None  # (F, …) of all views; None for a scene without
+    guides: Guides  # (F, …) of all views
 
     def __len__(self) -> int:
         """How many frames there are."""
@@ -48,10 +48,8 @@ class Frames:
         """Which points and photons one frame sees."""
         return Visibility(self.point_seen[frame], self.photon_seen[frame])
 
-    def guides_of(self, frame: int) -> Guides | None:
-        """The guides of one frame; None in a scene without."""
-        if self.guides is None:
-            return None
+    def guides_of(self, frame: int) -> Guides:
+        """The guides of one frame."""
         return Guides(**{name: values[frame] for name, values in arrays_of(self.guides).items()})
 
     def write(self, file: Path) -> None:
@@ -61,11 +59,10 @@ class Frames:
             "modification": self.modification.vector,
             "view": np.stack([view.vector for view in self.views]),
             **{name: getattr(self, name) for name in _OF_VIEWS},
+            **{f"guide_{name}": array for name, array in arrays_of(self.guides).items()},
         }
         if self.photons is not None:
             arrays |= {f"photon_{name}": array for name, array in arrays_of(self.photons).items()}
-        if self.guides is not None:
-            arrays |= {f"guide_{name}": array for name, array in arrays_of(self.guides).items()}
         write_arrays(file, arrays, "buffers")
 
     @classmethod
@@ -76,9 +73,7 @@ class Frames:
             photons = None
             if "photon_bounce" in stored:
                 photons = Photons(*(stored[f"photon_{field.name}"] for field in fields(Photons)))
-            guides = None
-            if "guide_emission" in stored:
-                guides = Guides(*(stored[f"guide_{field.name}"] for field in fields(Guides)))
+            guides = Guides(*(stored[f"guide_{field.name}"] for field in fields(Guides)))
             modification = Modification.from_vector(stored["modification"])
             of_views = {name: stored[name] for name in _OF_VIEWS}
             return cls(str(stored["scene_id"]), modification, views, photons=photons, guides=guides, **of_views)

@@ -174,7 +174,7 @@ class PhotonSpec(Frozen):
 
 
 class GuideSpec(Frozen):
-    """The settings of the guides, which are rendered beside each view's buffers; no sample depends on them."""
+    """The settings of the guides, which are rendered beside each view's buffers."""
 
     light_samples: Annotated[int, Field(ge=0, le=64)] = 3  # shadow rays of each of a pixel's 16 sub-pixels; 0: none
 
@@ -253,7 +253,7 @@ class SceneSpec(Frozen):
 
     def identity(self) -> dict[str, Any]:
         """All that a sample's radiance depends on, as JSON has it: specs that agree in it are one scene."""
-        not_of_it: dict[str, Any] = {"scene": {"file"}, "name": True, "credits": True, "guides": True}
+        not_of_it: dict[str, Any] = {"scene": {"file"}, "name": True, "credits": True}
         return self.model_dump(mode="json", exclude=not_of_it)
 
     @property

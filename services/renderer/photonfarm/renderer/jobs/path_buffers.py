@@ -24,7 +24,7 @@ from photonfarm.shared.scene.camera_path import CameraPath, kept_clear, orbit
 from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import scene_named
@@ -45,7 +45,7 @@ def write_buffers(store: str | Path, scene: str, modification: str | None, path:
     else:
         views = kept_clear(spec, path.sampled(), configuration)
     cloud = stored.base()[1] if stored.has_base() else None
-    frames_of(spec, configuration, views, cloud, guides=stored.guides.settings()).write(out)
+    frames_of(spec, configuration, views, cloud).write(out)
     return len(views)
 
 
@@ -55,11 +55,8 @@ def frames_of(
     views: Sequence[View],
     cloud: BasePointCloud | None = None,
     load: SceneLoader = load_scene,
-    guides: GuideSpec | None = None,
 ) -> Frames:
-    """The buffers of views of one configuration, its photons if the scene has some, and which of them the views see.
-
-    With `guides` also their guides, rendered with these settings.
+    """The buffers and guides of views of one configuration, and its photons, if the scene has some.
 
     The photons are those that the store holds of the configuration, or would: their seed follows from its key. `cloud`
     is the stored base cloud; without one it is sampled, as a job would. Raises IncompleteError for values that are not
@@ -76,17 +73,16 @@ def frames_of(
             raise IncompleteError(f"{name} of these views came out non-finite; move the camera a little")
     cloud = cloud or scene.base()[1]
     points = rebuild(cloud, modification)
-    known = None if guides is None else _guides(scene, modification, views, (spec.scene_id, guides, cloud))
+    guides = _guides(scene, modification, views, spec, cloud)
     seen = [visibility_of(scene, view, points, photons) for view in views]
     arrays |= {"point_seen": np.stack([s.points for s in seen]), "photon_seen": np.stack([s.photons for s in seen])}
-    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=known, **arrays)
+    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=guides, **arrays)
 
 
 def _guides(
-    scene: SceneRenderer, modification: Modification, views: Sequence[View], of: tuple[str, GuideSpec, BasePointCloud]
+    scene: SceneRenderer, modification: Modification, views: Sequence[View], spec: SceneSpec, cloud: BasePointCloud
 ) -> Guides:
-    """The guides of all views, stacked; `of` holds the scene's id, the guides' settings, and the base cloud."""
-    scene_id, wanted, cloud = of
-    key, lit = modification.key(scene_id), lit_points(cloud, modification)
-    found = [arrays_of(scene.guides(view, view_key(key, view.vector), wanted, lit)) for view in views]
+    """The guides of all views, stacked."""
+    key, lit = modification.key(spec.scene_id), lit_points(cloud, modification)
+    found = [arrays_of(scene.guides(view, view_key(key, view.vector), spec.guides, lit)) for view in views]
     return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})

@@ -45,7 +45,6 @@ SCENES_KEPT = 2
 
 LOADS = "loads the scene"
 COMPILES = "compiles kernels, renders samples"
-RENDERS_GUIDES = "renders guides"
 RENDERS_SAMPLES = "renders samples"
 COMMITS = "commits"
 
@@ -145,50 +144,24 @@ class ShardRenderer:
         self._scenes: dict[str, _Loaded] = {}  # in the order of their last use
 
     def render(self, scene_id: str, job: int) -> bool:
-        """Render and commit what a job lacks; False if it lacked nothing, or another worker committed it meanwhile.
+        """Render and commit a job; False if it was committed already, or another worker committed it meanwhile.
 
-        It renders the job's guides, if the scene has some, and then its samples. It also returns False if a repair
-        removed the job's files meanwhile: the job is then missing, and queued again.
+        It also returns False if a repair removed the job's files meanwhile: the job is then missing, and queued again.
 
         Raises QueueError for a job that is not planned in this store, SceneNotHereError if the scene file here is not
         the planned one, IncompleteError if renders stay non-finite or buffers are.
         """
         if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
             raise QueueError(f"store {self._store.root} has no job {job} of scene {scene_id}")
-        if stored.is_done(job):
-            return False
-        loaded = self._scene(scene_id)
-        stored = loaded.stored
-        guided = stored.guides.lacks_job(stored.job_rows(job)) and self._render_guides(loaded, job)
-        return self._render_samples(loaded, job) if not stored.is_committed(job) else guided
+        return not stored.is_committed(job) and self._render(self._scene(scene_id), job)
 
-    def _render_guides(self, loaded: _Loaded, job: int) -> bool:
-        """Render and commit the guides of a job's new views; False if another worker was faster."""
-        stored, scene, began = loaded.stored, loaded.scene, self._now()
-        rows, wanted = stored.job_rows(job), stored.guides.settings() or GuideSpec()
-        cloud = loaded.cloud()
-        views, done = len(rows.new_views), 0
-        with stored.guide_writer(job) as out:
-            for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
-                modification = rows.modifications[modification_row]
-                scene.apply(modification)
-                key, lit = modification.key(stored.scene_id), lit_points(cloud, modification)
-                for row in sorted(rows.new_views.intersection(sample.view_row for sample in group)):
-                    self._on_progress(RENDERS_GUIDES, done, views)
-                    done += 1
-                    view = rows.views[row]
-                    guides = scene.guides(view, view_key(key, view.vector), wanted, lit)
-                    _check_finite(arrays_of(guides), f"view {row}")
-                    out.guides(row, guides)
-            return out.commit(self._figures(began, 0))
-
-    def _render_samples(self, loaded: _Loaded, job: int) -> bool:
+    def _render(self, loaded: _Loaded, job: int) -> bool:
         stored, scene_id, began = loaded.stored, loaded.stored.scene_id, self._now()
         cloud = loaded.cloud()
         with stored.job_writer(job) as out:
             report = self._on_progress if loaded.compiled else self._compiles_first
             rows = stored.job_rows(job)
-            redrawn = _Rendering(loaded.scene, cloud, scene_id, out, report).run(rows)
+            redrawn = _Rendering(loaded.scene, cloud, loaded.stored.spec, out, report).run(rows)
             loaded.compiled = True
             self._on_progress(COMMITS, len(rows.samples), len(rows.samples))
             committed = out.commit(self._figures(began, redrawn))
@@ -282,15 +255,15 @@ def visibility_of(
 
 
 class _Rendering:
-    """One pass over a job's samples: each modification is applied once, and each new view's buffers rendered once."""
+    """One pass over a job's samples: each modification is applied once, and each new view's inputs rendered once."""
 
     def __init__(
-        self, scene: SceneRenderer, cloud: BasePointCloud, scene_id: str, out: JobWriter, on_progress: OnProgress
+        self, scene: SceneRenderer, cloud: BasePointCloud, spec: SceneSpec, out: JobWriter, on_progress: OnProgress
     ) -> None:
         self._scene = scene
         self._on_progress = on_progress
         self._cloud = cloud
-        self._scene_id = scene_id
+        self._scene_id, self._wanted = spec.scene_id, spec.guides
         self._out = out
         self._redrawn = 0
 
@@ -319,7 +292,8 @@ class _Rendering:
                     if sample.view_row in new_views:
                         view = rows.views[sample.view_row]
                         visibility = visibility_of(self._scene, view, points, photons)
-                        self._out.view(sample.view_row, self._buffers(sample, view), visibility)
+                        buffers, guides = self._buffers(sample, view), self._guides(sample, view, modification)
+                        self._out.view(sample.view_row, buffers, guides, visibility)
                         new_views.remove(sample.view_row)
                 self._render_halves(together, rows)
         return self._redrawn
@@ -334,8 +308,15 @@ class _Rendering:
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
         """Render the buffers of a view, without a second attempt: they depend on no seed."""
         buffers = self._scene.buffers(view)
-        _check_finite(arrays_of(buffers), f"view {sample.view_row}", f" (sample {sample.key.hex()})")
+        _check_finite(arrays_of(buffers), sample)
         return buffers
+
+    def _guides(self, sample: SampleRow, view: View, modification: Modification) -> Guides:
+        """Render the guides of a view, without a second attempt."""
+        key = view_key(modification.key(self._scene_id), view.vector)
+        guides = self._scene.guides(view, key, self._wanted, lit_points(self._cloud, modification))
+        _check_finite(arrays_of(guides), sample)
+        return guides
 
 
 def _parts(samples: Sequence[SampleRow], most: int) -> Iterator[Sequence[SampleRow]]:
@@ -343,8 +324,9 @@ def _parts(samples: Sequence[SampleRow], most: int) -> Iterator[Sequence[SampleR
     return (samples[first : first + most] for first in range(0, len(samples), most))
 
 
-def _check_finite(arrays: Mapping[str, NDArray[np.generic]], what: str, more: str = "") -> None:
-    """Raise IncompleteError unless all values of arrays that depend on no seed are finite."""
+def _check_finite(arrays: Mapping[str, NDArray[np.generic]], sample: SampleRow) -> None:
+    """Raise IncompleteError unless all values of arrays of a sample's view are finite."""
     for name, values in arrays.items():
         if not np.isfinite(values.astype(np.float32)).all():
-            raise IncompleteError(f"{name} of {what} came out non-finite{more}")
+            what = f"view {sample.view_row} (sample {sample.key.hex()})"
+            raise IncompleteError(f"{name} of {what} came out non-finite")

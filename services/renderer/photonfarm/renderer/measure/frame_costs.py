@@ -58,13 +58,12 @@ def write_frame_costs(
     SceneNotHereError if the scene's files are not on this machine.
     """
     opened = Store(store)
-    reader = SceneReader(store, scene_id := scene_named(opened, scene))
+    reader = SceneReader(store, scene_named(opened, scene))
     reader.refresh()
     _check_complete(reader, rows)
     frames = [_frame(reader, row) for row in rows]
     used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
-    wanted = opened.scene(scene_id).guides.settings() or reader.spec.guides
-    spec = located(reader.spec.model_copy(update={"guides": wanted}))
+    spec = located(reader.spec)
     costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed)
     costs.write(out)
     return costs

@@ -110,9 +110,9 @@ class TrainerPace:
 
     def _look(self) -> dict[str, str]:
         committed = {
-            scene_id: progress.usable_samples
+            scene_id: progress.committed_samples
             for scene_id, progress in self._progress().items()
-            if progress.usable_samples > AHEAD_MINIMUM and progress.committed_samples < progress.planned_samples
+            if progress.committed_samples > AHEAD_MINIMUM and progress.committed_samples < progress.planned_samples
         }
         used = queue.consumed_samples(self._connection, list(committed))
         return {

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 
 import redis
 
-from photonfarm.renderer.jobs.render import RENDERS_GUIDES
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError
@@ -66,7 +65,7 @@ class HeartbeatThread:
 
     def doing(self, phase: str, done: int = 0, total: int = 0) -> None:
         """Note what the worker is doing; it is reported soon. See `jobs.OnProgress`."""
-        self._activity = queue.Activity(phase, done, total, 0 if phase == RENDERS_GUIDES else done, self._job)
+        self._activity = queue.Activity(phase, done, total, self._job)
 
     def end(self) -> None:
         """Remove the heartbeat of the worker's child; its supervisor keeps the name."""

@@ -138,7 +138,7 @@ class Outcomes:
     def _is_committed(self, name: str) -> bool:
         with contextlib.suppress(PhotonfarmError, OSError):
             arguments = RenderArguments.of(name)
-            return self._store.scene(arguments.scene_id).is_done(arguments.job)
+            return self._store.scene(arguments.scene_id).is_committed(arguments.job)
         return False
 
     def _record(self, name: str, reason: str) -> None:

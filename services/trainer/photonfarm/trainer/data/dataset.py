@@ -56,7 +56,7 @@ class RawSample:
     buffers: ViewBuffers
     visibility: Visibility
     pass_: int  # the number of the noisy pass of this view
-    guides: Guides | None = None  # if guides are followed
+    guides: Guides | None = None  # if they are read
 
 
 class SampleSource(Keyed[Sequence[int]], Protocol):
@@ -65,8 +65,8 @@ class SampleSource(Keyed[Sequence[int]], Protocol):
     def ready(self) -> bool:
         """Whether spec and base are there; they come with the scene's first job."""
 
-    def follow_guides(self) -> None:
-        """Read guides too, so that samples are complete only with them; SpecError if the scene has none."""
+    def read_guides(self) -> None:
+        """Read guides too, from now on."""
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """The geometry and the base cloud."""

@@ -49,7 +49,7 @@ class Feed:
         self._needs = needs or kind_of(settings.network.architecture).needs
         self._resident = resident if resident is not None and resident.keeps_any else None
         if self._needs.guides:
-            source.follow_guides()
+            source.read_guides()
         self.geometry, self.cloud = source.base()
         self.spec = source.spec
         self._lock = threading.Lock()

@@ -16,17 +16,17 @@ class StoreSource(SceneReader):
 
     def __init__(self, root: str | Path, scene_id: str) -> None:
         super().__init__(root, scene_id)
+        self._guides = False
         self._memory: Batch | None = None
 
-    def follow_guides(self) -> None:
-        """Read guides too; samples are complete only with them. Raises SpecError for a scene without guides."""
-        super().follow_guides()
-        self._memory = None
+    def read_guides(self) -> None:
+        """Read guides too, from now on."""
+        self._guides, self._memory = True, None
 
     def read_samples(self, rows: Sequence[int]) -> list[RawSample]:
         """The samples of complete rows, valid until the next call; CorruptError if bytes are not what was committed."""
         if self._memory is None or len(rows) > len(self._memory):
-            self._memory = Batch.empty(self.spec, len(rows), guides=self._with_guides)
+            self._memory = Batch.empty(self.spec, len(rows), guides=self._guides)
         read = self.read_batch(rows, self._memory)
         return [self._sample(read, place, row) for place, row in enumerate(rows)]
 

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format.schema import guide_arrays
+from photonfarm.shared.store.format.schema import output_arrays
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -88,7 +88,7 @@ class GuideInputs:
     @classmethod
     def empty(cls, memory: Memory, spec: SceneSpec) -> GuideInputs:
         """Unfilled guides."""
-        shapes = {name: array.shape for name, array in guide_arrays(spec).items()}
+        shapes = {name: array.shape for name, array in output_arrays(spec).items()}
         return cls(**{f.name: memory(*shapes[f.name]) for f in fields(cls)})
 
 

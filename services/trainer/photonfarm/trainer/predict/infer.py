@@ -180,11 +180,6 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
         )
     if run.needs.photons and frames.photons is None:
         raise SpecError(f"{run.folder}: {run.settings.network.architecture} needs photons, and the buffers have none")
-    if run.needs.guides and frames.guides is None:
-        raise SpecError(
-            f"{run.folder}: {run.settings.network.architecture} needs guides, and the buffers have none: make them of "
-            "a store whose scene has guides, by `photonfarm buffers`"
-        )
 
 
 def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[TrainingBatch]:

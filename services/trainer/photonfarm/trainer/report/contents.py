@@ -131,7 +131,7 @@ def _inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tu
     """The buffers of some rows, and their guides if the run reads these, in memory of their own."""
     source = StoreSource(store, run.scene_id)
     if run.needs.guides:
-        source.follow_guides()
+        source.read_guides()
     there = set(source.refresh().tolist())
     found = {}
     for row in rows:

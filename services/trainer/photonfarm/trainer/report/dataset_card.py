@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.shared.plan.request import UNUSED
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStatus, SceneStore, Store
 from photonfarm.shared.store.write.status import scene_status
 
@@ -29,7 +29,6 @@ class DatasetCard:
     """A scene of a store, described by its plans and markers."""
 
     spec: SceneSpec
-    guides: GuideSpec | None  # the settings of the scene's guides, if it has some
     status: SceneStatus
     requests: tuple[dict[str, Any], ...]  # of each plan: all rows follow from them
     versions: dict[str, list[str]]  # of the packages that rendered, each with all versions
@@ -44,18 +43,15 @@ class DatasetCard:
         versions: dict[str, set[str]] = {}
         workers = set()
         core_s: dict[int, float] = {}
-        committed, guided = scene.committed_jobs(), scene.guides.committed_jobs()
-        marked = [(job, scene.marker(job)) for job in sorted(committed)]
-        marked += [(job, scene.guides.marker(job)) for job in sorted(guided & committed)]
-        for job, marker in marked:
-            figures = marker["figures"]
-            core_s[job] = core_s.get(job, 0.0) + figures["core_s"]
+        for job in sorted(scene.committed_jobs()):
+            figures = scene.marker(job)["figures"]
+            core_s[job] = figures["core_s"]
             workers.add(figures["worker"])
             for package, version in figures["versions"].items():
                 versions.setdefault(package, set()).add(version)
         requests = tuple(plan.request.model_dump(mode="json") for plan in scene.plans())
         known = {package: sorted(found) for package, found in sorted(versions.items())}
-        return cls(scene.spec, scene.guides.settings(), status, requests, known, len(workers), _spent(scene, core_s))
+        return cls(scene.spec, status, requests, known, len(workers), _spent(scene, core_s))
 
     @property
     def samples(self) -> PlanTotals:
@@ -88,7 +84,7 @@ class DatasetCard:
             "points": spec.points,
             "transport": spec.transport.model_dump(),
             "photons": spec.photons.model_dump(),
-            "guides": None if self.guides is None else self.guides.model_dump(),
+            "guides": spec.guides.model_dump(),
             "spp_per_sample": 2 * spec.transport.half_spp,
             "samples_planned": status.samples_planned,
             "samples_complete": status.samples_complete,

@@ -14,7 +14,6 @@ from math import ceil
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, StoreError, store_errors
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.check.content_check import CheckTotals
-from photonfarm.shared.store.check.guide_check import GuideCheck
 from photonfarm.shared.store.check.halves import SIGNIFICANCE, HalvesResult, HalvesTest
 from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.check.job_pool import JobPool
@@ -25,8 +24,7 @@ from photonfarm.shared.store.check.unplanned_files import unplanned_files
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans
-from photonfarm.shared.store.write.findings import Cause, Finding, FindingGroup, Findings, JobPart, Remedy
-from photonfarm.shared.store.write.guides import GUIDES
+from photonfarm.shared.store.write.findings import Cause, Finding, FindingGroup, Findings, Remedy
 from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
 from photonfarm.shared.store.write.store import Store
@@ -46,13 +44,12 @@ class SceneReport:
     scene_id: str
     name: str | None  # None if its spec cannot be read
     jobs: int  # committed ones that were checked
-    guide_jobs: int  # those of them whose guides were checked
     samples: int
     size_bytes: int
     back_facing_share: float | None  # of the pixels that meet something; None if none does
     halves: HalvesResult | None
     groups: tuple[FindingGroup, ...]
-    set_aside: tuple[str, ...]  # "job 12", "guides of job 12", "base", "spec"
+    set_aside: tuple[str, ...]  # "job 12", "base", "spec"
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,10 +120,10 @@ class _SceneChecking:
         self._name = f"{SCENES}/{scene_id}"
         self._on_progress = on_progress
         self._findings = Findings()
-        self._markers: dict[JobPart, bytes] = {}  # of jobs with findings
+        self._markers: dict[int, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
         self._scenes = scenes
-        self._totals, self._guide_totals = CheckTotals(HalvesTest(scenes)), CheckTotals(HalvesTest(scenes))
+        self._totals = CheckTotals(HalvesTest(scenes))
 
     def run(self, quarantine: Quarantine | None) -> SceneReport:
         """Check everything; set aside what is damaged, unless `quarantine` is None."""
@@ -138,7 +135,6 @@ class _SceneChecking:
             aside = ["spec"] if quarantine and quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
             return self._report(None, aside)
         committed = markers.jobs(self._storage, self._name)
-        guided = markers.jobs(self._storage, f"{self._name}/{GUIDES}")
         inputs, done = self._plans(spec, quarantine)
         self._add(inputs.check_base(committed))
         scene = None
@@ -147,7 +143,6 @@ class _SceneChecking:
                 self._storage, self._scene_id, self._name, spec, inputs.plans, inputs.shard_rows, frozenset(inputs.lost)
             )
             self._jobs(scene, sorted(committed))
-            done += self._guides(scene.of_guides(), guided, quarantine)
         return self._report(spec.name, [*done, *(self._repair(scene, quarantine) if quarantine else [])])
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
@@ -173,30 +168,21 @@ class _SceneChecking:
         return check, rewritten
 
     def _jobs(self, scene: CheckTarget, committed: list[int]) -> None:
-        self._read(scene, committed, self._totals, scene.spec.name)
+        self._read(scene, committed)
         self._add(self._again(equal_samples(scene, self._totals)))
         if (halves := self._totals.halves.result()) is not None and not halves.passed:
             self._add([Finding(Cause.HALVES_DIFFER, halves_in_words(halves), self._scene_id)])
 
-    def _guides(self, guides: CheckTarget, committed: set[int], quarantine: Quarantine | None) -> list[str]:
-        """Check the scene's guides, if it has some; returns what of their settings and declarations was repaired."""
-        if not self._storage.names(guides.name):
-            return []
-        check = GuideCheck(guides, committed)
-        found = list(check.run())
-        self._add(found)
-        self._read(guides, sorted(committed), self._guide_totals, f"{guides.spec.name}, guides")
-        return check.repair(quarantine, found) if quarantine else []
-
-    def _read(self, scene: CheckTarget, committed: list[int], total: CheckTotals, called: str) -> None:
-        """Read everything that committed jobs stored there, and look for what is missing."""
+    def _read(self, scene: CheckTarget, committed: list[int]) -> None:
+        """Read everything that committed jobs stored, and look for what is missing."""
+        called, total = scene.spec.name, self._totals
         with JobPool(scene, self._scenes) as pool:
             for done in range(0, len(committed), AT_ONCE):
                 jobs = committed[done : done + AT_ONCE]
                 self._on_progress(called, done, len(committed), pool.size_bytes)
                 for job, (found, marker) in zip(jobs, pool.run(jobs), strict=True):
                     if found:
-                        self._markers[scene.guides, job] = marker
+                        self._markers[job] = marker
                         self._add(self._again(found))
             for part in pool.totals:
                 total.add(part)
@@ -214,36 +200,36 @@ class _SceneChecking:
         if job not in self._same:
             self._same[job] = False
             with contextlib.suppress(FileNotFoundError, CorruptError):  # set aside just now, or reported by itself
-                self._same[job] = was_set_aside(self._storage, self._name, job, self._marker((False, job)))
+                self._same[job] = was_set_aside(self._storage, self._name, job, self._marker(job))
         return self._same[job]
 
-    def _marker(self, part: JobPart) -> bytes:
+    def _marker(self, job: int) -> bytes:
         """The marker that findings of a job refer to; raises FileNotFoundError if it was set aside in the meantime."""
-        if part not in self._markers:  # found when all samples were looked at
-            self._markers[part] = self._storage.read(markers.name_of(self._name, part[1]))
-        return self._markers[part]
+        if job not in self._markers:  # found when all samples were looked at
+            self._markers[job] = self._storage.read(markers.name_of(self._name, job))
+        return self._markers[job]
 
     def _add(self, found: Iterator[Finding] | list[Finding]) -> None:
         self._findings.add(found)
 
     def _report(self, name: str | None, set_aside: list[str]) -> SceneReport:
-        totals, guides = self._totals, self._guide_totals
+        totals = self._totals
         share = totals.back_facing_pixels / totals.hit_pixels if totals.hit_pixels else None
         return SceneReport(
-            self._scene_id, name, totals.jobs, guides.jobs, totals.samples, totals.size_bytes + guides.size_bytes,
-            share, totals.halves.result(), self._findings.groups(), tuple(set_aside),
+            self._scene_id, name, totals.jobs, totals.samples, totals.size_bytes, share,
+            totals.halves.result(), self._findings.groups(), tuple(set_aside),
         )  # fmt: skip
 
     # ----------------------------------------------------------------------------------------------------------- repair
 
     def _repair(self, scene: CheckTarget | None, quarantine: Quarantine) -> list[str]:
         aside = []
-        for (guides, job), why in sorted(self._findings.jobs.items(), key=lambda found: found[0]):
+        for job, why in sorted(self._findings.jobs.items()):
             if scene is None or scene.plans is None:
                 detail = "stays until the plans are whole"
-                self._add([Finding(Cause.LEFT, detail, self._scene_id, job, guides=guides)])
-            elif self._set_aside(scene.of_guides() if guides else scene, quarantine, job, why):
-                aside.append(f"guides of job {job}" if guides else f"job {job}")
+                self._add([Finding(Cause.LEFT, detail, self._scene_id, job)])
+            elif self._set_aside(scene, quarantine, job, why):
+                aside.append(f"job {job}")
         if why := self._findings.of(Cause.BASE):
             if quarantine.base(self._name, why):
                 aside.append("base")
@@ -259,7 +245,7 @@ class _SceneChecking:
     def _set_aside(self, scene: CheckTarget, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:
         files = set(scene.files_of(job).values())
         try:
-            marker = self._marker((scene.guides, job))
+            marker = self._marker(job)
             files.update(markers.files(marker, scene.name, job))
         except FileNotFoundError:  # another repair has been here
             return False

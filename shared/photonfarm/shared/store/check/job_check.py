@@ -1,13 +1,10 @@
-"""Reads everything that one committed job stored: its marker, its files, each of their rows.
-
-A job's samples and its guides have markers of their own, and are checked separately.
-"""
+"""Reads everything that one committed job stored: its marker, its files, each of their rows."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,7 +18,6 @@ from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import Storage
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Cause, Finding
-from photonfarm.shared.store.write.guides import GUIDES, beside
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
 KINDS: tuple[schema.RowKind, ...] = ("sample", "view", "modification")
@@ -29,44 +25,29 @@ KINDS: tuple[schema.RowKind, ...] = ("sample", "view", "modification")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckTarget:
-    """A folder with plans and markers that is being checked: a scene's samples, or its guides."""
+    """A scene that is being checked."""
 
     storage: Storage
     scene_id: str
-    name: str  # of the folder that has the plans and markers
+    name: str  # of its folder
     spec: SceneSpec
     plans: list[StoredPlan] | None  # None if one is damaged: then only what markers state can be checked
     shard_rows: int
     lost: frozenset[str] = frozenset()  # folders of plans that are missing
-    guides: bool = False  # True: the folder of the guides
-
-    def of_guides(self) -> CheckTarget:
-        """The guides of the scene, whose plans and jobs have the same numbers."""
-        name = f"{self.name}/{GUIDES}"
-        found = None if self.plans is None else [beside(plan, name) for plan in self.plans]
-        lost = frozenset(f"{name}{folder.removeprefix(self.name)}" for folder in self.lost)
-        return replace(self, name=name, plans=found, lost=lost, guides=True)
 
     @property
     def arrays(self) -> Mapping[str, schema.ArraySchema]:
         """The arrays that jobs store there, by name."""
-        return schema.guide_arrays(self.spec) if self.guides else schema.output_arrays(self.spec)
+        return schema.output_arrays(self.spec)
 
     def wanted(self, rows: JobRows) -> dict[schema.RowKind, Set[int]]:
         """The rows that a job stores of each kind."""
-        if self.guides:
-            return {"sample": frozenset(), "view": rows.new_views, "modification": frozenset()}
         samples = {sample.row for sample in rows.samples}
         return {"sample": samples, "view": rows.new_views, "modification": rows.new_modifications}
 
     def finding(self, cause: Cause, job: int, detail: str, file: str | None = None, row: int | None = None) -> Finding:
         """A finding about a job."""
-        return Finding(cause, detail, self.scene_id, job, row, file, self.guides)
-
-    def plan_of(self, folder: str) -> str:
-        """The folder of the plan that a folder of its outputs belongs to."""
-        scene = self.name.removesuffix(f"/{GUIDES}") if self.guides else self.name
-        return f"{scene}{folder.removeprefix(self.name)}"
+        return Finding(cause, detail, self.scene_id, job, row, file)
 
     def files_of(self, job: int) -> dict[str, str]:
         """The names that a job's files may have, by array; empty for a job of no known plan."""
@@ -135,7 +116,7 @@ class JobCheck:
         with contextlib.suppress(CorruptError):
             named = {_plan_of(file) for file in markers.files(marker, scene.name, job)}
             if missing := named - {plan.folder for plan in scene.plans or []}:
-                return self._finding(Cause.PLAN, job, plans.MISSING, f"{scene.plan_of(min(missing))}/zarr.json")
+                return self._finding(Cause.PLAN, job, plans.MISSING, f"{min(missing)}/zarr.json")
         return self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
 
     # ------------------------------------------------------------------------------------------------------------ files

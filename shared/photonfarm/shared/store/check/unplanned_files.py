@@ -1,4 +1,4 @@
-"""Files of a scene, or of its guides, that belong to no committed job."""
+"""Files of a scene that belong to no committed job."""
 
 from __future__ import annotations
 
@@ -28,8 +28,7 @@ def unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
             else:
                 left.setdefault(job, f"{folder}/{name}")
     for job in sorted(left.keys() - markers.jobs(scene.storage, scene.name)):  # now: a worker may have been at it
-        what = "not guides yet" if scene.guides else "not a sample yet"
-        yield scene.finding(Cause.NO_MARKER, job, what, left[job])
+        yield scene.finding(Cause.NO_MARKER, job, "not a sample yet", left[job])
     yield from (Finding(Cause.FOREIGN_FILE, "left alone", scene.scene_id, file=file) for file in foreign)
 
 

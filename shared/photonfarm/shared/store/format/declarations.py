@@ -19,7 +19,7 @@ from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.keys import KEY_BYTES
 
 FORMAT = "photonfarm store"
-VERSION = 4
+VERSION = 5
 
 
 def stamp() -> dict[str, Any]:
@@ -50,8 +50,8 @@ def check_version(name: object, version: object, where: str, document: str = "ph
         advice = f"No photonfarm has written that: versions count from 1. Restore {document} from a copy."
     elif version < VERSION:
         advice = (
-            "An older photonfarm made it: read it with the one that its markers name under figures.versions, or render "
-            "it again into a new store with `photonfarm submit`. Nothing in it has been changed."
+            "An older photonfarm made it: `photonfarm submit` renders its samples into a new store, and this one stays "
+            "as it is."
         )
     else:
         advice = "A newer photonfarm made it: install that one. Nothing in it has been changed."
@@ -91,7 +91,7 @@ _WORLD = "world coordinates"
 _BITS = "bit i of byte j, bit 0 the least significant"
 _SEEN = "1: in the image, and hidden by nothing; bits left over: 0"
 
-OUTPUTS = (
+_SAMPLES_AND_BUFFERS = (
     ArrayDeclaration(
         "radiance",
         ("sample", "half", "y", "x", "channel"),
@@ -191,8 +191,6 @@ OUTPUTS = (
         "surfaces met before: 0 straight from a light; -1: an empty slot, 0 in the other arrays",
     ),
 )
-"""The arrays that jobs produce. The first axis names what a row belongs to."""
-
 _MEAN = "mean over the pixel"
 _FIRST = "of the first surface"
 _BEYOND = "of the surface that pure mirrors, glass and null surfaces lead to; 0: the first surface is none of these"
@@ -298,7 +296,10 @@ GUIDES = (
         "normal, by light that arrives straight from lights; noisy and rounded as direct",
     ),
 )
-"""The arrays that jobs produce for new views in a scene with guides, in groups of their own."""
+"""The guides of a view, which jobs produce with its buffers."""
+
+OUTPUTS = (*_SAMPLES_AND_BUFFERS, *GUIDES)
+"""The arrays that jobs produce. The first axis names what a row belongs to."""
 
 PLAN_INPUTS = (
     ArrayDeclaration(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.core.records import LIT_POINTS
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format.declarations import GUIDES, OUTPUTS, ArrayDeclaration
+from photonfarm.shared.store.format.declarations import OUTPUTS, ArrayDeclaration
 
 if TYPE_CHECKING:
     import zarr
@@ -34,10 +34,6 @@ BLOSC: dict[str, Any] = {
     "clevel": 1,
     "shuffle": "shuffle",
 }  # byte shuffle: floats compress by their exponents
-
-_INDEX_ENTRY, _CRC, _BLOSC_HEADER = 16, 4, 16
-_ROW_OVERHEAD = _BLOSC_HEADER + _CRC
-"""The bytes of a shard beside its values: an index entry and a checksum for each row, and Blosc's header."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,37 +56,20 @@ class ArraySchema:
 
 def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     """The output arrays of a scene, by name; a scene without photons has none for them."""
-    return _arrays(OUTPUTS, spec)
-
-
-def guide_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
-    """The arrays of a scene's guides, by name; each row belongs to a view."""
-    return _arrays(GUIDES, spec)
-
-
-def _arrays(declared: Iterable[ArrayDeclaration], spec: SceneSpec) -> dict[str, ArraySchema]:
     points, photons = (-(-count // 8) for count in bit_counts(spec).values())
     lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
     lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons, "L": min(spec.points, LIT_POINTS)}
-    wanted = [each for each in declared if all(lengths.get(str(n), 1) for n in each.shape)]
+    wanted = [each for each in OUTPUTS if all(lengths.get(str(n), 1) for n in each.shape)]
     return {each.name: _resolved(each, lengths, spec) for each in wanted}
 
 
 def bytes_of_rows(spec: SceneSpec) -> dict[RowKind, int]:
-    """The stored bytes of one sample, one view with its guides, and one modification, with inputs, uncompressed."""
+    """The stored bytes of one sample, one view and one modification, with inputs, uncompressed."""
     found: dict[RowKind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
     for name, array in output_arrays(spec).items():
         if name != "radiance_wide":  # few rows need it
             found[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
-    found["view"] += sum(int(np.prod(array.shape)) * array.dtype.itemsize for array in guide_arrays(spec).values())
     return found
-
-
-def most_guide_bytes(spec: SceneSpec, views: int, jobs: int, shard_rows: int) -> int:
-    """The stored bytes of the guides of so many views, in so many jobs, if nothing can be compressed."""
-    arrays = guide_arrays(spec).values()
-    rows = sum(int(np.prod(array.shape)) * array.dtype.itemsize + _ROW_OVERHEAD for array in arrays)
-    return views * rows + jobs * len(arrays) * (_INDEX_ENTRY * shard_rows + _CRC)
 
 
 def bit_counts(spec: SceneSpec) -> dict[str, int]:

@@ -5,15 +5,17 @@ Shape letters: B batch, H W image, P points, K photon slots.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.records import F32, Visibility
+from photonfarm.shared.core.records import F32, Guides, Visibility
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import schema
+
+GUIDE_NAMES = frozenset(field.name for field in fields(Guides))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,13 +37,13 @@ class Batch:
     def empty(cls, spec: SceneSpec, size: int, *, buffers: bool = True, guides: bool = False) -> Batch:
         """Memory for `size` samples of a scene; without memory for buffers, neither they nor visibility are read."""
         arrays = schema.output_arrays(spec)
-        names = [name for name, array in arrays.items() if array.kind == "view" and buffers]
+        of_view = [name for name, array in arrays.items() if array.kind == "view"]
+        names = [name for name in of_view if (guides if name in GUIDE_NAMES else buffers)]
         memory = {name: np.empty((size, *arrays[name].shape), arrays[name].dtype) for name in ("radiance", *names)}
         bits = schema.bit_counts(spec)
         seen = {name: memory.pop(name) for name in bits if name in memory}
+        of_guides = {name: memory.pop(name) for name in names if name in GUIDE_NAMES}
         rows = np.zeros((3, size), np.int64)
-        known = schema.guide_arrays(spec) if guides else {}
-        of_guides = {name: np.empty((size, *array.shape), array.dtype) for name, array in known.items()}
         radiance = memory.pop("radiance")
         return cls(spec.radiance_exponent, radiance, memory, seen, bits, rows[0], rows[1], rows[2], of_guides)
 

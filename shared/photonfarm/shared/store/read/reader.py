@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
 from photonfarm.shared.core.keys import Key, view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene.modification import Modification, modification_keys
@@ -31,7 +31,6 @@ from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import FORMAT_FILE, open_storage, renew_copy
 from photonfarm.shared.store.read.batch import Batch
 from photonfarm.shared.store.write import plans
-from photonfarm.shared.store.write.guides import GuideStore, beside, has_guides
 from photonfarm.shared.store.write.plans import StoredPlan
 from photonfarm.shared.store.write.scene_store import SCENES, is_there, read_base, read_spec
 from photonfarm.shared.store.write.store import check_format
@@ -48,13 +47,11 @@ class StoredSample:
     buffers: ViewBuffers
     visibility: Visibility
     pass_: int
-    guides: Guides | None = None  # of a reader that reads them
+    guides: Guides | None = None  # None: not asked for
 
 
 REPAIR = "`photonfarm store check --repair` sets its job aside, and workers render it again"
 """The remedy for damaged samples."""
-
-GUIDE_NAMES = frozenset(field.name for field in fields(Guides))
 
 OPEN_SHARDS = 400
 """The most shards that a reader keeps open, with a file descriptor each, two once mapped; a usual limit is 1024."""
@@ -63,12 +60,8 @@ OPEN_SHARDS = 400
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
-    def __init__(self, root: str | Path, scene_id: str, *, guides: bool = False) -> None:
-        """Take the scene to follow; store, scene and plans may appear later. With `guides`, samples come with them."""
-        self._with_guides = guides
-        self._guides: GuideStore | None = None
-        self._guided: set[int] = set()  # jobs whose guides are there
-        self._guide_markers: FollowedMarkers | None = None
+    def __init__(self, root: str | Path, scene_id: str) -> None:
+        """Take the scene to follow; store, scene and plans may appear later."""
         self._storage = open_storage(root)
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
@@ -90,26 +83,7 @@ class SceneReader:
             check_format(self._storage)
             self._spec = read_spec(self._storage, self._scene_id)
             self._arrays = schema.output_arrays(self._spec)
-            if self._with_guides:
-                self._guides = GuideStore(self._storage, self._name, self._spec)
-                self._guide_markers = FollowedMarkers(self._storage, self._guides.name)
-                self._arrays |= schema.guide_arrays(self._spec)
         return self._spec
-
-    def follow_guides(self) -> None:
-        """Read guides too, from the next refresh on: then a sample is complete only if its view has them.
-
-        Raises StoreError while the scene is not there, and SpecError for a scene without guides.
-        """
-        if GuideStore(self._storage, self._name, self.spec).settings() is None:
-            raise SpecError(
-                f"scene {self._scene_id} ({self.spec.name}) has no guides, which an older photonfarm did not render; "
-                f"`photonfarm store upgrade --scene {self._scene_id}` and `photonfarm work` add them, and render no "
-                "sample again"
-            )
-        if not self._with_guides:
-            self._with_guides, self._spec = True, None
-            self._committed, self._complete = set(), np.zeros(0, np.bool_)
 
     def ready(self) -> bool:
         """Whether spec and base are there; the base comes with the scene's first job."""
@@ -140,16 +114,12 @@ class SceneReader:
                 return np.zeros(0, np.int64)
         _ = self.spec
         committed = self._markers.look()  # before the plans: each one's plan is there by now
-        guided = self._guide_markers.look() if self._guide_markers else set()
         self._load_plans()
-        if committed == self._committed and guided == self._guided:
+        if committed == self._committed:
             return np.zeros(0, np.int64)
         complete = plans.complete_rows(self._plans, committed)
-        if self._with_guides:
-            complete[complete] = has_guides(self._plans, guided)[self._view_row[complete]]
-        if (self._committed - committed) | (self._guided - guided):  # markers removed by a repair
+        if self._committed - committed:  # markers removed by a repair
             self._shards.clear()
-        self._guided = guided
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
         self._committed, self._complete = committed, complete
@@ -173,13 +143,14 @@ class SceneReader:
     def read_batch(self, rows: Sequence[int] | NDArray[np.int64], out: Batch | None = None) -> Batch:
         """Read complete samples in the order of `rows`, in their stored types; every byte is checked.
 
-        They are read into the first places of `out`, which are returned; without it, into new memory. Raises
+        They are read into the first places of `out`, which are returned, with all that it has memory for; without it,
+        into new memory, without guides. Raises
         CorruptError if bytes are not what was committed; the content of `out` is then undefined.
         """
         chosen = np.asarray(rows, np.int64)
         self._check_complete(chosen)
         if out is None:
-            out = Batch.empty(self.spec, len(chosen), guides=self._with_guides)
+            out = Batch.empty(self.spec, len(chosen))
         if len(chosen) > len(out):
             raise ValueError(f"rows: {len(chosen)} samples do not fit a batch of {len(out)}")
         batch = out.first(len(chosen))
@@ -194,15 +165,17 @@ class SceneReader:
                     self._read_into(name, row, memory[place])
         return batch
 
-    def read(self, row: int) -> StoredSample:
-        """Read one complete sample; raises CorruptError if its bytes are not what was committed."""
-        batch = self.read_batch([row])
+    def read(self, row: int, *, guides: bool = False) -> StoredSample:
+        """Read one complete sample, with its view's `guides` or without.
+
+        Raises CorruptError if its bytes are not what was committed.
+        """
+        batch = self.read_batch([row], Batch.empty(self.spec, 1, guides=guides))
         buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
         modification, view, pass_ = self.inputs(row)
         known = {name: values[0].astype(np.float32, copy=False) for name, values in batch.guides.items()}
-        guides = Guides(**known) if known else None
-        seen = ViewBuffers(**buffers), batch.visibility(0)
-        sample = StoredSample(row, modification, view, batch.linear(0), *seen, pass_, guides)
+        of_view = ViewBuffers(**buffers), batch.visibility(0), pass_, Guides(**known) if known else None
+        sample = StoredSample(row, modification, view, batch.linear(0), *of_view)
         if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values(), *known.values())):
             where = f"{self._storage.where}/{self._name}"
             raise CorruptError(f"{where}: row {row} holds a value that is not finite; {REPAIR}")
@@ -322,8 +295,7 @@ class SceneReader:
             try:
                 yield
             except CorruptError as error:
-                for followed in filter(None, (self._markers, self._guide_markers)):
-                    followed.doubt()  # a repair may have set the job aside
+                self._markers.doubt()  # a repair may have set the job aside
                 raise CorruptError(f"{error}; {REPAIR}") from error
 
     def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:
@@ -343,8 +315,6 @@ class SceneReader:
 
     def _file(self, name: str, job: int) -> str:
         plan = plans.plan_of(self._plans, job * self._plans[0].shard_rows)
-        if self._guides is not None and name in GUIDE_NAMES:
-            plan = beside(plan, self._guides.name)
         return plan.shard(name, self._arrays[name], job)
 
     def _shard(self, name: str, row: int, *, anew: bool = False) -> tuple[Shard | None, int]:

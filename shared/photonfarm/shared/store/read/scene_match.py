@@ -23,7 +23,6 @@ from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import renew_copy
 from photonfarm.shared.store.read.query import Query
 from photonfarm.shared.store.write import plans
-from photonfarm.shared.store.write.guides import beside
 from photonfarm.shared.store.write.plans import StoredPlan
 from photonfarm.shared.store.write.scene_store import SceneStore
 
@@ -60,7 +59,6 @@ class FoundSample:
     plan: int
     jobs: tuple[int, ...]  # of its own row, its view's and its modification's
     committed: tuple[bool, ...]  # these jobs
-    guided: bool | None  # whether its view has guides, by its job's marker; None: the scene is without guides
     places: tuple[Place, ...]
 
     @property
@@ -164,13 +162,8 @@ class SceneMatch:
             plan=plan.number,
             jobs=jobs,
             committed=tuple(job in self._committed for job in jobs),
-            guided=self._guided(jobs[1]),
-            places=(*self._places(rows), *self._guide_places(sample.view_row)),
+            places=tuple(self._places(rows)),
         )
-
-    def _guided(self, job: int) -> bool | None:
-        guides = self._scene.guides
-        return None if guides.settings() is None else guides.is_committed(job)
 
     def _places(self, rows: dict[str, int]) -> list[Place]:
         found = []
@@ -182,14 +175,6 @@ class SceneMatch:
         if any(place.array == "radiance_wide" for place in found):  # and those have nothing in `radiance`
             found = [place for place in found if place.array != "radiance" or place.there]
         return found
-
-    def _guide_places(self, view_row: int) -> list[Place]:
-        """The places of a view's guides; none if the scene is without guides."""
-        if self._scene.guides.settings() is None:
-            return []
-        plan = beside(plans.plan_of(self._plans, view_row), self._scene.guides.name)
-        arrays = schema.guide_arrays(self._scene.spec)
-        return [self._place(plan, name, array, view_row) for name, array in arrays.items()]
 
     def _place(self, plan: StoredPlan, name: str, array: schema.ArraySchema, row: int) -> Place:
         job, chunk = divmod(row, plan.shard_rows)

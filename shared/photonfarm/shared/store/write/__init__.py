@@ -1,1 +1,1 @@
-"""Writing: plans, a job's rows and its commit, guides, and what is set aside."""
+"""Writing: plans, a job's rows and its commit, and what is set aside."""

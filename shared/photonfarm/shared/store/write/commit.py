@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
@@ -20,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, store_errors
-from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.shared.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.shards import Shard, ShardWriter, encode
@@ -28,7 +27,7 @@ from photonfarm.shared.store.io.storage import Storage, discard, renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 from photonfarm.shared.store.write.quarantine import Quarantine
-from photonfarm.shared.store.write.rounding import as_array, stays_finite
+from photonfarm.shared.store.write.rounding import NOISY_GUIDES, as_array, rounded, stays_finite
 
 WAITING_ROWS = 8
 """The most rows that wait to be written: more would only hide for a while that the disk is slower than the renderer."""
@@ -61,7 +60,7 @@ def _utc_now() -> datetime:
 
 
 class CommitTarget(Protocol):
-    """The target of a commit: a scene, or its guides."""
+    """The scene that a job is committed to."""
 
     @property
     def storage(self) -> Storage:
@@ -69,7 +68,7 @@ class CommitTarget(Protocol):
 
     @property
     def name(self) -> str:
-        """The name of its folder, which has plans and markers."""
+        """The name of its folder."""
 
     @property
     def scene_id(self) -> str:
@@ -80,26 +79,27 @@ class CommitTarget(Protocol):
         """The scene's spec."""
 
     def is_committed(self, job: int) -> bool:
-        """Whether a job has its marker there."""
+        """Whether a job has its marker."""
 
 
-class RowWriter(ABC):
-    """Takes rows of a job's arrays in any order, and commits them to a `CommitTarget` once all are there.
+class JobWriter:
+    """Takes a job's rows in any order, and commits them once all are there.
+
+    They are the radiance of its samples, buffers, guides and visibility of its new views, and photons of its new
+    modifications.
 
     A context manager: leaving it without `commit` leaves nothing behind. Arrays must not be changed after they are
     passed. The methods raise IncompleteError for a row that is not the job's, of the wrong shape or not finite, and
     StoreError once the disk has refused something.
     """
 
-    def __init__(
-        self, scene: CommitTarget, rows: JobRows, plan: StoredPlan, arrays: Mapping[str, schema.ArraySchema]
-    ) -> None:
-        """Begin; `plan` determines the folder of the arrays."""
+    def __init__(self, scene: CommitTarget, rows: JobRows, plan: StoredPlan) -> None:
+        """Begin; `SceneStore.job_writer` calls this."""
         self._scene = scene
         self._rows = rows
         self._plan = plan
         self._storage = scene.storage
-        self._arrays = arrays
+        self._arrays = schema.output_arrays(scene.spec)
         self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
         self._shards: dict[str, ShardWriter] = {}
         self._waiting: queue.Queue[tuple[str, int, memoryview] | None] = queue.Queue(WAITING_ROWS)
@@ -122,6 +122,37 @@ class RowWriter(ABC):
             discard(shard.part)
 
     # ------------------------------------------------------------------------------------------------------------- rows
+
+    def radiance(self, row: int, halves: F32) -> None:
+        """Add the half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
+        self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
+        self._put(row, *as_array(halves, self._scene.spec.radiance_exponent))
+
+    def view(self, row: int, buffers: ViewBuffers, guides: Guides, visibility: Visibility) -> None:
+        """Add a new view row: its buffers, its guides, and which points and photons it sees."""
+        self._claim("view", row, "view", self._rows.new_views)
+        for name, values in arrays_of(buffers).items():
+            self._put(row, name, values)
+        for name, values in arrays_of(guides).items():
+            self._put(row, name, rounded(values) if name in NOISY_GUIDES else values)
+        self._put_bits(row, "point_seen", visibility.points)
+        self._put_bits(row, "photon_seen", visibility.photons)
+
+    def photons(self, row: int, photons: Photons) -> None:
+        """Add the photons of a new modification row."""
+        self._claim("modification", row, "photons", self._photon_rows())
+        for name, values in arrays_of(photons).items():
+            self._put(row, f"photon_{name}", values)
+
+    def _photon_rows(self) -> frozenset[int]:
+        return self._rows.new_modifications if self._scene.spec.photons.paths else frozenset()
+
+    def _put_bits(self, row: int, name: str, seen: NDArray[np.bool_]) -> None:
+        count = schema.bit_counts(self._scene.spec)[name]
+        if seen.shape != (count,):
+            raise IncompleteError(f"{name} of row {row} has shape {seen.shape}; {(count,)} is required")
+        if count:
+            self._put(row, name, np.packbits(seen, bitorder="little"))
 
     def _claim(self, kind: schema.RowKind, row: int, what: str, expected: set[int] | frozenset[int]) -> None:
         if row not in expected or row in self._given[kind]:
@@ -283,9 +314,12 @@ class RowWriter(ABC):
     def _plan_file(self, name: str) -> str:
         return self._file(name).removeprefix(f"{self._scene.name}/")
 
-    @abstractmethod
     def _expected(self) -> dict[schema.RowKind, tuple[str, Set[int]]]:
-        """The rows required of each kind, with the name of the kind in messages."""
+        return {
+            "sample": ("radiance", {sample.row for sample in self._rows.samples}),
+            "view": ("view", self._rows.new_views),
+            "modification": ("photons", self._photon_rows()),
+        }
 
     def _check_complete(self) -> None:
         for kind, (what, rows) in self._expected().items():
@@ -314,64 +348,6 @@ class RowWriter(ABC):
             return False
         return True
 
-    @abstractmethod
-    def _check_readable(self) -> None:
-        """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
-
-    def _check_rows(self, name: str, wanted: Set[int], *, may_be_missing: bool = False) -> set[int]:
-        """Check the rows of one shard; returns the missing ones if they may be missing, else raises CorruptError."""
-        if not wanted:
-            return set()
-        rows = self._plan.shard_rows
-        missing = self._look(name, lambda shard: {row for row in wanted if shard.read(row % rows) is None})
-        if missing and not may_be_missing:
-            raise CorruptError(f"{self._storage.where}/{self._file(name)}: row {min(missing)} is missing")
-        return missing
-
-
-class JobWriter(RowWriter):
-    """Takes a job's outputs: radiance of its samples, buffers of new views, photons of new modifications."""
-
-    def __init__(self, scene: CommitTarget, rows: JobRows, plan: StoredPlan) -> None:
-        """Begin; `SceneStore.job_writer` calls this."""
-        super().__init__(scene, rows, plan, schema.output_arrays(scene.spec))
-
-    def radiance(self, row: int, halves: F32) -> None:
-        """Add the half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
-        self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
-        self._put(row, *as_array(halves, self._scene.spec.radiance_exponent))
-
-    def view(self, row: int, buffers: ViewBuffers, visibility: Visibility) -> None:
-        """Add a new view row: its buffers, and which points and photons it sees."""
-        self._claim("view", row, "view", self._rows.new_views)
-        for name, values in arrays_of(buffers).items():
-            self._put(row, name, values)
-        self._put_bits(row, "point_seen", visibility.points)
-        self._put_bits(row, "photon_seen", visibility.photons)
-
-    def photons(self, row: int, photons: Photons) -> None:
-        """Add the photons of a new modification row."""
-        self._claim("modification", row, "photons", self._photon_rows())
-        for name, values in arrays_of(photons).items():
-            self._put(row, f"photon_{name}", values)
-
-    def _photon_rows(self) -> frozenset[int]:
-        return self._rows.new_modifications if self._scene.spec.photons.paths else frozenset()
-
-    def _put_bits(self, row: int, name: str, seen: NDArray[np.bool_]) -> None:
-        count = schema.bit_counts(self._scene.spec)[name]
-        if seen.shape != (count,):
-            raise IncompleteError(f"{name} of row {row} has shape {seen.shape}; {(count,)} is required")
-        if count:
-            self._put(row, name, np.packbits(seen, bitorder="little"))
-
-    def _expected(self) -> dict[schema.RowKind, tuple[str, Set[int]]]:
-        return {
-            "sample": ("radiance", {sample.row for sample in self._rows.samples}),
-            "view": ("view", self._rows.new_views),
-            "modification": ("photons", self._photon_rows()),
-        }
-
     def _check_readable(self) -> None:
         """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
         wanted = {"view": self._rows.new_views, "modification": self._rows.new_modifications}
@@ -382,6 +358,16 @@ class JobWriter(RowWriter):
         if self._storage.exists(self._file("radiance")):
             samples = self._check_rows("radiance", samples, may_be_missing=True)
         self._check_rows("radiance_wide", samples)
+
+    def _check_rows(self, name: str, wanted: Set[int], *, may_be_missing: bool = False) -> set[int]:
+        """Check the rows of one shard; returns the missing ones if they may be missing, else raises CorruptError."""
+        if not wanted:
+            return set()
+        rows = self._plan.shard_rows
+        missing = self._look(name, lambda shard: {row for row in wanted if shard.read(row % rows) is None})
+        if missing and not may_be_missing:
+            raise CorruptError(f"{self._storage.where}/{self._file(name)}: row {min(missing)} is missing")
+        return missing
 
 
 def _matches(named: Mapping[str, Any] | None, there: Mapping[str, Any] | None) -> bool:

@@ -14,10 +14,6 @@ REASONS = 20
 """The findings of one job that its quarantine record lists."""
 
 
-JobPart = tuple[bool, int]
-"""The unit that is set aside: whether it is a job's guides or its samples, and the job."""
-
-
 class Remedy(Enum):
     """The remedies for causes."""
 
@@ -25,7 +21,6 @@ class Remedy(Enum):
     BASE = "write the base again"  # it is set aside, and the next job writes it
     SUBMIT = "submit the spec again"  # it is set aside, and written by the next submission
     REWRITE = "write it again from the plan's request"  # by --repair, at once; what was there is set aside
-    UPGRADE = "ask for guides again"  # it is set aside, and written by `photonfarm store upgrade`
     REPORT = "cannot be repaired here"
     LOOK = "may be right: worth a look"  # no error, and no exit code
 
@@ -81,11 +76,6 @@ class Cause(Enum):
         "an input of a plan, or the declaration of an output, is not what was stored",
         Remedy.REWRITE,
     )
-    GUIDE_SETTINGS = (
-        "guide-settings",
-        "what a scene's guides are rendered with is missing or not what was stored",
-        Remedy.UPGRADE,
-    )
     BASE = "base", "geometry or base point cloud are not what was stored", Remedy.BASE
     BASE_TO_COME = (
         "base-to-come",
@@ -124,7 +114,6 @@ class Finding:
     job: int | None = None
     row: int | None = None  # in the scene
     file: str | None = None  # its name in the store
-    guides: bool = False  # True: about a job's guides; False: about its samples
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +131,7 @@ class Findings:
     def __init__(self) -> None:
         self._count: Counter[Cause] = Counter()
         self._first: dict[Cause, list[Finding]] = {}
-        self.jobs: dict[JobPart, list[Finding]] = {}  # to be rendered again, each with its first reasons
+        self.jobs: dict[int, list[Finding]] = {}  # to be rendered again, each with its first reasons
 
     def add(self, found: Iterable[Finding]) -> None:
         """Add findings."""
@@ -150,7 +139,7 @@ class Findings:
             self._count[finding.cause] += 1
             _keep(self._first.setdefault(finding.cause, []), finding, NAMED)
             if finding.job is not None and finding.cause.remedy is Remedy.RENDER:
-                _keep(self.jobs.setdefault((finding.guides, finding.job), []), finding, REASONS)
+                _keep(self.jobs.setdefault(finding.job, []), finding, REASONS)
 
     def of(self, cause: Cause) -> list[Finding]:
         """The first findings of a cause."""

@@ -2,7 +2,7 @@
 
 STORE/quarantine/000000/repair.json                  a repair: when; its number is claimed by placing this file
 STORE/quarantine/000000/job-<scene id>-<job>.json    what was set aside of a job and why; base-…, spec-…, plan-…
-alike; of guides, …-<scene id>-guides-…
+alike
 STORE/quarantine/000000/scenes/<scene id>/…          the files, under the names that they had
 
 The marker goes first: from then on readers do not see the job and workers find it missing, and what becomes of its
@@ -36,7 +36,7 @@ class Quarantine:
         self.folder: str | None = None  # its name in the store, once claimed
 
     def job(self, scene: str, job: int, marker: bytes, files: Iterable[str], why: Sequence[Finding]) -> bool:
-        """Set a committed job aside: its marker, then its files; `scene` is the scene's folder, or that of its guides.
+        """Set a committed job aside: its marker, then its files; `scene` is the scene's folder.
 
         False if its marker is not `marker` any more, as another repair was faster. Raises StoreError.
         """
@@ -71,19 +71,11 @@ class Quarantine:
 
     def spec(self, scene: str, why: Sequence[Finding]) -> bool:
         """Set a scene's spec aside, so that the next submission of it writes it; False if it is not there."""
-        then = "`photonfarm submit` of the same spec writes it"
-        return self._document(f"{scene}/spec.json", f"spec-{_id(scene)}", why, then)
-
-    def settings(self, guides: str, why: Sequence[Finding]) -> bool:
-        """Set the settings in a folder of guides aside, so that they can be requested anew; False without any."""
-        then = "`photonfarm store upgrade` writes it"
-        return self._document(f"{guides}/settings.json", f"settings-{_id(guides)}", why, then)
-
-    def _document(self, name: str, record: str, why: Sequence[Finding], then: str) -> bool:
-        with store_errors("set a document aside", self._storage.where):
+        name = f"{scene}/spec.json"
+        with store_errors("set the spec aside", self._storage.where):
             if not self._storage.exists(name):
                 return False
-            self._record(record, why, [name], then)
+            self._record(f"spec-{_id(scene)}", why, [name], "`photonfarm submit` of the same spec writes it")
             return bool(self._move([name]))
 
     def rewrite(self, scene: str, plan: int, files: Mapping[str, Path], why: Sequence[Finding]) -> None:
@@ -171,5 +163,5 @@ def was_set_aside(storage: Storage, scene: str, job: int, marker: bytes) -> bool
 
 
 def _id(scene: str) -> str:
-    """The name by which records identify a scene's folder, or that of its guides."""
-    return "-".join(scene.split("/")[1:])
+    """The id of the scene in a folder."""
+    return scene.rpartition("/")[2]

@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.records import F32
 
+NOISY_GUIDES = ("direct", "gloss", "point_light")
+"""The guides that are sampled, with seeds of their own; they are rounded."""
+
 
 def as_array(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
     """The array that a sample goes to, and its values: scaled, or unscaled if float16 cannot hold them."""
@@ -35,3 +38,15 @@ def stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
         return True
     end = {2: 65520.0, 4: 2.0**128 - 2.0**103}[stored.itemsize]
     return -end < float(values.min()) and float(values.max()) < end
+
+
+def rounded(values: NDArray[Any]) -> F32:
+    """Numbers rounded to 8 significant bits, to nearest with ties to even; noisy values need no more.
+
+    The two lower bytes are then 0 and take no room once compressed. Finite values must not be within 0.4 % of the
+    largest float32.
+    """
+    bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
+    to_even = (bits >> np.uint32(16)) & np.uint32(1)
+    kept: F32 = ((bits + np.uint32(0x7FFF) + to_even) & np.uint32(0xFFFF0000)).view(np.float32)
+    return kept

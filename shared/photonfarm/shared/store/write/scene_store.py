@@ -28,7 +28,6 @@ from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.io.storage import Storage
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.commit import JobWriter
-from photonfarm.shared.store.write.guides import GuideStore, GuideWriter, has_guides
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
 SCENES = "scenes"
@@ -54,7 +53,6 @@ class Progress:
 
     planned_samples: int
     committed_samples: int  # complete ones
-    usable_samples: int  # of these, those whose view lacks no guides, if the scene has guides
     planned_passes: int  # of the planned samples, further passes: those that top-ups planned
     committed_passes: int  # of these, the complete ones
 
@@ -68,9 +66,8 @@ class SceneStore:
         self.scene_id = scene_id
         self.name = f"{SCENES}/{scene_id}"  # of its folder
         self.spec = read_spec(storage, scene_id)
-        self.guides = GuideStore(storage, self.name, self.spec)
         self._plans: list[StoredPlan] = []
-        self._followed = [FollowedMarkers(storage, name) for name in (self.name, self.guides.name)]
+        self._followed = FollowedMarkers(storage, self.name)
 
     @property
     def folder(self) -> Path:
@@ -97,16 +94,15 @@ class SceneStore:
         Raises SpecError for an invalid request or number of rows, and CorruptError if a plan is missing.
         """
         while True:
-            last = {name: max(markers.jobs(self.storage, name), default=-1) for name in (self.name, self.guides.name)}
+            last = max(markers.jobs(self.storage, self.name), default=-1)
             found = self.plans()  # after the markers: each one's plan is there by now
             rows_per_job = self._shard_rows(found, shard_rows, usual_rows)
             first_job = found[-1].end_job if found else 0
-            for name, job in last.items():
-                if job >= first_job:
-                    raise CorruptError(
-                        f"{self.storage.where}/{markers.name_of(name, job)}: no plan has this job, and a new "
-                        "plan would take its number; `photonfarm store check` reports whether the last plan is missing"
-                    )
+            if last >= first_job:
+                raise CorruptError(
+                    f"{self.storage.where}/{markers.name_of(self.name, last)}: no plan has this job, and a new plan "
+                    "would take its number; `photonfarm store check` reports whether the last plan is missing"
+                )
             expansion = plans.expanded(self.spec, request, found, first_job=first_job, shard_rows=rows_per_job)
             if expansion.rows is None or dry_run:
                 return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
@@ -146,11 +142,6 @@ class SceneStore:
         rows = self.job_rows(job)
         return JobWriter(self, rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
 
-    def guide_writer(self, job: int) -> GuideWriter:
-        """A writer that takes and commits the guides of a job's new views; raises IndexError for a job of no plan."""
-        rows = self.job_rows(job)
-        return self.guides.writer(rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
-
     def jobs(self) -> int:
         """The number of planned jobs; they are numbered from 0."""
         found = self.plans()
@@ -161,53 +152,35 @@ class SceneStore:
         return markers.jobs(self.storage, self.name)
 
     def missing_jobs(self, *, followed: bool = False) -> list[int]:
-        """The jobs that are planned and not committed, or lack the guides that the scene has, in order.
+        """The jobs that are planned and not committed, in order.
 
         `followed` is for callers who ask often, as in `progress`: they may be told late of jobs that a repair has set
         aside, and should ask without it before they take nothing to be missing.
         """
-        rendered, guided = self._followed
-        committed = rendered.look() if followed else self.committed_jobs()
-        jobs = range(self.jobs())
-        uncommitted = {job for job in jobs if job not in committed}
-        unguided = self.guides.lacks(
-            self._plans, [job for job in jobs if job in committed], guided.look if followed else None
-        )
-        return sorted(uncommitted.union(unguided))
+        committed = self._followed.look() if followed else self.committed_jobs()
+        return [job for job in range(self.jobs()) if job not in committed]
 
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
         return self.storage.exists(markers.name_of(self.name, job))
-
-    def is_done(self, job: int) -> bool:
-        """Whether a job is committed, and lacks no guides."""
-        return self.is_committed(job) and not self.guides.lacks_job(self.job_rows(job))
 
     def marker(self, job: int) -> dict[str, Any]:
         """The marker of a committed job: its files and its figures."""
         return markers.read(self.storage, self.name, job)
 
     def progress(self, *, followed: bool = False) -> Progress:
-        """The scene's progress; costs one listing of the markers, and of those of guides.
+        """The scene's progress; costs one listing of the markers.
 
         It costs those who ask often less if it is `followed`: what a repair sets aside may then be seen late
         (`FollowedMarkers`).
         """
-        if followed:
-            committed, guided = (each.look() for each in self._followed)
-        else:
-            committed, guided = self.committed_jobs(), self.guides.committed_jobs()
+        committed = self._followed.look() if followed else self.committed_jobs()
         found = self.plans()
         complete = plans.complete_rows(found, committed)
-        usable = complete.copy()
-        if self.guides.settings() is not None and found:
-            view_row = np.concatenate([plan.rows.sample_view for plan in found])
-            usable[complete] = has_guides(found, guided)[view_row[complete]]
         further = [plan for plan in found if isinstance(plan.request, TopUp)]
         return Progress(
             planned_samples=sum(plan.samples for plan in found),
             committed_samples=int(np.count_nonzero(complete)),
-            usable_samples=int(np.count_nonzero(usable)),
             planned_passes=sum(plan.samples for plan in further),
             committed_passes=sum(int(np.count_nonzero(complete[p.first_row : p.end_row])) for p in further),
         )

@@ -8,10 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.store.write.guides import has_guides, used_views
 from photonfarm.shared.store.write.scene_store import SceneStore
 from photonfarm.shared.store.write.store import Store, check_format
 
@@ -26,17 +23,13 @@ class SceneStatus:
     samples_complete: int
     jobs_planned: int
     jobs_committed: int
-    size_bytes: int  # of the committed outputs, with guides
-    core_s: float  # processor time of the committed jobs, with that of guides
+    size_bytes: int  # of the committed outputs
+    core_s: float  # processor time of the committed jobs
     redrawn: int  # renders thrown away for a non-finite value
     markers_unreadable: int  # of committed jobs whose bytes, time and redrawn renders are not counted
     marker_error: str | None  # why the first of these cannot be read
     markers_without_plan: int = 0  # of committed jobs that no plan has: the last plan is missing
     error: str | None = None  # why the scene cannot be read; all numbers are 0 then
-    views_planned: int = 0
-    views_guided: int | None = None  # the views with guides; None: the scene has no guides, and none are requested
-    guide_jobs: int = 0  # whose guides are committed
-    guide_bytes: int = 0  # of their guides, out of `size_bytes`
 
 
 _READERS = 8
@@ -72,13 +65,9 @@ def scene_status(scene: SceneStore) -> SceneStatus:
     """The status of one scene, as `store_status` has it; raises StoreError if it cannot be read."""
     progress = scene.progress()
     committed = sorted(scene.committed_jobs())  # before the plans: each one's plan is there by now
-    guided = sorted(scene.guides.committed_jobs())
-    jobs, found = scene.jobs(), scene.plans()
-    samples, guides = _summed(scene.marker, committed), _summed(scene.guides.marker, guided)
-    errors = [each.error for each in (samples, guides) if each.error]
-    if any(not isinstance(error, CorruptError) for error in errors):
+    jobs, sums = scene.jobs(), _summed(scene.marker, committed)
+    if sums.error is not None and not isinstance(sums.error, CorruptError):
         check_format(scene.storage)
-    views, with_guides = used_views(found), has_guides(found, set(guided))
     return SceneStatus(
         scene.scene_id,
         scene.spec.name,
@@ -86,16 +75,12 @@ def scene_status(scene: SceneStore) -> SceneStatus:
         progress.committed_samples,
         jobs,
         len(committed),
-        samples.size_bytes + guides.size_bytes,
-        samples.core_s + guides.core_s,
-        samples.redrawn + guides.redrawn,
-        samples.unreadable + guides.unreadable,
-        str(errors[0]) if errors else None,
-        sum(job >= jobs for job in (*committed, *guided)),
-        views_planned=int(np.count_nonzero(views)),
-        views_guided=int(np.count_nonzero(views & with_guides)) if scene.guides.settings() or guided else None,
-        guide_jobs=len(guided),
-        guide_bytes=guides.size_bytes,
+        sums.size_bytes,
+        sums.core_s,
+        sums.redrawn,
+        sums.unreadable,
+        str(sums.error) if sums.error else None,
+        sum(job >= jobs for job in committed),
     )
 
 

@@ -97,7 +97,7 @@ class Store:
         name = f"{SCENES}/{spec.scene_id}/spec.json"
         with store_errors("add a scene", self.storage.where):
             if not self.storage.exists(name):
-                put_json(self.storage, spec.model_dump(mode="json", exclude={"guides"}), name)
+                put_json(self.storage, spec.model_dump(mode="json"), name)
         return self.scene(spec.scene_id)
 
     def plan(

@@ -41,7 +41,7 @@ def costs(folder: Path, count: int) -> Costs:
 
         found = store.scene(spec.scene_id).plans()
         rows = np.concatenate([plan.rows.sample_modification for plan in found])
-        return modification_keys(spec.scene_id, plans.vectors_at(found, "modification", rows[rows >= 0]))
+        return modification_keys(spec.radiance_id, plans.vectors_at(found, "modification", rows[rows >= 0]))
 
     opened, of_keys = timed(start), timed(keys)
     more = timed(lambda: store.plan(spec, Request(modifications=FURTHER), dry_run=True))

@@ -60,7 +60,7 @@ def make_sample(scene: Any, number: int) -> None:
     from photonfarm.shared.scene.view import sample_view
 
     modification = sample_modification(scene.spec, 0, number)
-    view = sample_view(scene.spec, modification.key(scene.spec.scene_id), 0, 0)
+    view = sample_view(scene.spec, modification.key(scene.spec.radiance_id), 0, 0)
     scene.apply(modification)
     scene.buffers(view)
     scene.photons(number)

@@ -72,12 +72,12 @@ class Contents:
         """The guides of a view."""
         from photonfarm.renderer.jobs.render import lit_points
 
-        key, lit = modification.key(self.spec.scene_id), lit_points(self.base[1], modification)
+        key, lit = modification.key(self.spec.radiance_id), lit_points(self.base[1], modification)
         make = partial(self._scene.guides, view, view_key(key, view.vector), self.spec.guides, lit)
         return self._get("guides", modification, view, make)
 
     def _get(self, what: str, modification: Modification, view: View | None, make: Any) -> Any:
-        key = modification.key(self.spec.scene_id)
+        key = modification.key(self.spec.radiance_id)
         name = (what, key + (view.vector.tobytes() if view else b""))
         if name not in self._made:
             if self._applied != key:

@@ -93,7 +93,7 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Modificat
     for i in range(modifications):
         modification = sample_modification(spec, 0, i)
         before = sample_modification(spec, 0, i - 1) if i else rest(spec)
-        view = sample_view(spec, modification.key(spec.scene_id), 0, 0)
+        view = sample_view(spec, modification.key(spec.radiance_id), 0, 0)
         position, _ = rebuild(cloud, modification)
         points = np.resize(position, (len(position) + spec.photons.slots, 3))  # as many as with photons
         works: dict[str, Callable[[], Any]] = {

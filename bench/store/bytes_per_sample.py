@@ -115,7 +115,7 @@ def whole_samples(scene: SceneStore, contents: Contents, folder: Path) -> Whole:
         rows = scene.job_rows(job)
         for sample in (s for s in rows.samples if not s.pass_):
             modification, view = rows.modifications[sample.modification_row], rows.views[sample.view_row]
-            key = modification.key(spec.scene_id) + view.vector.tobytes()
+            key = modification.key(spec.radiance_id) + view.vector.tobytes()
             if key in seen:
                 continue
             seen.add(key)

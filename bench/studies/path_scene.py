@@ -119,7 +119,7 @@ def integrator_costs(spec: SceneSpec, views: int) -> Costs:
     spent = {BDPT: 0.0, FEW: 0.0, MANY: 0.0}
     for number in range(WARM_UP + views):
         modification = sample_modification(spec, TIMED_SEED, number)
-        view = sample_view(spec, modification.key(spec.scene_id), TIMED_SEED, 0)
+        view = sample_view(spec, modification.key(spec.radiance_id), TIMED_SEED, 0)
         scene.apply(modification)
         for spp in spent:
             scene.spp = spp

@@ -235,7 +235,7 @@ class Stage:
         The seeds of the halves are of this benchmark alone, so that no guide and no sample has their noise.
         """
         frames = frames_of(self.spec, modification, [view], self.base[1], lambda _: self.scene)
-        key = view_key(modification.key(self.spec.scene_id), view.vector)
+        key = view_key(modification.key(self.spec.radiance_id), view.vector)
         halves = self.scene.render_halves(view, [seed_of(key, f"{NAME}, half {half}") for half in "AB"])
         known = frames.buffers(0), frames.visibility(0), 0, frames.guides_of(0)
         return Look(RawSample(modification, view, halves, 1.0, *known), frames.photons)

@@ -107,7 +107,7 @@ class LoadedRoom:
             modification = sample_modification(self.spec, 0, index // 2)
             self.loaded.apply(modification)
             corners = triangles(self.geometry, modification)
-            view = sample_view(self.spec, modification.key(self.spec.scene_id), 0, index)
+            view = sample_view(self.spec, modification.key(self.spec.radiance_id), 0, index)
             position, present = rebuild(self.cloud, modification)
             camera = Camera.of(view, self.spec)
             inside = np.flatnonzero(present & in_image(camera, self.spec, position))

@@ -132,7 +132,7 @@ def test_five_lines_with_a_loader_of_spawned_processes(place: str | Path, worker
 def test_what_is_held_out_is_what_training_holds_out(scene: Scene) -> None:
     train, held_out = (scene.split(split, hold_out=0.4) for split in ("train", "held-out"))
     assert sorted([*train.rows, *held_out.rows]) == scene.rows.tolist()
-    keys = [sample.modification.key(scene.id) for sample in held_out]
+    keys = [sample.modification.key(scene.spec.radiance_id) for sample in held_out]
     assert keys
     assert all(are_held_out(keys, 0.4))
     with pytest.raises(ValueError, match="held-out"):

@@ -131,7 +131,7 @@ def test_guides_are_said_to_be_missing_and_only_samples_that_have_them_are_expor
 def test_points_and_photons_are_exported_once_per_configuration(scene: SceneStore, tmp_path: Path) -> None:
     result = exported(scene, tmp_path / "out", "webdataset", extras=("points", "photons"))
     opened = open_scene(scene.folder.parent.parent, scene.scene_id)
-    keys = {sample.modification.key(scene.scene_id).hex(): sample for sample in opened}
+    keys = {sample.modification.key(scene.spec.radiance_id).hex(): sample for sample in opened}
     assert result.configurations == len(keys) < 10
     assert {file.stem for file in (tmp_path / "out/configurations").iterdir()} == set(keys)
     for key, sample in keys.items():

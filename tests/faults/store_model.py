@@ -113,7 +113,9 @@ class Model:
 
     def key(self, modification: bytes, view: bytes, pass_: int) -> bytes:
         vector = np.frombuffer(modification, np.float32).reshape(-1, 4)
-        return sample_key(self.spec.scene_id, Modification.from_vector(vector), np.frombuffer(view, np.float32), pass_)
+        return sample_key(
+            self.spec.radiance_id, Modification.from_vector(vector), np.frombuffer(view, np.float32), pass_
+        )
 
     def named(self, request: Request) -> set[bytes]:
         """The keys that a request names, whatever is planned."""

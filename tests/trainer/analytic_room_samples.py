@@ -63,10 +63,10 @@ class AnalyticSource:
         return sample_modification(self.spec, 0, row // self._views)
 
     def view(self, row: int) -> View:
-        return sample_view(self.spec, self.modification(row).key(self.spec.scene_id), 0, row)
+        return sample_view(self.spec, self.modification(row).key(self.spec.radiance_id), 0, row)
 
     def modification_key(self, row: int) -> Key:
-        return self.modification(row).key(self.spec.scene_id)
+        return self.modification(row).key(self.spec.radiance_id)
 
     def view_key(self, row: int) -> Key:
         return make_key(self.modification_key(row), self.view(row).vector)

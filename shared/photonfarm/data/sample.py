@@ -90,7 +90,7 @@ class Sample:
     @property
     def key(self) -> Key:
         """The content key: 16 bytes, a hash of scene, modification, view and pass."""
-        return sample_key(self._scene_id, self.modification, self.view.vector, self.pass_number)
+        return sample_key(self._reader.spec.radiance_id, self.modification, self.view.vector, self.pass_number)
 
     @property
     def seeds(self) -> tuple[int, int]:

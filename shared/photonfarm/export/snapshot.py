@@ -89,7 +89,7 @@ class Snapshot:
         job = self._of_job(row // self._shard_rows)
         modification, view = job.inputs(row)
         sample = job.samples[row]
-        key = modification.key(self.spec.scene_id)
+        key = modification.key(self.spec.radiance_id)
         return {
             "row": row,
             "key": sample.key.hex(),

@@ -129,7 +129,7 @@ class SceneSamples:
         return {
             "row": row,
             "scene": spec.name,
-            "key": sample_key(self._scene_id, modification, sample.view.vector, sample.pass_).hex(),
+            "key": sample_key(self._reader.spec.radiance_id, modification, sample.view.vector, sample.pass_).hex(),
             "pass": sample.pass_,
             "passes": self._merged(row)[1],
             "previous": int(rows[place - 1]) if place else None,

@@ -44,7 +44,7 @@ def test_a_room_becomes_a_spec_that_renders_at_once(quick: None, boxes: Path, ru
     for number in range(6):
         modification = sample_modification(spec, 1, number)
         scene.apply(modification)
-        view = sample_view(spec, modification.key(spec.scene_id), 1, number, modification)
+        view = sample_view(spec, modification.key(spec.radiance_id), 1, number, modification)
         assert scene.surroundings(view.origin[None]).open.all()
         depth = scene.buffers(view).depth
         assert (depth > 0).mean() > 0.99  # no view leaves the room
@@ -162,7 +162,7 @@ def test_no_camera_stands_in_a_cube_on_a_floor_which_gets_a_sky(
     origin = np.array([spec.view.origin.min, spec.view.origin.max])
     assert (origin[0] > inside[1]).any() or (origin[1] < inside[0]).any()
     scene = LoadedScene.load(spec, Path())
-    view = sample_view(spec, rest(spec).key(spec.scene_id), 1, 0)
+    view = sample_view(spec, rest(spec).key(spec.radiance_id), 1, 0)
     assert 0.2 < display_values(np.float32(spec.exposure) * scene.render_halves(view, (0,), 2)[0]).mean() < 0.8
 
 

@@ -28,7 +28,7 @@ def cameras(spec: SceneSpec, scene: LoadedScene, configurations: int, views: int
     for number in range(configurations):
         modification = sample_modification(spec, 0, number)
         scene.apply(modification)
-        key = modification.key(spec.scene_id)
+        key = modification.key(spec.radiance_id)
         origins = np.stack([sample_view(spec, key, 0, i, modification).origin for i in range(views)])
         here = scene.surroundings(origins)
         inside += int((here.solid != NONE).sum())

@@ -81,7 +81,7 @@ def of_many_views(room: LoadedScene, somewhere: View) -> Callable[[str], tuple[I
     modification = rest(room.spec)
     position, normal = lit_points(room.base()[1], modification)
     lit = position[:64], normal[:64]
-    of_modification = modification.key(room.spec.scene_id)
+    of_modification = modification.key(room.spec.radiance_id)
     noisy: dict[str, list[Images]] = {name: [] for name in NOISY}
     halves = []
     for number in range(48):

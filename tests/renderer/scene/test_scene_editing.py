@@ -50,7 +50,7 @@ def test_no_kernel_is_new_after_the_second_modification(small: Callable[..., Sce
         room = LoadedScene.load(small(load_spec("room")))
         for i in range(12):
             modification = sample_modification(room.spec, 3, i)
-            view = sample_view(room.spec, modification.key(room.spec.scene_id), 3, i)
+            view = sample_view(room.spec, modification.key(room.spec.radiance_id), 3, i)
             room.apply(modification)
             room.buffers(view)
             room.render_half(view, 2 * i)
@@ -71,7 +71,7 @@ def test_recorded_buffers_and_photons_are_those_that_python_traces_anew(room: Lo
     for i in range(5):
         modification = sample_modification(room.spec, 11, i)
         room.apply(modification)
-        view = sample_view(room.spec, modification.key(room.spec.scene_id), 11, i)
+        view = sample_view(room.spec, modification.key(room.spec.radiance_id), 11, i)
         recorded, anew = room.buffers(view), view_buffers(room.scene, view, room.spec)
         photons = room.photons(i)
         assert photons is not None

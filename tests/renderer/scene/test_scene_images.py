@@ -61,7 +61,7 @@ def test_guided_light_paths_follow_from_the_configuration_alone(small: Callable[
     spec = plain.model_copy(update={"transport": plain.transport.model_copy(update={"guided_light": True})})
     room = LoadedScene.load(spec)
     moved = sample_modification(spec, 0, 0)
-    views = [sample_view(spec, moved.key(spec.scene_id), 0, i, moved) for i in range(2)]
+    views = [sample_view(spec, moved.key(spec.radiance_id), 0, i, moved) for i in range(2)]
     room.apply(moved)
     halves = room.render_halves(views[0], (1, 2))
     room.render_halves(views[1], (3, 4))

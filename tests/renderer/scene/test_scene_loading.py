@@ -82,7 +82,7 @@ def test_a_real_room_is_loaded_edited_and_rendered(
     loaded = LoadedScene.load(spec)
     modification = sample_modification(spec, 0, 1)
     loaded.apply(modification)
-    view = sample_view(spec, modification.key(spec.scene_id), 0, 0)
+    view = sample_view(spec, modification.key(spec.radiance_id), 0, 0)
     image = loaded.render_half(view, 0)
     assert np.all(np.isfinite(image))
     assert image.mean() > 0

@@ -121,7 +121,7 @@ def look(loaded: LoadedScene, geometry: Geometry, cloud: BasePointCloud) -> Iter
     for i in range(8):
         modification = sample_modification(spec, 0, i // 2)
         loaded.apply(modification)
-        view = sample_view(spec, modification.key(spec.scene_id), 0, i)
+        view = sample_view(spec, modification.key(spec.radiance_id), 0, i)
         photons = loaded.photons(i // 2)
         assert photons is not None
         found = visibility_of(loaded, view, rebuild(cloud, modification), photons)

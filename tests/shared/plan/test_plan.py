@@ -215,7 +215,7 @@ class OneByOne:
     def named(self, request: Request) -> Iterator[tuple[Modification, np.ndarray, int]]:
         for modification, views in self.configurations(request):
             for index in views:
-                view = sample_view(self.spec, modification.key(self.spec.scene_id), request.seed, index)
+                view = sample_view(self.spec, modification.key(self.spec.radiance_id), request.seed, index)
                 for pass_ in range(request.passes):
                     yield modification, view.vector, pass_
 

@@ -67,7 +67,7 @@ def test_a_configuration_is_a_vector_the_key_of_a_planned_one_or_the_scene_at_re
     store, spec = Store(tmp_path / "store", create=True), load_spec("room")
     scene = store.scene(store.plan(spec, Request(modifications=3), shard_rows=8).scene_id)
     planned = sample_modification(spec, 0, 1)
-    key = planned.key(spec.scene_id).hex()
+    key = planned.key(spec.radiance_id).hex()
     vector = " ".join(map(str, planned.vector.ravel()))
     for text, wanted in ((key, planned), (vector, planned), (None, rest(spec))):
         np.testing.assert_array_equal(named_configuration(store, scene, text).vector, wanted.vector)

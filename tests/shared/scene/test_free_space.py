@@ -70,7 +70,7 @@ def test_cameras_are_uniform_in_what_is_free_of_their_configuration() -> None:
 def test_many_views_at_once_are_those_that_are_drawn_one_by_one() -> None:
     spec = with_space()
     vectors = sample_modifications(spec, 0, range(1500))
-    keys = modification_keys(spec.scene_id, vectors)
+    keys = modification_keys(spec.radiance_id, vectors)
     index = [number % 3 for number in range(1500)]
     found = sample_views(spec, keys, 7, index, vectors)
     drawn_at_once = sample_views(with_all_free(spec), keys, 7, index, vectors)

@@ -80,7 +80,7 @@ def seen() -> Seen:
     scene = LoadedScene.load(spec)
     base = scene.base()
     modification = sample_modification(spec, 0, 0)
-    key = modification.key(spec.scene_id)
+    key = modification.key(spec.radiance_id)
     view = sample_view(spec, key, 0, 0)
     scene.apply(modification)
     traced, _ = photons_of(scene, key)

@@ -105,7 +105,7 @@ def _lead(
     from photonfarm.trainer.runs.tensorboard import event_files
     from photonfarm.trainer.training.loop import Hooks, train
 
-    begun_on = _begun_on(folder)
+    begun_on, exposure = _begun_on(folder)
     if scene_id and begun_on and scene_id != begun_on:
         raise SpecError(
             f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
@@ -124,7 +124,7 @@ def _lead(
         if scene_id is None:
             log(f"{store}: no scene to train on has come; nothing was trained")
             return
-        source, waited = StoreSource(store, scene_id), time.monotonic() - began
+        source, waited = StoreSource(store, scene_id, exposure), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
             log(f"waiting for scene {scene_id}, {_lacks(Store(store), scene_id, spec)}")
         progress, begun = RunProgress(settings.max_steps, settings.batch), False
@@ -282,13 +282,16 @@ def search(
         return table(cells)
 
 
-def _begun_on(folder: Path) -> str | None:
-    """The scene that a run was begun on; None for a new run."""
+def _begun_on(folder: Path) -> tuple[str | None, float | None]:
+    """The scene that a run was begun on, and its exposure then; None for a new run."""
     from photonfarm.trainer.runs import checkpoint
     from photonfarm.trainer.runs.run_folder import INITIAL
 
     begun = folder / INITIAL
-    return str(checkpoint.load(begun)["scene_id"]) if begun.exists() else None
+    if not begun.exists():
+        return None, None
+    state = checkpoint.load(begun)
+    return str(state["scene_id"]), float(state["exposure"])
 
 
 def _only_scene(store: str | Path) -> str | None:

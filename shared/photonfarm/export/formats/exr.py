@@ -56,6 +56,6 @@ def _frame(snapshot: Snapshot, row: int) -> Values:
     return {
         "file_path": f"{SAMPLES}/{row:08d}{SUFFIX}",
         "transform_matrix": camera_to_world(view, snapshot.spec).tolist(),
-        "configuration_key": modification.key(snapshot.spec.scene_id).hex(),
+        "configuration_key": modification.key(snapshot.spec.radiance_id).hex(),
         "split": snapshot.split_of(row),
     }

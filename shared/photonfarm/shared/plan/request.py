@@ -226,7 +226,7 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
     modifications, counts = _configurations(spec, request)
     of_view = np.repeat(np.arange(len(counts)), counts)
     index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
-    keys = modification_keys(spec.scene_id, modifications)
+    keys = modification_keys(spec.radiance_id, modifications)
     views = sample_views(
         spec, [keys[m] for m in of_view.tolist()], request.seed, index.tolist(), modifications[of_view]
     )
@@ -235,7 +235,7 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
 
     view = np.repeat(np.arange(len(views)), request.passes)
     pass_ = np.tile(np.arange(request.passes, dtype=np.int32), len(views))
-    keys = sample_keys(spec.scene_id, modifications[of_view[view]], views[view], pass_)
+    keys = sample_keys(spec.radiance_id, modifications[of_view[view]], views[view], pass_)
     distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
     new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
     found = SamplesToPlan(
@@ -245,15 +245,15 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
     return found, len(distinct)
 
 
-def sample_keys(scene_id: str, modifications: F32, views: F32, passes: Iterable[int]) -> list[Key]:
+def sample_keys(radiance_id: str, modifications: F32, views: F32, passes: Iterable[int]) -> list[Key]:
     """The content keys of samples of configurations (N, G, 4) and views (N, 6), by the numbers of their passes (N,)."""
     samples = zip(modifications, views, passes, strict=True)
-    return [make_key("sample", scene_id, modification, view, int(pass_)) for modification, view, pass_ in samples]
+    return [make_key("sample", radiance_id, modification, view, int(pass_)) for modification, view, pass_ in samples]
 
 
-def sample_key(scene_id: str, modification: Modification, view: F32, pass_: int) -> Key:
+def sample_key(radiance_id: str, modification: Modification, view: F32, pass_: int) -> Key:
     """The content key of one sample; `view` is the view's vector (6,)."""
-    return sample_keys(scene_id, modification.vector[None], view[None], [pass_])[0]
+    return sample_keys(radiance_id, modification.vector[None], view[None], [pass_])[0]
 
 
 def contents(array: F32) -> list[bytes]:

@@ -105,7 +105,7 @@ def _candidates(planned: PlannedViews, views: Rows, count: Rows) -> SamplesToPla
     of_sample = np.repeat(np.arange(len(views)), count)
     number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)
     pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
-    keys = sample_keys(planned.spec.scene_id, modification[of_view[of_sample]], view[of_sample], pass_)
+    keys = sample_keys(planned.spec.radiance_id, modification[of_view[of_sample]], view[of_sample], pass_)
     return SamplesToPlan(
         modification, modification_row, view, planned.view_row[views], of_view[of_sample], of_sample, pass_,
         np.frombuffer(b"".join(keys), np.uint8).reshape(-1, KEY_BYTES),
@@ -145,7 +145,7 @@ class PlannedViews:
     def modification_keys(self, views: Rows | Mask) -> list[Key]:
         """The content key of the configuration of each of some views, by their places here."""
         rows, of_view = np.unique(self.modification_row[views], return_inverse=True)
-        keys = modification_keys(self.spec.scene_id, self.known.vectors("modification", rows))
+        keys = modification_keys(self.spec.radiance_id, self.known.vectors("modification", rows))
         return [keys[m] for m in of_view.tolist()]
 
     def view_keys(self, views: Rows | Mask) -> list[Key]:

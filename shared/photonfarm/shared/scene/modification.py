@@ -34,9 +34,9 @@ class Modification:
         """The inverse of `vector`; (G, 4)."""
         return cls(np.ascontiguousarray(vector[:, :3], np.float32), vector[:, 3] != 0)
 
-    def key(self, scene_id: str) -> Key:
+    def key(self, radiance_id: str) -> Key:
         """The content key of this configuration of that scene."""
-        return modification_keys(scene_id, self.vector[None])[0]
+        return modification_keys(radiance_id, self.vector[None])[0]
 
 
 def rest(spec: SceneSpec) -> Modification:
@@ -51,8 +51,8 @@ def sample_modifications(spec: SceneSpec, seed: int, indices: Iterable[int]) -> 
     own probability; intersecting or unrealistic placements are not rejected [supplement 2.4]. A static scene gives the
     rest state. The position of a removed group is zeroed, so that equal configurations have equal keys.
     """
-    scene_id, count = spec.scene_id, len(spec.groups)
-    keys = [make_key("modification", scene_id, seed, index) for index in indices]
+    radiance_id, count = spec.radiance_id, len(spec.groups)
+    keys = [make_key("modification", radiance_id, seed, index) for index in indices]
     uniform = uniform_of(keys, "placement", 4 * count).reshape(len(keys), count, 4)
     vectors = np.zeros(uniform.shape, np.float32)
     for g, group in enumerate(spec.groups):
@@ -68,6 +68,6 @@ def sample_modification(spec: SceneSpec, seed: int, index: int) -> Modification:
     return Modification.from_vector(sample_modifications(spec, seed, [index])[0])
 
 
-def modification_keys(scene_id: str, vectors: F32) -> list[Key]:
+def modification_keys(radiance_id: str, vectors: F32) -> list[Key]:
     """The content keys of configurations (N, G, 4) of a scene."""
-    return [make_key("modification", scene_id, vector) for vector in vectors]
+    return [make_key("modification", radiance_id, vector) for vector in vectors]

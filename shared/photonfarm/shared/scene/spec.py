@@ -1,7 +1,7 @@
 """The scene spec: what to render and what may change, as frozen models; `spec_loading` reads them from a file.
 
-Lengths are in scene units, angles in degrees. The spec's content digest, with the bytes of every file the scene is made
-of, is the scene id: equal content gives equal ids on every machine, wherever the files lie.
+Lengths are in scene units, angles in degrees. Ids are digests of the spec's content, with the bytes of every file that
+the scene is made of: equal content gives equal ids on every machine, wherever the files lie.
 """
 
 from __future__ import annotations
@@ -140,11 +140,8 @@ class Transport(Frozen):
     connections: Annotated[int, Field(ge=0, le=64)] = 1  # light vertices joined to each eye vertex
     light_ratio: Annotated[float, Field(ge=0, le=64)] = 1.0  # light paths per eye path
     half_spp: Annotated[int, Field(ge=1, le=65536)] = 4  # samples per pixel of each of the two half-estimates
-    # The next two are left out of ids at their defaults
-    guided_light: bool = Field(
-        default=False, exclude_if=lambda said: not said
-    )  # light paths start where views see them, connections go to useful light vertices
-    light_samples: int = Field(default=1, ge=1, le=64, exclude_if=lambda said: said == 1)  # at the first eye vertex
+    guided_light: bool = False  # light paths start where views see them, connections go to useful light vertices
+    light_samples: Annotated[int, Field(ge=1, le=64)] = 1  # at the first eye vertex
 
     @model_validator(mode="after")
     def _has_light_paths_to_connect_to(self) -> Self:
@@ -159,6 +156,10 @@ class Transport(Frozen):
                 "or a light_ratio above 0 is required"
             )
         return self
+
+
+STRATEGY = frozenset({"rr_depth", "connections", "light_ratio", "guided_light", "light_samples"})
+"""The settings of `Transport` that change the noise and the cost of an estimate, and not its mean: part of no id."""
 
 
 class PhotonSpec(Frozen):
@@ -213,6 +214,15 @@ class Credits(Frozen):
     source: Annotated[str, Field(max_length=500)] = ""  # where it was published
 
 
+INPUTS_GENERATOR = 1
+"""The version of the code that makes buffers, guides, photons and points: it grows when their values change."""
+
+RAYS_PER_PIXEL = 16
+"""The rays through a pixel over which albedo and guides are means."""
+
+_INPUTS = ("photons", "guides", "points")
+
+
 class SceneSpec(Frozen):
     """A scene and everything that shapes its samples. No movable group: a static scene."""
 
@@ -230,6 +240,7 @@ class SceneSpec(Frozen):
     points: Annotated[int, Field(ge=1, le=1 << 22)] = 16384  # size of the base point cloud
     exposure: Positive = 1.0  # fixed factor on linear radiance, for losses and pictures
     content: str = ""  # digest of the scene's files; set when loaded
+    stored_exponent: int | None = Field(default=None, exclude_if=lambda said: said is None)  # set when first stored
 
     @model_validator(mode="after")
     def _groups_are_distinct(self) -> Self:
@@ -247,14 +258,39 @@ class SceneSpec(Frozen):
         return self.objects + self.lights
 
     @cached_property
+    def radiance_id(self) -> str:
+        """32 hexadecimal digits: the digest of all that the mean of a sample and its size depend on.
+
+        Keys and seeds follow from it.
+        """
+        return make_key("radiance", _canonical(self._of_radiance())).hex()
+
+    @cached_property
+    def inputs_id(self) -> str:
+        """32 hexadecimal digits: the digest of what buffers, guides, photons and points are made with."""
+        return make_key("inputs", _canonical(self._of_inputs())).hex()
+
+    @cached_property
     def scene_id(self) -> str:
-        """32 hexadecimal digits: the digest of all that a sample's radiance depends on."""
-        return make_key("scene", _canonical(self.identity())).hex()
+        """32 hexadecimal digits, by which a store holds the scene: the digest of both other ids."""
+        return make_key("scene", self.radiance_id, self.inputs_id).hex()
 
     def identity(self) -> dict[str, Any]:
-        """All that a sample's radiance depends on, as JSON has it: specs that agree in it are one scene."""
-        not_of_it: dict[str, Any] = {"scene": {"file"}, "name": True, "credits": True}
+        """All that ids are made of, as JSON has it: specs that agree in it are one scene."""
+        return self._of_radiance() | self._of_inputs()
+
+    def _of_radiance(self) -> dict[str, Any]:
+        not_of_it: dict[str, Any] = {"scene": {"file"}, "transport": STRATEGY}
+        not_of_it |= dict.fromkeys(("name", "credits", "exposure", "stored_exponent", *_INPUTS), True)
         return self.model_dump(mode="json", exclude=not_of_it)
+
+    def _of_inputs(self) -> dict[str, Any]:
+        made = {"generator": INPUTS_GENERATOR, "rays_per_pixel": RAYS_PER_PIXEL}
+        return self.model_dump(mode="json", include=set(_INPUTS)) | made
+
+    def strategy(self) -> dict[str, Any]:
+        """How light is sampled: the settings of `STRATEGY`, which a job's marker records."""
+        return self.transport.model_dump(mode="json", include=set(STRATEGY))
 
     @property
     def free_space_digest(self) -> str:
@@ -268,13 +304,14 @@ class SceneSpec(Frozen):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """A changed copy; pydantic would keep the id of the original."""
         copied = super().model_copy(update=update, deep=deep)
-        copied.__dict__.pop("scene_id", None)
+        for name in ("radiance_id", "inputs_id", "scene_id"):
+            copied.__dict__.pop(name, None)
         return copied
 
     @property
     def radiance_exponent(self) -> int:
-        """The power of two that stored radiance is multiplied by, so that exposed values lie near 1."""
-        return int(np.round(np.log2(self.exposure)))
+        """The power of two that stored radiance is multiplied by, so that values exposed as at first lie near 1."""
+        return int(np.round(np.log2(self.exposure))) if self.stored_exponent is None else self.stored_exponent
 
 
 def shape_ids(group: Movable) -> tuple[str, ...]:

@@ -29,7 +29,7 @@ def test_every_committed_sample_reads_back_as_it_was_rendered(scene: SceneStore)
             assert read.radiance.dtype == np.float32
             np.testing.assert_array_equal(read.modification.vector, rows.modifications[s.modification_row].vector)
             np.testing.assert_array_equal(read.view.vector, rows.views[s.view_row].vector)
-            assert reader.modification_key(s.row) == read.modification.key(scene.scene_id)
+            assert reader.modification_key(s.row) == read.modification.key(scene.spec.radiance_id)
             for name, array in arrays_of(given.buffers[s.view_row]).items():
                 np.testing.assert_array_equal(getattr(read.buffers, name), array)
             for name, array in arrays_of(given.visibility[s.view_row]).items():

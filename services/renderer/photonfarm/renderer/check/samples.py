@@ -106,7 +106,7 @@ def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, work: Wor
 def _drawn(spec: SceneSpec, number: int) -> tuple[Modification, list[View]]:
     """A configuration, and its views; the first is that of the configuration's sample."""
     modification = sample_modification(spec, sample_costs.SEED, number)
-    key = modification.key(spec.scene_id)
+    key = modification.key(spec.radiance_id)
     first = 0 if spec.groups else number  # as a plan numbers the views of a configuration
     others = (COUNT + number * VIEWS + index for index in range(1, VIEWS))
     return modification, [sample_view(spec, key, sample_costs.SEED, index, modification) for index in (first, *others)]

@@ -66,7 +66,7 @@ def frames_of(
     scene.apply(modification)
     buffers = [scene.buffers(view) for view in views]
     depth, albedo, normal = (np.stack([getattr(b, name) for b in buffers]) for name in ("depth", "albedo", "normal"))
-    photons, _ = photons_of(scene, modification.key(spec.scene_id))
+    photons, _ = photons_of(scene, modification.key(spec.radiance_id))
     arrays = {"depth": depth, "albedo": albedo, "normal": normal}
     for name, values in arrays.items():
         if not np.isfinite(values).all():
@@ -83,6 +83,6 @@ def _guides(
     scene: SceneRenderer, modification: Modification, views: Sequence[View], spec: SceneSpec, cloud: BasePointCloud
 ) -> Guides:
     """The guides of all views, stacked."""
-    key, lit = modification.key(spec.scene_id), lit_points(cloud, modification)
+    key, lit = modification.key(spec.radiance_id), lit_points(cloud, modification)
     found = [arrays_of(scene.guides(view, view_key(key, view.vector), spec.guides, lit)) for view in views]
     return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,6 +117,7 @@ class _Loaded:
 
     stored: SceneStore
     scene: SceneRenderer
+    strategy: dict[str, Any]  # that it was loaded with
     compiled: bool = False  # its first image compiles the kernels
     _cloud: BasePointCloud | None = None
 
@@ -153,7 +154,10 @@ class ShardRenderer:
         """
         if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
             raise QueueError(f"store {self._store.root} has no job {job} of scene {scene_id}")
-        return not stored.is_committed(job) and self._render(self._scene(scene_id), job)
+        if stored.is_committed(job):
+            return False
+        stored.reread()
+        return self._render(self._scene(stored), job)
 
     def _render(self, loaded: _Loaded, job: int) -> bool:
         stored, scene_id, began = loaded.stored, loaded.stored.scene_id, self._now()
@@ -164,7 +168,7 @@ class ShardRenderer:
             redrawn = _Rendering(loaded.scene, cloud, loaded.stored.spec, out, report).run(rows)
             loaded.compiled = True
             self._on_progress(COMMITS, len(rows.samples), len(rows.samples))
-            committed = out.commit(self._figures(began, redrawn))
+            committed = out.commit(self._figures(began, redrawn, stored.spec))
         if not committed:
             what = "was committed by another worker while it was rendered here; that one stays"
             if not stored.is_committed(job):
@@ -179,7 +183,7 @@ class ShardRenderer:
     def _now(self) -> tuple[float, float]:
         return time.monotonic(), time.process_time()
 
-    def _figures(self, began: tuple[float, float], redrawn: int) -> Figures:
+    def _figures(self, began: tuple[float, float], redrawn: int, spec: SceneSpec) -> Figures:
         """The cost of the work since `began`, for a marker."""
         wall, core = self._now()
         return Figures(
@@ -190,19 +194,23 @@ class ShardRenderer:
             versions=versions(),
             device=backend.device().name,
             driver=backend.device().driver,
+            strategy=spec.strategy(),
         )
 
-    def _scene(self, scene_id: str) -> _Loaded:
-        if scene_id in self._scenes:
-            self._scenes[scene_id] = self._scenes.pop(scene_id)
+    def _scene(self, stored: SceneStore) -> _Loaded:
+        """The scene, loaded; anew if it is to be rendered by another strategy than before."""
+        scene_id = stored.scene_id
+        known = self._scenes.pop(scene_id, None)
+        if known is not None and known.strategy == stored.spec.strategy():
+            self._scenes[scene_id] = known
         else:
-            stored = self._store.scene(scene_id)
+            known = None  # freed before the next one is loaded
             spec = located(stored.spec)  # before another scene is unloaded for it
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
             self._on_progress(LOADS, 0, 0)
             gc.collect()  # while an older scene is still partly alive, Dr.Jit finds no kernel in its cache
-            self._scenes[scene_id] = _Loaded(stored, self._load(spec))
+            self._scenes[scene_id] = _Loaded(stored, self._load(spec), spec.strategy())
         return self._scenes[scene_id]
 
 
@@ -263,7 +271,7 @@ class _Rendering:
         self._scene = scene
         self._on_progress = on_progress
         self._cloud = cloud
-        self._scene_id, self._wanted = spec.scene_id, spec.guides
+        self._radiance_id, self._wanted = spec.radiance_id, spec.guides
         self._out = out
         self._redrawn = 0
 
@@ -279,7 +287,9 @@ class _Rendering:
             self._scene.apply(modification)
             is_new = modification_row in rows.new_modifications
             wants_photons = is_new or any(sample.view_row in new_views for sample in samples)
-            photons, thrown = photons_of(self._scene, modification.key(self._scene_id)) if wants_photons else (None, 0)
+            photons, thrown = (
+                photons_of(self._scene, modification.key(self._radiance_id)) if wants_photons else (None, 0)
+            )
             if is_new:
                 self._redrawn += thrown
                 if photons is not None:
@@ -313,7 +323,7 @@ class _Rendering:
 
     def _guides(self, sample: SampleRow, view: View, modification: Modification) -> Guides:
         """Render the guides of a view, without a second attempt."""
-        key = view_key(modification.key(self._scene_id), view.vector)
+        key = view_key(modification.key(self._radiance_id), view.vector)
         guides = self._scene.guides(view, key, self._wanted, lit_points(self._cloud, modification))
         _check_finite(arrays_of(guides), sample)
         return guides

@@ -147,12 +147,12 @@ def repeat(
     """
     opened = Store(store)
     stored = scene_or_spec(opened, scene)
-    spec = located(_beside(scene, stored.spec))
+    spec = located(_beside(scene, _as_rendered(stored, row)))
     reader = SceneReader(store, stored.scene_id)
     reader.refresh()
     modification, view, planned_pass = _planned(stored, row)
     number = planned_pass if pass_number is None else pass_number
-    key = sample_key(stored.scene_id, modification, view.vector, number)
+    key = sample_key(spec.radiance_id, modification, view.vector, number)
     at = next(iter(SceneMatch(stored, Query(sample=key)).rows.tolist()), None)
     with waiting(log, f"loading scene {spec.name}"):
         loaded = load(spec)
@@ -161,6 +161,14 @@ def repeat(
         ((halves, _),) = halves_of(loaded, [(key, view)])
     there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
+
+
+def _as_rendered(stored: SceneStore, row: int) -> SceneSpec:
+    """The scene's spec with the strategy by which the job of a row was rendered, if it is committed."""
+    found = stored.plans()
+    job = row // found[0].shard_rows if found else 0
+    strategy = stored.marker(job)["figures"].get("strategy", {}) if stored.is_committed(job) else {}
+    return stored.spec.model_copy(update={"transport": stored.spec.transport.model_copy(update=strategy)})
 
 
 def _beside(named: str, spec: SceneSpec) -> SceneSpec:

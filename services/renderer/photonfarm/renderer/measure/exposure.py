@@ -186,6 +186,6 @@ def _rendered(scene: LoadedScene, frames: int, spp: int, steps: Steps) -> Iterat
     for number in range(frames):
         modification = sample_modification(spec, SEED, number)
         scene.apply(modification)
-        view = sample_view(spec, modification.key(spec.scene_id), SEED, number, modification)
+        view = sample_view(spec, modification.key(spec.radiance_id), SEED, number, modification)
         yield scene.render_halves(view, (2 * number, 2 * number + 1), spp)
         steps.reach(number + 1)

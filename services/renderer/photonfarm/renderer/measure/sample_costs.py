@@ -70,7 +70,7 @@ def find_or_measure(
     The backend must have been loaded, with one thread. Raises SpecError and BackendError as loading does,
     IncompleteError if not even one view fits.
     """
-    of = "sample costs with guides", spec.scene_id, str(frames)
+    of = "sample costs", spec.scene_id, spec.transport.model_dump_json(), str(frames)
     whole, part = (cache.file_of("costs", cache.digest_here(*of, *also)) for also in ((), ("in few seconds",)))
     for file in [] if again else [whole, part] if math.isfinite(seconds) else [whole]:
         if (kept := _kept(file)) is not None:
@@ -160,7 +160,7 @@ def _medians(scene_id: str, measured: list[_Frame]) -> SampleCosts:
 def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
     spec = scene.spec
     modification = sample_modification(spec, SEED, number)
-    view = sample_view(spec, modification.key(spec.scene_id), SEED, number, modification)
+    view = sample_view(spec, modification.key(spec.radiance_id), SEED, number, modification)
     configuration_s, (points, photons) = timed(partial(configure, scene, cloud, modification))
     view_s, _ = timed(partial(look, scene, view, points, photons))
     guides_s, _ = timed(partial(guide, scene, view, cloud, modification))

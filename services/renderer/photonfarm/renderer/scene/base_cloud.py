@@ -38,9 +38,9 @@ def _stacked(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
     return np.concatenate(arrays).astype(dtype) if arrays else np.zeros((0, 3), dtype)
 
 
-def cloud_of(scene: Any, geometry: Geometry, count: int, scene_id: str) -> BasePointCloud:
+def cloud_of(scene: Any, geometry: Geometry, count: int, radiance_id: str) -> BasePointCloud:
     """`count` points uniform on the scene's surfaces, as they are at rest; the scene id determines which."""
-    face, barycentric = sample_surface(geometry, count, Stream(make_key("cloud", scene_id), "surface"))
+    face, barycentric = sample_surface(geometry, count, Stream(make_key("cloud", radiance_id), "surface"))
     position, si = surfaces_at(scene, geometry, face, barycentric)
     emission = si.emitter(scene).eval(si)
     albedo = diffuse_reflectance(si, mi.Bool(True))

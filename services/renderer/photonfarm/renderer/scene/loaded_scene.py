@@ -208,7 +208,7 @@ class LoadedScene:
         before = self._state
         self.apply(rest(self.spec))
         geometry = geometry_of(self.scene.shapes(), self._group_of)
-        cloud = cloud_of(self.scene, geometry, self.spec.points, self.spec.scene_id)
+        cloud = cloud_of(self.scene, geometry, self.spec.points, self.spec.radiance_id)
         self.apply(before)
         return geometry, cloud
 

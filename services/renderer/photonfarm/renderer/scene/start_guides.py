@@ -52,7 +52,7 @@ class SceneGuides:
 
     def _learn(self, integrator: Any, scene: Any, state: Modification) -> Any:
         spec = self._spec
-        key = state.key(spec.scene_id)
+        key = state.key(spec.radiance_id)
         seed = seed_of(key, PURPOSE)
         views = [sample_view(spec, key, seed, i, state) for i in range(VIEWS)]
         places = np.stack([self._sensor.place(view) for view in views])

@@ -15,7 +15,7 @@ from photonfarm.renderer.strategy.measurement import GRID, Measurement
 from photonfarm.renderer.strategy.objective.purpose import Purpose
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec, Transport
+from photonfarm.shared.scene.spec import SceneSpec, Transport
 
 _DECIDED = ("connections", "light_ratio", "half_spp", "guided_light", "light_samples")
 
@@ -28,9 +28,10 @@ def digest(spec: SceneSpec, purpose: Purpose) -> str:
     """
     default = Transport()
     undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
-    scene = spec.model_copy(update={"transport": undecided, "photons": PhotonSpec()})
+    scene = spec.model_copy(update={"transport": undecided})
+    known = scene.radiance_id, str(undecided.rr_depth), repr(spec.exposure), str(spec.points)
     guides = [spec.guides.model_dump_json()] if purpose is Purpose.TRAINING else []
-    return digest_here("scene plan", scene.scene_id, repr(GRID), purpose.value, *guides)
+    return digest_here("scene plan", *known, repr(GRID), purpose.value, *guides)
 
 
 def digest_here(*parts: str) -> str:

@@ -48,7 +48,7 @@ class PilotScene:
         """Some configurations, and a view of each; always the same."""
         for i in range(count):
             modification = sample_modification(self.spec, SEED, i)
-            yield modification, sample_view(self.spec, modification.key(self.spec.scene_id), SEED, i, modification)
+            yield modification, sample_view(self.spec, modification.key(self.spec.radiance_id), SEED, i, modification)
 
     def renders(self, count: int) -> list[Render]:
         """A function for each of some configurations; it renders one view of it."""

@@ -173,7 +173,7 @@ def compare(
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
     torch.set_num_threads(first.settings.threads)
-    samples = HeldOutSamples.of(StoreSource(store, first.scene_id), min(run.settings.hold_out for run in runs), most)
+    samples = HeldOutSamples.of(first.source(store), min(run.settings.hold_out for run in runs), most)
     spec = samples.source.spec
     for _, kept in denoisers:
         kept_count(spec, kept)
@@ -208,6 +208,11 @@ def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
             raise SpecError(
                 f"{run.folder}: was trained on scene {run.scene_id}, and {first.folder} on {first.scene_id}; "
                 "runs of one scene can be compared"
+            )
+        if run.exposure != first.exposure:
+            raise SpecError(
+                f"{run.folder}: was trained with exposure {run.exposure:g}, and {first.folder} with "
+                f"{first.exposure:g}; runs of one exposure can be compared"
             )
 
 
@@ -313,7 +318,8 @@ class _Test:
 
     def _feed(self, predictor: TrainedRun | ReadyPredictor, *, batch: int) -> Feed:
         settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
-        source = StoreSource(self.store, self.samples.source.spec.scene_id)
+        spec = self.samples.source.spec
+        source = StoreSource(self.store, spec.scene_id, spec.exposure)
         return Feed(source, settings, needs=predictor.needs)
 
     def _metrics(self, watched: _Watched, *, having_seen_a: bool) -> ImageMetrics | None:

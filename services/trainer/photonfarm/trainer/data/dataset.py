@@ -160,7 +160,7 @@ def kept_pixels(sample: RawSample, spec: SceneSpec, of: int) -> NDArray[np.bool_
     pixels is a subset of a larger one. Raises SpecError as `kept_count` does.
     """
     film = spec.film.height, spec.film.width
-    key = sample_key(spec.scene_id, sample.modification, sample.view.vector, sample.pass_)
+    key = sample_key(spec.radiance_id, sample.modification, sample.view.vector, sample.pass_)
     chance = Stream(key, "kept pixels").uniform(*film)
     last = kept_count(spec, of) - 1
     kept: NDArray[np.bool_] = chance <= np.partition(chance, last, axis=None)[last]

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from photonfarm.shared.core.records import Guides, ViewBuffers
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.read.batch import Batch
 from photonfarm.shared.store.read.reader import SceneReader
 from photonfarm.trainer.data.dataset import RawSample
@@ -14,10 +15,17 @@ from photonfarm.trainer.data.dataset import RawSample
 class StoreSource(SceneReader):
     """A `SampleSource`: the reader of a scene, with memory that samples are read into again and again."""
 
-    def __init__(self, root: str | Path, scene_id: str) -> None:
+    def __init__(self, root: str | Path, scene_id: str, exposure: float | None = None) -> None:
+        """Take the scene to follow; with an `exposure` other than the one that its spec has now, that of a run."""
         super().__init__(root, scene_id)
+        self._exposure = exposure
         self._guides = False
         self._memory: Batch | None = None
+
+    def read_spec(self) -> SceneSpec:
+        """The scene's spec, with the exposure that was given."""
+        spec = super().read_spec()
+        return spec if self._exposure is None else spec.model_copy(update={"exposure": self._exposure})
 
     def read_guides(self) -> None:
         """Read guides too, from now on."""

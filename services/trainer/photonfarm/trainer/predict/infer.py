@@ -197,7 +197,7 @@ def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointC
 
 def _source(store: str | Path, run: TrainedRun) -> StoreSource:
     """The samples of the run's scene; StoreError if there is no store, or it lacks the scene."""
-    source = StoreSource(Store(store).root, run.scene_id)
+    source = run.source(Store(store).root)
     _ = source.spec  # which says what is there instead
     return source
 

@@ -9,6 +9,7 @@ from typing import Any, Self
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs
@@ -29,6 +30,7 @@ class TrainedRun:
     folder: Path
     settings: TrainSettings
     scene_id: str
+    exposure: float  # of the scene when the run began
     weights: dict[str, Any]  # that predict: averaged over its steps, if the run averages
 
     @classmethod
@@ -42,7 +44,11 @@ class TrainedRun:
         identity = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
         checkpoint.check_continues(folder / name, state, identity)
         weights = average["weights"] if (average := state.get("average")) else state["network"]
-        return cls(folder, settings, str(state["scene_id"]), weights)
+        return cls(folder, settings, str(state["scene_id"]), float(state["exposure"]), weights)
+
+    def source(self, store: str | Path) -> StoreSource:
+        """The samples of its scene in a store, exposed as they were when the run began."""
+        return StoreSource(store, self.scene_id, self.exposure)
 
     def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:
         """The trained network, on the CPU, for the scene that it was trained on."""

@@ -15,7 +15,6 @@ from photonfarm.shared.core.records import F32, Guides, ViewBuffers, arrays_of
 from photonfarm.trainer.compare import evaluate
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict.ready import ReadyPredictor
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.baselines import Baselines
@@ -99,7 +98,7 @@ def gathered(
 ) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
     first = runs[0]
-    card = DatasetCard.of(store, first.scene_id)
+    card = DatasetCard.of(store, first.scene_id, first.exposure)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     tell = on_progress or (lambda *_: None)
     close_look = _CloseLook(store, first, kept, points_used(runs), tell, timed=timed)
@@ -115,7 +114,7 @@ def gathered(
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
-        baselines=Baselines.of(StoreSource(store, first.scene_id), first, evaluation.measured),
+        baselines=Baselines.of(first.source(store), first, evaluation.measured),
         evaluation=evaluation,
         entries=entries,
         costs=costs,
@@ -129,7 +128,7 @@ def gathered(
 
 def _inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tuple[ViewBuffers, Guides | None]]:
     """The buffers of some rows, and their guides if the run reads these, in memory of their own."""
-    source = StoreSource(store, run.scene_id)
+    source = run.source(store)
     if run.needs.guides:
         source.read_guides()
     there = set(source.refresh().tolist())
@@ -204,7 +203,7 @@ class _CloseLook:
 
     def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[HeldOutView]:
         """The views that have references, with the first network's images of them."""
-        source = StoreSource(self._store, self._run.scene_id)
+        source = self._run.source(self._store)
         source.refresh()
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
         views = []

@@ -36,8 +36,8 @@ class DatasetCard:
     spent: dict[str, PlanTotals]  # by the kind of the plans' requests; without kinds that have no committed job
 
     @classmethod
-    def of(cls, store: str | Path, scene_id: str) -> DatasetCard:
-        """The card of one scene; raises StoreError for one that the store does not hold."""
+    def of(cls, store: str | Path, scene_id: str, exposure: float) -> DatasetCard:
+        """The card of one scene, exposed as its runs are; raises StoreError for one that the store does not hold."""
         scene = Store(store).scene(scene_id)
         status = scene_status(scene)
         versions: dict[str, set[str]] = {}
@@ -51,7 +51,14 @@ class DatasetCard:
                 versions.setdefault(package, set()).add(version)
         requests = tuple(plan.request.model_dump(mode="json") for plan in scene.plans())
         known = {package: sorted(found) for package, found in sorted(versions.items())}
-        return cls(scene.spec, status, requests, known, len(workers), _spent(scene, core_s))
+        return cls(
+            scene.spec.model_copy(update={"exposure": exposure}),
+            status,
+            requests,
+            known,
+            len(workers),
+            _spent(scene, core_s),
+        )
 
     @property
     def samples(self) -> PlanTotals:

@@ -29,7 +29,7 @@ from photonfarm.shared.store.io.local import sync
 from photonfarm.trainer.runs.run_folder import GOOD
 from photonfarm.trainer.runs.settings import NetworkSettings
 
-FORMAT = 3
+FORMAT = 4
 ANEW = "remove it, and the run begins anew"
 TENSOR = "tensor"
 

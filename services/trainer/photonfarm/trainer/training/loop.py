@@ -180,7 +180,10 @@ class Session:
         return changed
 
     def _send_begin(self, *, continues: bool) -> None:
-        beginning = {"scene_id": self._feed.spec.scene_id, "step": self._step, "continues": continues}
+        spec = self._feed.spec
+        beginning = {
+            "scene_id": spec.scene_id, "exposure": spec.exposure, "step": self._step, "continues": continues,
+        }  # fmt: skip
         self._hooks.group.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
@@ -203,6 +206,7 @@ class Session:
         samples = len(self._stream.growth.rows)
         return {
             **self._identity(),
+            "exposure": self._feed.spec.exposure,
             "step": self._step,
             "seconds": self._watch.seconds,
             "last_error": self._last_error,

@@ -19,8 +19,8 @@ from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.recovery import GoodState
 
 
-def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
-    """Train with rank 0 until that ends; `source` makes the samples of a scene, given its id.
+def assist(source: Callable[[str, float], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
+    """Train with rank 0 until that ends; `source` makes the samples of a scene, given its id and its exposure.
 
     A resumed run is read from the folder `run`, which rank 0 writes. Raises what `train` does.
     """
@@ -30,7 +30,7 @@ def assist(source: Callable[[str], SampleSource], settings: TrainSettings, run: 
         return
     own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
     resident = ResidentSamples(ranks.device(settings.device), settings.resident_gb)
-    with Feed(source(value["scene_id"]), own, resident=resident) as feed:
+    with Feed(source(value["scene_id"], value["exposure"]), own, resident=resident) as feed:
         good, step = GoodState(Learner(feed, settings, ranks)), value["step"]
         if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run, recover=settings.recover)

@@ -139,7 +139,7 @@ class PlanCheck:
             rows = plan.rows
             used = np.flatnonzero(rows.sample_modification != UNUSED)
             contents = modification[rows.sample_modification[used]], view[rows.sample_view[used]]
-            keys = sample_keys(self._id, *contents, rows.sample_pass[used])
+            keys = sample_keys(self._spec.radiance_id, *contents, rows.sample_pass[used])
             stored = (rows.sample_key[i].tobytes() for i in used)
             wrong = [plan.first_row + int(i) for i, key, kept in zip(used, keys, stored, strict=True) if key != kept]
             if wrong:

@@ -18,7 +18,7 @@ _DIGITS = 12
 _NAME = re.compile(rf"([0-9]{{{_DIGITS}}})\.json")
 
 CPU = "cpu"
-"""The device of jobs that a processor rendered, and of markers that name none."""
+"""The device of jobs that a processor rendered."""
 
 _Seconds = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 _ShardName = Annotated[str, Field(pattern=r"^plans/[0-9]{6,}/[a-z0-9_]+/c(\.[0-9]+)+$")]
@@ -41,8 +41,9 @@ class _Figures(_Stored):
     redrawn: Annotated[int, Field(ge=0)]
     worker: str
     versions: dict[str, str]  # of the packages that rendered
-    device: str = CPU  # what rendered: older markers do not say it, and are of processors
+    device: str = CPU  # what rendered
     driver: str = ""
+    strategy: dict[str, Any] = {}
 
 
 class _Marker(_Stored):

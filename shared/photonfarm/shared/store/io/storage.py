@@ -167,12 +167,12 @@ def discard(part: Path) -> None:
         part.unlink(missing_ok=True)
 
 
-def put_json(storage: Storage, document: dict[str, Any], name: str) -> bool:
-    """Store a JSON document durably under a new name; False if the name was taken, which keeps the old document."""
+def put_json(storage: Storage, document: dict[str, Any], name: str, *, replace: bool = False) -> bool:
+    """Store a JSON document durably; False if the name was taken, which keeps the old document unless `replace`."""
     part = storage.part()
     try:
         part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-        placed = storage.adopt(part, name)
+        placed = storage.adopt(part, name, replace=replace)
     finally:
         discard(part)
     storage.settle([name])

@@ -81,9 +81,13 @@ class SceneReader:
         """The scene's spec; raises StoreError while the scene is not there."""
         if self._spec is None:
             check_format(self._storage)
-            self._spec = read_spec(self._storage, self._scene_id)
+            self._spec = self.read_spec()
             self._arrays = schema.output_arrays(self._spec)
         return self._spec
+
+    def read_spec(self) -> SceneSpec:
+        """The scene's spec as it is stored now; what a reader began with stays its `spec`."""
+        return read_spec(self._storage, self._scene_id)
 
     def ready(self) -> bool:
         """Whether spec and base are there; the base comes with the scene's first job."""
@@ -217,7 +221,7 @@ class SceneReader:
 
     def modification_key(self, row: int) -> Key:
         """The content key of a sample's configuration, by whose hash samples are held out."""
-        return plans.modification_at(self._plans, self.modification_row(row)).key(self._scene_id)
+        return plans.modification_at(self._plans, self.modification_row(row)).key(self.spec.radiance_id)
 
     def modification_keys(self, rows: Sequence[int]) -> list[Key]:
         """The content keys of the configurations of many samples, each hashed once."""
@@ -226,7 +230,7 @@ class SceneReader:
         if not len(chosen):
             return []
         distinct, place = np.unique(self._modification_row[chosen], return_inverse=True)
-        keys = modification_keys(self._scene_id, plans.vectors_at(self._plans, "modification", distinct))
+        keys = modification_keys(self.spec.radiance_id, plans.vectors_at(self._plans, "modification", distinct))
         return [keys[i] for i in place.tolist()]
 
     def view_keys(self, rows: Sequence[int]) -> list[Key]:

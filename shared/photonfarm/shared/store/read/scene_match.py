@@ -111,7 +111,7 @@ class SceneMatch:
         """The distances of the modifications in some rows from the wanted one; infinite if other groups are present."""
         vectors = _inputs(self._plans, "modification")[rows]
         if isinstance(wanted, bytes):
-            return _unless_equal(modification_keys(self._scene.spec.scene_id, vectors), wanted)
+            return _unless_equal(modification_keys(self._scene.spec.radiance_id, vectors), wanted)
         if wanted.size != vectors[0].size:
             return np.full(len(rows), np.inf)
         target = wanted.reshape(vectors.shape[1:])
@@ -128,7 +128,7 @@ class SceneMatch:
             return np.asarray(np.linalg.norm(apart, axis=-1).max(axis=1))
         seen, first = np.unique(view, return_index=True)  # by some sample
         of_view = _inputs(self._plans, "modification")[modification[first[np.searchsorted(seen, rows)]]]
-        keys = modification_keys(self._scene.spec.scene_id, of_view)
+        keys = modification_keys(self._scene.spec.radiance_id, of_view)
         return _unless_equal(view_keys(keys, vectors), wanted)
 
     # ------------------------------------------------------------------------------------------------------- describing
@@ -142,7 +142,7 @@ class SceneMatch:
             self._committed = self._scene.committed_jobs()
         modification = plans.modification_at(self._plans, sample.modification_row)
         view = plans.view_at(self._plans, sample.view_row)
-        key = modification.key(self._scene.scene_id)
+        key = modification.key(self._scene.spec.radiance_id)
         plan = plans.plan_of(self._plans, row)
         rows = {"sample": row, "view": sample.view_row, "modification": sample.modification_row}
         jobs = tuple(each // plan.shard_rows for each in rows.values())

@@ -10,7 +10,7 @@ import contextlib
 import queue
 import threading
 from collections.abc import Callable, Iterable, Mapping, Set
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Protocol, Self, TypeVar
@@ -50,6 +50,7 @@ class Figures:
     versions: Mapping[str, str]
     device: str = markers.CPU  # what rendered; otherwise the name of a card
     driver: str = ""  # the version of the card's driver
+    strategy: Mapping[str, Any] = field(default_factory=dict)  # how light was sampled, as `SceneSpec.strategy`
 
 
 Clock = Callable[[], datetime]

@@ -49,6 +49,9 @@ RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a co
 REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
 """The remedy for most damage of a plan."""
 
+PARTS = 2
+"""The independent parts of a sample: the halves A and B."""
+
 INPUTS = [field.name for field in fields(PlannedRows)]
 """The names of a plan's arrays of inputs."""
 
@@ -165,6 +168,10 @@ def build(
     attributes: Any = {
         **declarations.stamp(),
         "scene": spec.scene_id,
+        "radiance_id": spec.radiance_id,
+        "inputs_id": spec.inputs_id,
+        "parts": PARTS,
+        "radiance_exponent": spec.radiance_exponent,
         "request": request.model_dump(mode="json"),
         "first_job": first_job,
         "jobs": count // shard_rows,
@@ -175,6 +182,18 @@ def build(
         for declared in declarations.PLAN_INPUTS:
             schema.create_input(group, declared, getattr(rows, declared.name))
         schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
+
+
+def radiance_exponent(storage: Storage, scene: str) -> int | None:
+    """The power of two by which a scene's first plan stores radiance; None without a plan that can be read."""
+    import zarr
+
+    first = folder(scene, 0)
+    try:
+        group = zarr.open_group(storage.zarr(first), mode="r", zarr_format=3, use_consolidated=False)
+        return int(str(group.attrs["radiance_exponent"]))
+    except (FileNotFoundError, ValueError, KeyError, TypeError, RuntimeError):
+        return None
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:

@@ -25,7 +25,7 @@ from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
 from photonfarm.shared.store.format.followed_markers import FollowedMarkers
-from photonfarm.shared.store.io.storage import Storage
+from photonfarm.shared.store.io.storage import Storage, put_json
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.commit import JobWriter
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
@@ -68,6 +68,10 @@ class SceneStore:
         self.spec = read_spec(storage, scene_id)
         self._plans: list[StoredPlan] = []
         self._followed = FollowedMarkers(storage, self.name)
+
+    def reread(self) -> None:
+        """Take up what a later submission has changed of the spec: name, credits, exposure or strategy."""
+        self.spec = read_spec(self.storage, self.scene_id)
 
     @property
     def folder(self) -> Path:
@@ -263,6 +267,20 @@ def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
     if spec.scene_id != scene_id:
         raise CorruptError(f"{storage.where}/{name}: has scene id {spec.scene_id}, not that of its folder")
     return spec
+
+
+def write_spec(storage: Storage, spec: SceneSpec) -> None:
+    """Store the spec of a scene; one that is there is replaced if it differs in what no id covers.
+
+    The power of two by which radiance is stored stays what it was at first. Raises CorruptError for a damaged spec.
+    """
+    folder = f"{SCENES}/{spec.scene_id}"
+    name = f"{folder}/spec.json"
+    there = read_spec(storage, spec.scene_id) if storage.exists(name) else None
+    exponent = plans.radiance_exponent(storage, folder) if there is None else there.radiance_exponent
+    stored = spec.model_copy(update={"stored_exponent": spec.radiance_exponent if exponent is None else exponent})
+    if stored != there:
+        put_json(storage, stored.model_dump(mode="json"), name, replace=there is not None)
 
 
 def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:

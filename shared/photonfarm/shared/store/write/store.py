@@ -12,7 +12,15 @@ from photonfarm.shared.plan.request import SHARD_ROWS, PlannedContent, Request, 
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations
 from photonfarm.shared.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, Storage, open_storage, put_json
-from photonfarm.shared.store.write.scene_store import SCENES, PlanResult, SceneStore, are_there, is_there, scene_ids
+from photonfarm.shared.store.write.scene_store import (
+    SCENES,
+    PlanResult,
+    SceneStore,
+    are_there,
+    is_there,
+    scene_ids,
+    write_spec,
+)
 
 FAILURES_FOLDER = "failures"
 """The folder in which the queue keeps why jobs failed."""
@@ -93,11 +101,13 @@ class Store:
         return given, failed
 
     def add(self, spec: SceneSpec) -> SceneStore:
-        """The scene of a spec, made if it is new; the first spec written for a scene id stays."""
-        name = f"{SCENES}/{spec.scene_id}/spec.json"
+        """The scene of a spec, made if it is new.
+
+        Of a scene that is there, the spec replaces what no id covers: name, credits, exposure and strategy.
+        """
         with store_errors("add a scene", self.storage.where):
-            if not self.storage.exists(name):
-                put_json(self.storage, spec.model_dump(mode="json"), name)
+            write_spec(self.storage, spec)
+        self._opened.pop(spec.scene_id, None)
         return self.scene(spec.scene_id)
 
     def plan(

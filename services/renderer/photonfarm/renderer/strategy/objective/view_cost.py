@@ -66,7 +66,7 @@ def configure(
     """Bring a scene into a configuration; returns its points, as `rebuild` does, and its photons."""
     scene.apply(modification)
     dr.sync_thread()  # pending evaluations would be charged to the view
-    return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.scene_id))[0]
+    return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.radiance_id))[0]
 
 
 def look(scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None) -> None:
@@ -77,7 +77,7 @@ def look(scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], 
 
 def guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: Modification) -> None:
     """Render the guides of a view."""
-    key = view_key(modification.key(scene.spec.scene_id), view.vector)
+    key = view_key(modification.key(scene.spec.radiance_id), view.vector)
     scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
 
 

@@ -51,6 +51,8 @@ def scene_show(spec: str, as_json: bool) -> None:
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
 @click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
+@click.option("--halves-from", metavar="ID", help="A scene of the store that differs in buffers, guides, photons or "
+              "points alone: jobs take over the halves that it has.")  # fmt: skip
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
               "more at that cost; write nothing.")  # fmt: skip
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
@@ -61,6 +63,7 @@ def submit(
     redis_url: str,
     no_queue: bool,
     retry: bool,
+    halves_from: str | None,
     dry_run: bool,
     no_measure: bool,
     as_json: bool,
@@ -84,7 +87,9 @@ def submit(
         result = dry.rehearse(named, store, request, measure=not no_measure, log=log, shard_rows=shard_rows)
     else:
         url = None if no_queue else redis_url
-        result = submission.submit(named, store, url, request, retry=retry, shard_rows=shard_rows)
+        result = submission.submit(
+            named, store, url, request, retry=retry, shard_rows=shard_rows, halves_from=halves_from
+        )
     show.submission(result, as_json)
 
 

@@ -14,6 +14,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.read.find import scene_named
 from photonfarm.shared.store.read.other_scenes import other_scenes
 
 
@@ -47,16 +48,19 @@ def submit(
     retry: bool = False,
     shard_rows: int | None = None,
     workers: int = WORKERS,
+    halves_from: str | None = None,
 ) -> Submission:
     """Plan the new samples of a request, and queue every missing job of the store unless `redis_url` is None.
 
     Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
+    `halves_from` is a scene of the store by its id or how it begins: jobs take over what halves it has.
     Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
     QueueError; in the last case the plan is kept, and idle workers queue it later.
     """
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
-    planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual)
+    other = None if halves_from is None else scene_named(opened, halves_from)
+    planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     queued = _queued(opened, redis_url, retry=retry)
     return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)
 

@@ -99,6 +99,8 @@ class PlannedRows:
     sample_view: NDArray[np.int64]  # (R,) row of the sample's view, or UNUSED
     sample_pass: NDArray[np.int32]  # (R,) pass number, or UNUSED
     sample_key: NDArray[np.uint8]  # (R, 16)
+    modification_density: F32  # (R,) of the configuration, over that of uniform draws from the spec; NaN: unused row
+    view_density: F32  # (R,) likewise of the view, given the configuration
 
     @classmethod
     def empty(cls, rows: int, groups: int) -> PlannedRows:
@@ -110,6 +112,8 @@ class PlannedRows:
             np.full(rows, UNUSED, np.int64),
             np.full(rows, UNUSED, np.int32),
             np.zeros((rows, KEY_BYTES), np.uint8),
+            np.full(rows, np.nan, np.float32),
+            np.full(rows, np.nan, np.float32),
         )
 
 
@@ -283,8 +287,10 @@ def pack(candidates: SamplesToPlan, *, first_row: int, shard_rows: int) -> Plann
     rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, candidates.modification.shape[1])
     modification_row, new = _place(candidates.sample_modification, candidates.modification_row, first_row, shard_rows)
     rows.modification[modification_row[new] - first_row] = candidates.modification[new]
+    rows.modification_density[modification_row[new] - first_row] = 1
     view_row, new = _place(candidates.sample_view, candidates.view_row, first_row, shard_rows)
     rows.view[view_row[new] - first_row] = candidates.view[new]
+    rows.view_density[view_row[new] - first_row] = 1
     rows.sample_modification[:count] = modification_row[candidates.sample_modification]
     rows.sample_view[:count] = view_row[candidates.sample_view]
     rows.sample_pass[:count] = candidates.sample_pass

@@ -263,12 +263,12 @@ class SceneSpec(Frozen):
 
         Keys and seeds follow from it.
         """
-        return make_key("radiance", _canonical(self._of_radiance())).hex()
+        return make_key("radiance", _canonical(self.radiance_settings())).hex()
 
     @cached_property
     def inputs_id(self) -> str:
         """32 hexadecimal digits: the digest of what buffers, guides, photons and points are made with."""
-        return make_key("inputs", _canonical(self._of_inputs())).hex()
+        return make_key("inputs", _canonical(self.inputs())).hex()
 
     @cached_property
     def scene_id(self) -> str:
@@ -277,14 +277,16 @@ class SceneSpec(Frozen):
 
     def identity(self) -> dict[str, Any]:
         """All that ids are made of, as JSON has it: specs that agree in it are one scene."""
-        return self._of_radiance() | self._of_inputs()
+        return self.radiance_settings() | self.inputs()
 
-    def _of_radiance(self) -> dict[str, Any]:
+    def radiance_settings(self) -> dict[str, Any]:
+        """All that the mean of a sample and its size depend on."""
         not_of_it: dict[str, Any] = {"scene": {"file"}, "transport": STRATEGY}
         not_of_it |= dict.fromkeys(("name", "credits", "exposure", "stored_exponent", *_INPUTS), True)
         return self.model_dump(mode="json", exclude=not_of_it)
 
-    def _of_inputs(self) -> dict[str, Any]:
+    def inputs(self) -> dict[str, Any]:
+        """What buffers, guides, photons and points are made with."""
         made = {"generator": INPUTS_GENERATOR, "rays_per_pixel": RAYS_PER_PIXEL}
         return self.model_dump(mode="json", include=set(_INPUTS)) | made
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.jobs.estimates import Estimator, halves_of, photons_of
+from photonfarm.renderer.jobs.other_halves import OtherHalves
 from photonfarm.renderer.scene import backend
 from photonfarm.shared.core.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
 from photonfarm.shared.core.keys import Key, view_key
@@ -165,10 +166,11 @@ class ShardRenderer:
         with stored.job_writer(job) as out:
             report = self._on_progress if loaded.compiled else self._compiles_first
             rows = stored.job_rows(job)
-            redrawn = _Rendering(loaded.scene, cloud, loaded.stored.spec, out, report).run(rows)
+            rendering = _Rendering(loaded.scene, cloud, stored.spec, out, report, self._other_halves(stored, job))
+            rendering.run(rows)
             loaded.compiled = True
             self._on_progress(COMMITS, len(rows.samples), len(rows.samples))
-            committed = out.commit(self._figures(began, redrawn, stored.spec))
+            committed = out.commit(self._figures(began, rendering, stored.spec))
         if not committed:
             what = "was committed by another worker while it was rendered here; that one stays"
             if not stored.is_committed(job):
@@ -183,18 +185,23 @@ class ShardRenderer:
     def _now(self) -> tuple[float, float]:
         return time.monotonic(), time.process_time()
 
-    def _figures(self, began: tuple[float, float], redrawn: int, spec: SceneSpec) -> Figures:
+    def _other_halves(self, stored: SceneStore, job: int) -> OtherHalves | None:
+        other = stored.halves_from(job)
+        return None if other is None else OtherHalves(self._store.root, other)
+
+    def _figures(self, began: tuple[float, float], rendering: _Rendering, spec: SceneSpec) -> Figures:
         """The cost of the work since `began`, for a marker."""
         wall, core = self._now()
         return Figures(
             core_s=core - began[1],
             wall_s=wall - began[0],
-            redrawn=redrawn,
+            redrawn=rendering.redrawn,
             worker=self._worker,
             versions=versions(),
             device=backend.device().name,
             driver=backend.device().driver,
             strategy=spec.strategy(),
+            taken_over=rendering.taken_over,
         )
 
     def _scene(self, stored: SceneStore) -> _Loaded:
@@ -266,17 +273,25 @@ class _Rendering:
     """One pass over a job's samples: each modification is applied once, and each new view's inputs rendered once."""
 
     def __init__(
-        self, scene: SceneRenderer, cloud: BasePointCloud, spec: SceneSpec, out: JobWriter, on_progress: OnProgress
+        self,
+        scene: SceneRenderer,
+        cloud: BasePointCloud,
+        spec: SceneSpec,
+        out: JobWriter,
+        on_progress: OnProgress,
+        others: OtherHalves | None,
     ) -> None:
         self._scene = scene
         self._on_progress = on_progress
         self._cloud = cloud
         self._radiance_id, self._wanted = spec.radiance_id, spec.guides
         self._out = out
-        self._redrawn = 0
+        self._others = others
+        self.redrawn = 0  # renders that were discarded
+        self.taken_over = 0  # samples whose halves another scene has
 
-    def run(self, rows: JobRows) -> int:
-        """Pass every row of the job to its writer; returns the number of discarded renders.
+    def run(self, rows: JobRows) -> None:
+        """Pass every row of the job to its writer.
 
         Photons that another job stores, with the modification, are traced again for this job's new views: their seed
         follows from the modification's key, so that they are equal. That job counts the renders discarded for them.
@@ -291,7 +306,7 @@ class _Rendering:
                 photons_of(self._scene, modification.key(self._radiance_id)) if wants_photons else (None, 0)
             )
             if is_new:
-                self._redrawn += thrown
+                self.redrawn += thrown
                 if photons is not None:
                     self._out.photons(modification_row, photons)
             points = rebuild(self._cloud, modification)
@@ -306,14 +321,24 @@ class _Rendering:
                         self._out.view(sample.view_row, buffers, guides, visibility)
                         new_views.remove(sample.view_row)
                 self._render_halves(together, rows)
-        return self._redrawn
 
     def _render_halves(self, samples: Sequence[SampleRow], rows: JobRows) -> None:
-        """Render the halves of samples together."""
+        """Render the halves of samples together, or take them over."""
+        if self._others is not None:
+            samples = [sample for sample in samples if not self._takes_over(sample, self._others)]
+        if not samples:
+            return
         found = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in samples])
         for sample, (halves, thrown) in zip(samples, found, strict=True):
-            self._redrawn += thrown
+            self.redrawn += thrown
             self._out.radiance(sample.row, halves)
+
+    def _takes_over(self, sample: SampleRow, others: OtherHalves) -> bool:
+        halves = others.find(sample.key)
+        if halves is not None:
+            self._out.radiance(sample.row, halves)
+            self.taken_over += 1
+        return halves is not None
 
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
         """Render the buffers of a view, without a second attempt: they depend on no seed."""

@@ -301,22 +301,24 @@ GUIDES = (
 OUTPUTS = (*_SAMPLES_AND_BUFFERS, *GUIDES)
 """The arrays that jobs produce. The first axis names what a row belongs to."""
 
+_OVER = "over that of uniform draws from the spec: 1 of such a draw"
+
 PLAN_INPUTS = (
     ArrayDeclaration(
         "modification",
         ("modification", "group", "component"),
         ("R", "G", 4),
         "<f4",
-        "scene units; the last component: 1",
-        "translation from rest along x, y, z, then 1: present or 0: removed; NaN: unused row",
+        "see fields",
+        "what may change of each movable group, by the attributes groups and fields; NaN: unused row",
     ),
     ArrayDeclaration(
         "view",
         ("view", "component"),
         ("R", 6),
         "<f4",
-        "scene units",
-        f"camera position x, y, z, then the point it looks at, {_WORLD}; NaN: unused row",
+        "see fields",
+        f"a camera in {_WORLD}, by the attribute fields; NaN: unused row",
     ),
     ArrayDeclaration(
         "sample_modification",
@@ -335,8 +337,42 @@ PLAN_INPUTS = (
     ArrayDeclaration(
         "sample_key", ("sample", "byte"), ("R", KEY_BYTES), "|u1", "1", "the sample's content key; zeros: unused row"
     ),
+    ArrayDeclaration(
+        "modification_density",
+        ("modification",),
+        ("R",),
+        "<f4",
+        "1",
+        f"the density by which the configuration was chosen, {_OVER}; NaN: a person chose it, or an unused row",
+    ),
+    ArrayDeclaration(
+        "view_density",
+        ("view",),
+        ("R",),
+        "<f4",
+        "1",
+        f"the density by which the view was chosen, given its configuration, {_OVER}; NaN as above",
+    ),
 )
 """The arrays of a plan's inputs."""
+
+FIELDS = {
+    "modification": (
+        {"name": "x", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
+        {"name": "y", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
+        {"name": "z", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
+        {"name": "present", "unit": "1", "rest": 1.0, "zero": "removed"},
+    ),
+    "view": tuple(
+        {"name": f"{point}_{axis}", "unit": "scene units", "rest": 0.0, "zero": "the origin of world coordinates"}
+        for point in ("origin", "look_at")
+        for axis in "xyz"
+    ),
+}
+"""What the columns of `modification`, for each group, and of `view` hold. More may follow; a plan names those it has.
+
+A field that a plan lacks is at `rest` in all of its rows. `zero` says what 0 means.
+"""
 
 BASE = {
     "geometry": (

@@ -44,6 +44,7 @@ class _Figures(_Stored):
     device: str = CPU  # what rendered
     driver: str = ""
     strategy: dict[str, Any] = {}
+    taken_over: Annotated[int, Field(ge=0)] = 0
 
 
 class _Marker(_Stored):

@@ -113,8 +113,13 @@ def create_outputs(group: zarr.Group, arrays: Iterable[ArraySchema], rows: int, 
         )
 
 
-def create_input(group: zarr.Group, declared: ArrayDeclaration, data: NDArray[Any]) -> None:
-    """Store a whole array of inputs or of the base, compressed and with checksums; `data` has the declared type."""
+def create_input(
+    group: zarr.Group, declared: ArrayDeclaration, data: NDArray[Any], more: Mapping[str, Any] | None = None
+) -> None:
+    """Store a whole array of inputs or of the base, compressed and with checksums; `data` has the declared type.
+
+    `more` are attributes beside the declared ones.
+    """
     chunks = (min(max(len(data), 1), INPUT_ROWS_PER_CHUNK), *(max(n, 1) for n in data.shape[1:]))
     little = data.astype(declared.dtype, casting="equiv", copy=False)
     array = group.create_array(
@@ -126,7 +131,7 @@ def create_input(group: zarr.Group, declared: ArrayDeclaration, data: NDArray[An
         compressors=_codecs(compressed=declared.compressed),
         filters=None,
         dimension_names=declared.axes,
-        attributes=declared.attributes,
+        attributes={**declared.attributes, **(more or {})},
         chunk_key_encoding=_FLAT,
         config={"write_empty_chunks": True},
     )

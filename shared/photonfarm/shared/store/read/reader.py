@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
-from photonfarm.shared.core.keys import Key, view_key
+from photonfarm.shared.core.keys import KEY_BYTES, Key, view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
 from photonfarm.shared.scene.modification import Modification, modification_keys
 from photonfarm.shared.scene.spec import SceneSpec
@@ -184,6 +184,15 @@ class SceneReader:
             where = f"{self._storage.where}/{self._name}"
             raise CorruptError(f"{where}: row {row} holds a value that is not finite; {REPAIR}")
         return sample
+
+    def read_radiance(self, row: int) -> F32:
+        """Read the halves of one complete sample, and nothing else, (2, H, W, 3) linear, unscaled."""
+        return self.read_batch([row], Batch.empty(self.spec, 1, buffers=False)).linear(0)
+
+    def rows_by_key(self) -> dict[Key, int]:
+        """The rows of all complete samples by their content keys."""
+        keys = np.concatenate([np.zeros((0, KEY_BYTES), np.uint8), *(plan.rows.sample_key for plan in self._plans)])
+        return {keys[row].tobytes(): row for row in self.rows.tolist()}
 
     def inputs(self, row: int) -> tuple[Modification, View, int]:
         """The configuration, the view and the number of the noisy pass of a complete sample."""

@@ -51,6 +51,7 @@ class Figures:
     device: str = markers.CPU  # what rendered; otherwise the name of a card
     driver: str = ""  # the version of the card's driver
     strategy: Mapping[str, Any] = field(default_factory=dict)  # how light was sampled, as `SceneSpec.strategy`
+    taken_over: int = 0  # samples whose halves were copied from another scene
 
 
 Clock = Callable[[], datetime]

@@ -6,7 +6,7 @@ Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -69,6 +69,7 @@ class StoredPlan:
     jobs: int
     shard_rows: int
     rows: PlannedRows
+    halves_from: str | None = None  # another scene, whose halves its jobs take over
 
     @property
     def end_job(self) -> int:
@@ -108,6 +109,7 @@ class PlanAttributes:
     first_job: int
     jobs: int
     shard_rows: int
+    halves_from: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +159,14 @@ def expanded(
 
 
 def build(
-    part: Path, spec: SceneSpec, request: Request | TopUp, rows: PlannedRows, *, first_job: int, shard_rows: int
+    part: Path,
+    spec: SceneSpec,
+    request: Request | TopUp,
+    rows: PlannedRows,
+    *,
+    first_job: int,
+    shard_rows: int,
+    halves_from: str | None = None,
 ) -> None:
     """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
     import zarr
@@ -170,17 +179,24 @@ def build(
         "scene": spec.scene_id,
         "radiance_id": spec.radiance_id,
         "inputs_id": spec.inputs_id,
+        "inputs": spec.inputs(),
         "parts": PARTS,
         "radiance_exponent": spec.radiance_exponent,
         "request": request.model_dump(mode="json"),
         "first_job": first_job,
         "jobs": count // shard_rows,
         "shard_rows": shard_rows,
+        **({} if halves_from is None else {"halves_from": halves_from}),
     }
     with group_in(part) as store:
         group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
         for declared in declarations.PLAN_INPUTS:
-            schema.create_input(group, declared, getattr(rows, declared.name))
+            more: dict[str, Any] = {}
+            if declared.name in declarations.FIELDS:
+                more["fields"] = list(declarations.FIELDS[declared.name])
+            if declared.name == "modification":
+                more["groups"] = [each.name for each in spec.groups]
+            schema.create_input(group, declared, getattr(rows, declared.name), more)
         schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
 
 
@@ -231,8 +247,36 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
         group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
         check_version(group.attrs, f"{storage.where}/{name}")
         about = about_plan(dict(group.attrs))
-        rows = PlannedRows(*(schema.read_input(storage, f"{name}/{each}", group[each]) for each in INPUTS))
-    return StoredPlan(number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows)
+        rows = PlannedRows(*(_input(storage, name, group, each) for each in INPUTS))
+    return StoredPlan(
+        number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows, about.halves_from
+    )
+
+
+def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]:
+    """An array of inputs; one of vectors has the columns that this program knows, in their order."""
+    values = schema.read_input(storage, f"{folder}/{name}", group[name])
+    if name not in declarations.FIELDS:
+        return values
+    stored = [str(field["name"]) for field in group[name].attrs["fields"]]
+    return by_name(values, stored, declarations.FIELDS[name])
+
+
+def by_name(values: F32, stored: Sequence[str], known: Sequence[Mapping[str, Any]]) -> F32:
+    """Vectors (…, F) whose columns have the names `stored`, with the `known` fields; those not stored are at rest.
+
+    Unused rows stay NaN. Raises ValueError for a field that is not known.
+    """
+    names = [field["name"] for field in known]
+    if list(stored) == names:
+        return values
+    if unknown := [name for name in stored if name not in names]:
+        raise ValueError(f"has the field {unknown[0]}, which this program does not know: install a newer photonfarm")
+    found = np.empty((*values.shape[:-1], len(names)), np.float32)
+    for place, field in enumerate(known):
+        at_rest = np.where(np.isnan(values[..., 0]), np.float32(np.nan), np.float32(field["rest"]))
+        found[..., place] = values[..., stored.index(field["name"])] if field["name"] in stored else at_rest
+    return found
 
 
 @contextlib.contextmanager
@@ -261,7 +305,8 @@ def check_version(attributes: Mapping[str, Any], where: str) -> None:
 def about_plan(attributes: dict[str, Any]) -> PlanAttributes:
     """Read the attributes of a plan's group; raises ValueError or KeyError."""
     request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
-    return PlanAttributes(request, *(int(attributes[name]) for name in ("first_job", "jobs", "shard_rows")))
+    first_job, jobs, shard_rows = (int(attributes[name]) for name in ("first_job", "jobs", "shard_rows"))
+    return PlanAttributes(request, first_job, jobs, shard_rows, attributes.get("halves_from"))
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

@@ -91,11 +91,13 @@ class SceneStore:
         *,
         shard_rows: int | None = None,
         usual_rows: int = SHARD_ROWS,
+        halves_from: str | None = None,
         dry_run: bool = False,
     ) -> PlanResult:
         """Plan the new samples of a request; concurrent submitters try again, each after the other's plan.
 
-        Raises SpecError for an invalid request or number of rows, and CorruptError if a plan is missing.
+        `halves_from` is the id of a scene with the same radiance id, whose halves the jobs take over. Raises SpecError
+        for an invalid request or number of rows, and CorruptError if a plan is missing.
         """
         while True:
             last = max(markers.jobs(self.storage, self.name), default=-1)
@@ -113,7 +115,8 @@ class SceneStore:
             with store_errors("write a plan", self.storage.where):
                 built = self.storage.part()
                 try:
-                    plans.build(built, self.spec, request, expansion.rows, first_job=first_job, shard_rows=rows_per_job)
+                    numbers = {"first_job": first_job, "shard_rows": rows_per_job}
+                    plans.build(built, self.spec, request, expansion.rows, **numbers, halves_from=halves_from)
                     if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
                         jobs = len(expansion.rows.sample_pass) // rows_per_job
                         new, known, extent = expansion.new, expansion.known, expansion.extent
@@ -140,6 +143,11 @@ class SceneStore:
         if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
             self.plans()
         return plans.job_rows(self._plans, job)
+
+    def halves_from(self, job: int) -> str | None:
+        """The other scene whose halves a job takes over, if any; raises IndexError for a job of no plan."""
+        rows = self.job_rows(job)
+        return plans.plan_of(self._plans, rows.job * self._plans[0].shard_rows).halves_from
 
     def job_writer(self, job: int) -> JobWriter:
         """A writer that takes a job's outputs and commits them; raises IndexError for a job of no plan."""

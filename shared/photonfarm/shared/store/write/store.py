@@ -7,7 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
+from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.models import differing
 from photonfarm.shared.plan.request import SHARD_ROWS, PlannedContent, Request, expand
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations
@@ -117,17 +118,34 @@ class Store:
         *,
         shard_rows: int | None = None,
         usual_rows: int = SHARD_ROWS,
+        halves_from: str | None = None,
         dry_run: bool = False,
     ) -> PlanResult:
         """Plan the new samples of a request; `dry_run` only counts.
 
-        `shard_rows` is fixed by a scene's first plan; if it is None, that has `usual_rows`.
+        `shard_rows` is fixed by a scene's first plan; if it is None, that has `usual_rows`. `halves_from` is the id of
+        another scene of the store, whose halves the jobs take over; SpecError unless its radiance is the same.
         """
+        if halves_from is not None:
+            self._check_same_radiance(spec, halves_from)
         if dry_run and not self.has_scene(spec.scene_id):
             expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or usual_rows)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
         scene = self.scene(spec.scene_id) if dry_run else self.add(spec)
-        return scene.plan(request, shard_rows=shard_rows, usual_rows=usual_rows, dry_run=dry_run)
+        return scene.plan(
+            request, shard_rows=shard_rows, usual_rows=usual_rows, halves_from=halves_from, dry_run=dry_run
+        )
+
+    def _check_same_radiance(self, spec: SceneSpec, scene_id: str) -> None:
+        other = self.scene(scene_id).spec
+        if scene_id == spec.scene_id:
+            raise SpecError(f"--halves-from {scene_id}: is the scene itself, whose halves are there")
+        if other.radiance_id != spec.radiance_id:
+            changed = differing(other.radiance_settings(), spec.radiance_settings())
+            raise SpecError(
+                f"--halves-from {scene_id}: its radiance is another one, as {', '.join(changed)} differ; only scenes "
+                "that differ in buffers, guides, photons and points share halves"
+            )
 
     def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
         """Remove temporary files that dead writers left; returns how many."""

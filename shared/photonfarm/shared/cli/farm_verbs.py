@@ -51,8 +51,8 @@ def scene_show(spec: str, as_json: bool) -> None:
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
 @click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
-@click.option("--halves-from", metavar="ID", help="A scene of the store that differs in buffers, guides, photons or "
-              "points alone: jobs take over the halves that it has.")  # fmt: skip
+@click.option("--halves-from", metavar="ID", help="The scene whose halves jobs take over; it may differ in buffers, "
+              "guides, photons and points alone.  [default: the one that has most]")  # fmt: skip
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
               "more at that cost; write nothing.")  # fmt: skip
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")

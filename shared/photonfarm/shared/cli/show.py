@@ -126,6 +126,10 @@ def submission(result: Submission, as_json: bool) -> None:
     click.echo(
         f"scene {result.scene_id}: {result.planned} samples planned, {result.planned_before} planned before, {queued}"
     )
+    if result.note:
+        click.echo(result.note, err=True)
+    if result.halves_from:
+        click.echo(f"jobs take over the halves that scene {result.halves_from} has, and render the rest", err=True)
     if result.scenes:
         from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 

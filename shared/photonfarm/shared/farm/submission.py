@@ -15,7 +15,7 @@ from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import scene_named
-from photonfarm.shared.store.read.other_scenes import other_scenes
+from photonfarm.shared.store.read.other_scenes import first_plan_note, other_scenes, with_same_radiance
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,6 +28,8 @@ class Submission:
     planned_before: int  # samples of the request that older plans hold
     queued: int | None  # jobs queued, also those of older plans that were missing; None: not queued
     dry_run: bool = False  # nothing was written
+    note: str | None = None  # that the store has another scene of this name, and how it differs
+    halves_from: str | None = None  # the scene whose halves jobs take over
     scenes: str | None = None  # folder that workers must have in PHOTONFARM_SCENES to find the scene file, if any must
 
 
@@ -53,16 +55,21 @@ def submit(
     """Plan the new samples of a request, and queue every missing job of the store unless `redis_url` is None.
 
     Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
-    `halves_from` is a scene of the store by its id or how it begins: jobs take over what halves it has.
+    `halves_from` is a scene of the store by its id or how it begins: jobs take over what halves it has. Without it, that
+    is the scene of the same radiance with most of them, if there is one.
     Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
     QueueError; in the last case the plan is kept, and idle workers queue it later.
     """
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
-    other = None if halves_from is None else scene_named(opened, halves_from)
+    other = scene_named(opened, halves_from) if halves_from else with_same_radiance(opened, named.spec)
     planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     queued = _queued(opened, redis_url, retry=retry)
-    return Submission(planned.scene_id, planned.plan, planned.new, planned.known, queued, scenes=named.scenes)
+    return Submission(
+        planned.scene_id, planned.plan, planned.new, planned.known, queued,
+        note=first_plan_note(opened, named.spec) if planned.plan == 0 else None,
+        halves_from=other if planned.new else None, scenes=named.scenes,
+    )  # fmt: skip
 
 
 def top_up(

@@ -19,6 +19,7 @@ from photonfarm.shared.core.archives import write_arrays
 from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
 from photonfarm.shared.core.exr import write_layers
 from photonfarm.shared.core.files import whole_file
+from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import block_z_test
 from photonfarm.shared.core.waiting import Log, waiting
@@ -147,13 +148,13 @@ def repeat(
     """
     opened = Store(store)
     stored = scene_or_spec(opened, scene)
-    spec = located(_beside(scene, _as_rendered(stored, row)))
     reader = SceneReader(store, stored.scene_id)
     reader.refresh()
     modification, view, planned_pass = _planned(stored, row)
     number = planned_pass if pass_number is None else pass_number
-    key = sample_key(spec.radiance_id, modification, view.vector, number)
-    at = next(iter(SceneMatch(stored, Query(sample=key)).rows.tolist()), None)
+    key = sample_key(stored.spec.radiance_id, modification, view.vector, number)
+    at = _row_of(stored, key)
+    spec = located(_beside(scene, _as_rendered(opened, stored, key)))
     with waiting(log, f"loading scene {spec.name}"):
         loaded = load(spec)
         loaded.apply(modification)
@@ -163,11 +164,20 @@ def repeat(
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
 
 
-def _as_rendered(stored: SceneStore, row: int) -> SceneSpec:
-    """The scene's spec with the strategy by which the job of a row was rendered, if it is committed."""
-    found = stored.plans()
-    job = row // found[0].shard_rows if found else 0
-    strategy = stored.marker(job)["figures"].get("strategy", {}) if stored.is_committed(job) else {}
+def _row_of(stored: SceneStore, key: Key) -> int | None:
+    return next(iter(SceneMatch(stored, Query(sample=key)).rows.tolist()), None)
+
+
+def _as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
+    """The scene's spec with the strategy that a sample was rendered by, if it is there."""
+    strategy: dict[str, Any] = {}
+    holder: SceneStore | None = stored
+    while holder is not None and (row := _row_of(holder, key)) is not None:
+        job = row // holder.plans()[0].shard_rows
+        if holder.is_committed(job):
+            strategy = holder.marker(job)["figures"]["strategy"]
+        other = holder.halves_from(job)
+        holder = None if other is None else opened.scene(other)
     return stored.spec.model_copy(update={"transport": stored.spec.transport.model_copy(update=strategy)})
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store.read.other_scenes import scene_of
+from photonfarm.shared.store.read.other_scenes import scene_of, told_apart
 from photonfarm.shared.store.read.query import Query
 from photonfarm.shared.store.read.scene_match import FoundSample, Place, SceneMatch
 from photonfarm.shared.store.write.scene_store import SceneStore
@@ -31,6 +31,9 @@ def scene_named(store: Store, text: str) -> str:
     ids = store.scene_ids()
     found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
     found = found or [each for each in ids if _name(store, each) == text]
+    if len(found) > 1 and all(_name(store, each) == text for each in found):
+        apart = told_apart(store, found)
+        raise StoreError(f"{store.storage.where}: {len(found)} scenes have the name {text!r}: {apart}; give an id")
     if len(found) != 1:
         held = f"{len(found)} scenes have" if found else "no scene has"
         each_named = ", ".join(f"{each} ({_name(store, each) or 'unreadable'})" for each in found or ids)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.models import differing
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.write.scene_store import held
+from photonfarm.shared.store.write.scene_store import SceneStore, held
 from photonfarm.shared.store.write.store import Store
 
 FEW = 4
@@ -25,16 +27,63 @@ def scene_of(store: Store, name: str, spec: SceneSpec) -> str:
 
 def other_scenes(store: Store, spec: SceneSpec) -> str:
     """The scenes that a store has, in words, and where one of the spec's name differs from it."""
-    there, _ = store.each(lambda scene: scene.spec)
-    alike = [each for each in there.values() if each.name == spec.name]
-    if not alike:
+    nearest, others = _alike(store, spec)
+    if nearest is None:
         return held(store.storage)
-    compared = [(differing(each.identity(), spec.identity()), each) for each in alike]
-    changes, nearest = min(compared, key=lambda found: len(found[0]))
+    more = f"; {others} more have this name" if others else ""
+    return f"scene {nearest.scene_id} of this name is there and differs in {differences(nearest.spec, spec)}{more}"
+
+
+def first_plan_note(store: Store, spec: SceneSpec) -> str | None:
+    """What to say of a scene's first plan where the store has another scene of this name; None where it has none."""
+    nearest, _ = _alike(store, spec)
+    if nearest is None:
+        return None
+    differ = differences(nearest.spec, spec)
+    return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {samples_of(nearest)}"
+
+
+def with_same_radiance(store: Store, spec: SceneSpec) -> str | None:
+    """The id of the other scene that has most complete samples of the same radiance id; None without one."""
+    there, _ = store.each(lambda scene: scene)
+    alike = [s for s in there.values() if s.spec.radiance_id == spec.radiance_id and s.scene_id != spec.scene_id]
+    counted = {scene.scene_id: scene.progress().committed_samples for scene in alike}
+    best = max(counted, key=lambda scene_id: counted[scene_id], default=None)
+    return best if best and counted[best] else None
+
+
+def told_apart(store: Store, scene_ids: Sequence[str]) -> str:
+    """Scenes of one name in words: how many samples each has, and how it differs from the first."""
+    first, *others = [store.scene(each) for each in scene_ids]
+    said = [f"{first.scene_id} ({samples_of(first)})"]
+    said += [f"{each.scene_id} ({samples_of(each)}; {differences(first.spec, each.spec)} differ)" for each in others]
+    return ", ".join(said)
+
+
+def samples_of(scene: SceneStore) -> str:
+    """How many samples of a scene are complete, in words."""
+    found = scene.progress()
+    return f"{found.committed_samples} of {found.planned_samples} samples complete"
+
+
+def differences(there: SceneSpec, here: SceneSpec) -> str:
+    """Where two specs differ in what ids cover, in words."""
+    changes = differing(there.identity(), here.identity())
     few = list(changes.items())[:FEW]
     more = f" and {len(changes) - len(few)} more" if len(changes) > len(few) else ""
-    said = ", ".join(FILES if key == "content" else f"{key} ({_said(a)} there, {_said(b)} here)" for key, (a, b) in few)
-    return f"scene {nearest.scene_id} of this name is there and differs in {said}{more}"
+    return (
+        ", ".join(FILES if key == "content" else f"{key} ({_said(a)} there, {_said(b)} here)" for key, (a, b) in few)
+        + more
+    )
+
+
+def _alike(store: Store, spec: SceneSpec) -> tuple[SceneStore | None, int]:
+    """The other scene of a spec's name that differs least from it, and how many more there are."""
+    there, _ = store.each(lambda scene: scene)
+    alike = [each for each in there.values() if each.spec.name == spec.name and each.scene_id != spec.scene_id]
+    if not alike:
+        return None, 0
+    return min(alike, key=lambda each: len(differing(each.spec.identity(), spec.identity()))), len(alike) - 1
 
 
 def _said(value: object) -> str:

@@ -1,0 +1,166 @@
+"""What ids cover: what may change of a scene while its samples stay, and what another scene takes over."""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.jobs.repeat import repeat
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+
+REQUEST = Request(modifications=3, views_per_modification=2)
+
+
+def rendered(store: Store, spec: SceneSpec, analytic: ModuleType, **options: Any) -> SceneStore:
+    """The scene of a spec with all samples of a request rendered, in jobs of two."""
+    store.plan(spec, REQUEST, shard_rows=2, **options)
+    renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
+    scene = store.scene(spec.scene_id)
+    for job in scene.missing_jobs():
+        renderer.render(scene.scene_id, job)
+    return scene
+
+
+def reader_of(scene: SceneStore) -> SceneReader:
+    reader = SceneReader(scene.storage.where, scene.scene_id)
+    reader.refresh()
+    return reader
+
+
+def with_strategy(spec: SceneSpec, **strategy: Any) -> SceneSpec:
+    return spec.model_copy(update={"transport": spec.transport.model_copy(update=strategy)})
+
+
+@pytest.fixture
+def spec(analytic: ModuleType) -> SceneSpec:
+    return analytic.small_spec()  # type: ignore[no-any-return]
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"exposure": 5.0},
+        {"name": "renamed"},
+        {"credits": {"title": "a room", "author": "ada", "licence": "CC0-1.0"}},
+        {"transport": {"connections": 0, "light_ratio": 0.5, "guided_light": True, "light_samples": 4, "rr_depth": 9}},
+    ],
+    ids=lambda changes: next(iter(changes)),
+)
+def test_no_sample_is_lost_to_a_change_that_leaves_its_mean(
+    tmp_path: Path, spec: SceneSpec, analytic: ModuleType, changes: dict[str, Any]
+) -> None:
+    store = Store(tmp_path / "store", create=True)
+    before = rendered(store, spec, analytic)
+    radiance = [sample.radiance for sample in map(reader_of(before).read, reader_of(before).rows)]
+    changed = analytic.small_spec(**changes)
+    assert changed.scene_id == spec.scene_id
+    planned = store.plan(changed, REQUEST)
+    assert (planned.new, planned.known) == (0, 6)
+    reader = reader_of(store.scene(spec.scene_id))
+    there = reader.spec.model_copy(update={"stored_exponent": None})
+    assert there == changed
+    assert reader.spec.radiance_exponent == spec.radiance_exponent, "that of the first submission"
+    for row, halves in zip(reader.rows, radiance, strict=True):
+        np.testing.assert_array_equal(reader.read(row).radiance, halves)
+
+
+def test_radiance_is_stored_by_the_first_plans_power_of_two_even_if_the_spec_was_lost(
+    tmp_path: Path, spec: SceneSpec, analytic: ModuleType
+) -> None:
+    store = Store(tmp_path / "store", create=True)
+    (rendered(store, spec, analytic).folder / "spec.json").unlink()
+    store.plan(analytic.small_spec(exposure=64.0), Request(modifications=4, views_per_modification=2))
+    assert store.scene(spec.scene_id).spec.radiance_exponent == 0
+
+
+def test_each_jobs_marker_records_the_strategy_of_the_submission_before_it(
+    tmp_path: Path, spec: SceneSpec, analytic: ModuleType
+) -> None:
+    store = Store(tmp_path / "store", create=True)
+    store.plan(spec, REQUEST, shard_rows=2)
+    worker = ShardRenderer(Store(tmp_path / "store"), worker="test", load=analytic.AnalyticScene.load)
+    worker.render(spec.scene_id, 0)
+    store.add(with_strategy(spec, connections=3))
+    worker.render(spec.scene_id, 1)
+    scene = store.scene(spec.scene_id)
+    assert [scene.marker(job)["figures"]["strategy"]["connections"] for job in (0, 1)] == [1, 3]
+
+
+def test_a_sample_is_repeated_by_the_strategy_that_it_was_rendered_by(
+    tmp_path: Path, spec: SceneSpec, analytic: ModuleType
+) -> None:
+    class Strategic(analytic.AnalyticScene):  # type: ignore[name-defined, misc]
+        """Adds the number of connections, so that another strategy gives other bytes."""
+
+        def render_half(self, view: Any, seed: int) -> Any:
+            return super().render_half(view, seed) + np.float32(self.spec.transport.connections)
+
+    store = Store(tmp_path / "store", create=True)
+    scene = rendered(store, spec, type("m", (), {"AnalyticScene": Strategic}))
+    other = analytic.small_spec(points=32)
+    taken = rendered(store, other, type("m", (), {"AnalyticScene": Strategic}), halves_from=scene.scene_id)
+    for changed in (with_strategy(spec, connections=7), with_strategy(other, connections=7)):
+        store.add(changed)
+    for each in (scene, taken):
+        again = repeat(store.root, each.scene_id, 0, None, print, load=Strategic)
+        assert again.comparison is not None
+        assert again.comparison.is_equal
+
+
+@pytest.mark.parametrize("changes", [{"guides": {"light_samples": 0}}, {"points": 32}, {"photons": {"paths": 0}}])
+def test_a_scene_with_other_inputs_takes_halves_over_and_renders_inputs_alone(
+    tmp_path: Path, spec: SceneSpec, analytic: ModuleType, changes: dict[str, Any]
+) -> None:
+    store = Store(tmp_path / "store", create=True)
+    scene = rendered(store, spec, analytic)
+    other = analytic.small_spec(**changes)
+    assert other.scene_id != spec.scene_id
+    assert other.radiance_id == spec.radiance_id
+
+    class NoHalves(analytic.AnalyticScene):  # type: ignore[name-defined, misc]
+        def render_half(self, *_: Any) -> Any:
+            raise AssertionError("halves are not to be rendered")
+
+    taken = rendered(store, other, type("m", (), {"AnalyticScene": NoHalves}), halves_from=scene.scene_id)
+    there, here = reader_of(scene), reader_of(taken)
+    assert there.rows_by_key() == here.rows_by_key()
+    assert len(here.rows) == 6
+    for row in here.rows:
+        a, b = there.read(row, guides=True), here.read(row, guides=True)
+        np.testing.assert_array_equal(a.radiance, b.radiance)
+        for name, values in arrays_of(a.buffers).items():
+            np.testing.assert_array_equal(values, getattr(b.buffers, name))
+        assert a.guides is not None
+        assert b.guides is not None
+        same = np.array_equal(a.guides.direct, b.guides.direct)
+        assert same == ("guides" not in changes)
+    assert sum(taken.marker(job)["figures"]["taken_over"] for job in range(3)) == 6
+
+
+def test_what_the_other_scene_lacks_is_rendered(tmp_path: Path, spec: SceneSpec, analytic: ModuleType) -> None:
+    store = Store(tmp_path / "store", create=True)
+    store.plan(spec, REQUEST, shard_rows=2)
+    ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load).render(spec.scene_id, 1)
+    taken = rendered(store, analytic.small_spec(points=32), analytic, halves_from=spec.scene_id)
+    assert [taken.marker(job)["figures"]["taken_over"] for job in range(3)] == [0, 2, 0]
+    alone = rendered(Store(tmp_path / "alone", create=True), spec, analytic)
+    for row in reader_of(alone).rows:
+        np.testing.assert_array_equal(reader_of(alone).read(row).radiance, reader_of(taken).read(row).radiance)
+
+
+def test_halves_of_another_radiance_are_refused(tmp_path: Path, spec: SceneSpec, analytic: ModuleType) -> None:
+    store = Store(tmp_path / "store", create=True)
+    rendered(store, spec, analytic)
+    other = with_strategy(spec, half_spp=9)
+    with pytest.raises(SpecError, match=r"its radiance is another one, as transport.half_spp differ"):
+        store.plan(other, REQUEST, halves_from=spec.scene_id)
+    with pytest.raises(SpecError, match="is the scene itself"):
+        store.plan(spec, REQUEST, halves_from=spec.scene_id)
+    assert store.scene_ids() == [spec.scene_id], "nothing was written"

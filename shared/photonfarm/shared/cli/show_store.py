@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from photonfarm.shared.cli.show import print_json
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.waiting import SILENCE_S
+from photonfarm.shared.farm.join import JoinedScene, OnProgress
 from photonfarm.shared.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import WrittenView
@@ -24,11 +25,11 @@ from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[CheckProgress]:
-    """A progress callback for a check: a bar on a terminal, else a line per scene; both on stderr."""
+def progress(done_in_words: str = "read") -> Iterator[CheckProgress]:
+    """A progress callback for a check or a join: a bar on a terminal, else a line per scene; both on stderr."""
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield _lines()
+        yield _lines(done_in_words)
         return
     columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[read]}"), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True) as bars:
@@ -37,12 +38,12 @@ def progress() -> Iterator[CheckProgress]:
         def show(scene: str, done: int, total: int, size_bytes: int) -> None:
             if scene not in tasks:
                 tasks[scene] = bars.add_task(scene, total=total, read="")
-            bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs, {size_bytes / 1e6:,.0f} MB")
+            bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs{_size(size_bytes)}")
 
         yield show
 
 
-def _lines() -> CheckProgress:
+def _lines(done_in_words: str) -> CheckProgress:
     """A line for each scene, and one every few seconds before that."""
     said = time.monotonic()
 
@@ -51,9 +52,13 @@ def _lines() -> CheckProgress:
         if done == total or time.monotonic() - said > SILENCE_S * 0.8:
             said = time.monotonic()
             of = "" if done == total else f" of {total}"
-            click.echo(f"{scene}: {done}{of} jobs read, {size_bytes / 1e6:,.1f} MB", err=True)
+            click.echo(f"{scene}: {done}{of} jobs {done_in_words}{_size(size_bytes)}", err=True)
 
     return line
+
+
+def _size(size_bytes: int) -> str:
+    return f", {size_bytes / 1e6:,.1f} MB" if size_bytes else ""
 
 
 # ---------------------------------------------------------------------------------------------------------------- check
@@ -191,3 +196,25 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
             words = ["photonfarm", "work", "--store", str(store), "--scene", sample.scene_id, "--job", str(job)]
             listed[f"render job {job}"] = shlex.join(words)
     return listed
+
+
+# ----------------------------------------------------------------------------------------------------------------- join
+
+
+@contextlib.contextmanager
+def copying() -> Iterator[OnProgress]:
+    """A progress callback for a join."""
+    with progress("copied") as show:
+        yield lambda scene, done, total: show(scene, done, total, 0)
+
+
+def joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
+    """Print what a join has copied, scene by scene."""
+    if as_json:
+        print_json([asdict(scene) for scene in scenes])
+        return
+    for scene in scenes:
+        known = scene.there - scene.planned
+        jobs = "1 job" if scene.jobs == 1 else f"{scene.jobs} jobs"
+        said = f"{scene.there} samples there, {scene.planned} planned here now, {known} before; {jobs} copied"
+        click.echo(f"{scene.name} {scene.scene_id}: {said}")

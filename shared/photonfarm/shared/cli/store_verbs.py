@@ -142,3 +142,25 @@ def merge(
             raise StoreError("no sample that is planned fits; `photonfarm store find` shows what there is")
         what = "no complete sample fits" if least == 1 else f"no view that fits has {least} complete passes (--least)"
         raise IncompleteError(f"{what}; `photonfarm store find` shows what there is")
+
+
+@click.command()
+@click.argument("other")
+@store_option
+@click.option("--scene", metavar="ID", help="This scene of OTHER alone: its id, how it begins, or its name.")
+@json_option
+def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> None:
+    """Copy the complete samples of the store OTHER, a folder or bucket, into this one, which may be new.
+
+    Scenes are joined by their ids: samples that are here already are left out, and those that are planned here and not
+    rendered yet are filled in. Every byte is checked on the way. It may be stopped and repeated at any time, and
+    workers may be at work; OTHER is only read.
+
+    Exit codes: 0 all that OTHER has complete is here; 4 a store cannot be read or written, and what is copied stays.
+    """
+    from photonfarm.shared.cli import show_store
+    from photonfarm.shared.farm.join import join as joined
+
+    with show_store.copying() as on_progress:
+        result = joined(store, other, scene, on_progress=on_progress)
+    show_store.joined(result, as_json)

@@ -55,7 +55,7 @@ def submit(
     """Plan the new samples of a request, and queue every missing job of the store unless `redis_url` is None.
 
     Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
-    `halves_from` is a scene of the store by its id or how it begins: jobs take over what halves it has. Without it, that
+    `halves_from` is a scene of the store by its id or how it begins: jobs take over the halves it has. Without it, that
     is the scene of the same radiance with most of them, if there is one.
     Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
     QueueError; in the last case the plan is kept, and idle workers queue it later.

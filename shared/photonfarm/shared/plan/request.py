@@ -158,7 +158,7 @@ class PlannedContent:
         vectors = np.empty((len(rows), *getattr(self.plans[0][1], kind).shape[1:]), np.float32)
         order = np.argsort(of_row, kind="stable")  # by plan: each is looked into once, for its own rows alone
         numbers, first = np.unique(of_row[order], return_index=True)
-        for number, own in zip(numbers.tolist(), np.split(order, first[1:]), strict=True):
+        for number, own in zip(numbers.tolist(), np.split(order, first[1:]), strict=bool(len(rows))):
             first_row, inputs = self.plans[number]
             vectors[own] = getattr(inputs, kind)[rows[own] - first_row]
         return vectors
@@ -194,6 +194,8 @@ class SamplesToPlan:
     sample_view: NDArray[np.int64]  # (S,) which of the views
     sample_pass: NDArray[np.int32]  # (S,)
     sample_key: NDArray[np.uint8]  # (S, 16)
+    modification_density: F32 | None = None  # (M,) as in `PlannedRows`; None: 1
+    view_density: F32 | None = None  # (V,)
 
     def extent(self) -> Extent:
         """What is rendered for them."""
@@ -287,10 +289,12 @@ def pack(candidates: SamplesToPlan, *, first_row: int, shard_rows: int) -> Plann
     rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, candidates.modification.shape[1])
     modification_row, new = _place(candidates.sample_modification, candidates.modification_row, first_row, shard_rows)
     rows.modification[modification_row[new] - first_row] = candidates.modification[new]
-    rows.modification_density[modification_row[new] - first_row] = 1
+    density = candidates.modification_density
+    rows.modification_density[modification_row[new] - first_row] = 1 if density is None else density[new]
     view_row, new = _place(candidates.sample_view, candidates.view_row, first_row, shard_rows)
     rows.view[view_row[new] - first_row] = candidates.view[new]
-    rows.view_density[view_row[new] - first_row] = 1
+    density = candidates.view_density
+    rows.view_density[view_row[new] - first_row] = 1 if density is None else density[new]
     rows.sample_modification[:count] = modification_row[candidates.sample_modification]
     rows.sample_view[:count] = view_row[candidates.sample_view]
     rows.sample_pass[:count] = candidates.sample_pass

@@ -27,7 +27,6 @@ from photonfarm.shared.plan.request import (
     UNUSED,
     Expansion,
     PlannedContent,
-    Request,
     SamplesToPlan,
     pack,
     sample_keys,
@@ -66,10 +65,6 @@ class TopUp(Frozen):
     def passes(self, spec: SceneSpec) -> int:
         """The number of passes that have `spp` samples per pixel, rounded up."""
         return -(-self.spp // spp_per_pass(spec))
-
-
-AnyRequest = Annotated[Request | TopUp, Field(discriminator="kind")]
-"""The request that a plan was made for."""
 
 
 def spp_per_pass(spec: SceneSpec) -> int:

@@ -9,25 +9,28 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
-from photonfarm.shared.core.errors import CorruptError, store_errors
+from photonfarm.shared.core.errors import CorruptError, SpecError, store_errors
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.plan.joined import Joined
 from photonfarm.shared.plan.request import (
     UNUSED,
     Expansion,
     PlannedContent,
     PlannedRows,
     Request,
+    SamplesToPlan,
     expand,
+    pack,
 )
-from photonfarm.shared.plan.top_up import AnyRequest, TopUp, expand_top_up
+from photonfarm.shared.plan.top_up import TopUp, expand_top_up
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
@@ -55,7 +58,9 @@ PARTS = 2
 INPUTS = [field.name for field in fields(PlannedRows)]
 """The names of a plan's arrays of inputs."""
 
-_REQUEST: TypeAdapter[Request | TopUp] = TypeAdapter(AnyRequest)
+_REQUEST: TypeAdapter[Request | TopUp | Joined] = TypeAdapter(
+    Annotated[Request | TopUp | Joined, Field(discriminator="kind")]
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +69,7 @@ class StoredPlan:
 
     number: int
     folder: str  # its name in the storage
-    request: Request | TopUp
+    request: Request | TopUp | Joined
     first_job: int
     jobs: int
     shard_rows: int
@@ -105,7 +110,7 @@ class StoredPlan:
 class PlanAttributes:
     """The attributes of a plan's group."""
 
-    request: Request | TopUp
+    request: Request | TopUp | Joined
     first_job: int
     jobs: int
     shard_rows: int
@@ -149,19 +154,30 @@ def content(plans: list[StoredPlan]) -> PlannedContent:
 
 
 def expanded(
-    spec: SceneSpec, request: Request | TopUp, before: list[StoredPlan], *, first_job: int, shard_rows: int
+    spec: SceneSpec, request: Request | TopUp | Joined, before: list[StoredPlan], *, first_job: int, shard_rows: int
 ) -> Expansion:
-    """The rows of a request that the earlier plans do not have: a function of these, the same each time."""
+    """The rows of a request that the earlier plans do not have: a function of these, the same each time.
+
+    Raises SpecError for a request that cannot be met, and for that of a join, whose rows are another store's.
+    """
+    if isinstance(request, Joined):
+        raise SpecError(f"the rows of a join are those of another store, {request.store}")
     known = content(before)
     if isinstance(request, TopUp):
         return expand_top_up(spec, request, known, first_job=first_job, shard_rows=shard_rows)
     return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
 
 
+def packed(samples: SamplesToPlan, *, first_job: int, shard_rows: int) -> Expansion:
+    """The rows of samples, in jobs from number `first_job` on."""
+    rows = pack(samples, first_row=first_job * shard_rows, shard_rows=shard_rows)
+    return Expansion(rows, len(samples.sample_pass), 0, samples.extent())
+
+
 def build(
     part: Path,
     spec: SceneSpec,
-    request: Request | TopUp,
+    request: Request | TopUp | Joined,
     rows: PlannedRows,
     *,
     first_job: int,

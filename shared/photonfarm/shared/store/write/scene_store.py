@@ -8,7 +8,7 @@ from __future__ import annotations
 import contextlib
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ from pydantic import ValidationError
 from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, store_errors
 from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.plan.request import MAX_SHARD_ROWS, SHARD_ROWS, Extent, Request
+from photonfarm.shared.plan.joined import Joined
+from photonfarm.shared.plan.request import MAX_SHARD_ROWS, SHARD_ROWS, Extent, PlannedContent, Request, SamplesToPlan
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
@@ -87,17 +88,19 @@ class SceneStore:
 
     def plan(
         self,
-        request: Request | TopUp,
+        request: Request | TopUp | Joined,
         *,
         shard_rows: int | None = None,
         usual_rows: int = SHARD_ROWS,
         halves_from: str | None = None,
+        samples: Callable[[PlannedContent], SamplesToPlan] | None = None,
         dry_run: bool = False,
     ) -> PlanResult:
         """Plan the new samples of a request; concurrent submitters try again, each after the other's plan.
 
-        `halves_from` is the id of a scene with the same radiance id, whose halves the jobs take over. Raises SpecError
-        for an invalid request or number of rows, and CorruptError if a plan is missing.
+        `halves_from` is the id of a scene with the same radiance id, whose halves the jobs take over. `samples`
+        gives what is to be planned, instead of the request, from what is planned already. Raises SpecError for an
+        invalid request or number of rows, and CorruptError if a plan is missing.
         """
         while True:
             last = max(markers.jobs(self.storage, self.name), default=-1)
@@ -109,13 +112,16 @@ class SceneStore:
                     f"{self.storage.where}/{markers.name_of(self.name, last)}: no plan has this job, and a new plan "
                     "would take its number; `photonfarm store check` reports whether the last plan is missing"
                 )
-            expansion = plans.expanded(self.spec, request, found, first_job=first_job, shard_rows=rows_per_job)
+            numbers = {"first_job": first_job, "shard_rows": rows_per_job}
+            if samples is None:
+                expansion = plans.expanded(self.spec, request, found, **numbers)
+            else:
+                expansion = plans.packed(samples(plans.content(found)), **numbers)
             if expansion.rows is None or dry_run:
                 return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
             with store_errors("write a plan", self.storage.where):
                 built = self.storage.part()
                 try:
-                    numbers = {"first_job": first_job, "shard_rows": rows_per_job}
                     plans.build(built, self.spec, request, expansion.rows, **numbers, halves_from=halves_from)
                     if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
                         jobs = len(expansion.rows.sample_pass) // rows_per_job

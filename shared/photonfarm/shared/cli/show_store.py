@@ -22,6 +22,7 @@ from photonfarm.shared.store.check.check import CheckProgress, SceneReport, Stor
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import WrittenView
 from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
+from photonfarm.shared.store.write.withdrawal import Withdrawal
 
 
 @contextlib.contextmanager
@@ -218,3 +219,17 @@ def joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
         jobs = "1 job" if scene.jobs == 1 else f"{scene.jobs} jobs"
         said = f"{scene.there} samples there, {scene.planned} planned here now, {known} before; {jobs} copied"
         click.echo(f"{scene.name} {scene.scene_id}: {said}")
+
+
+# ------------------------------------------------------------------------------------------------------------- withdraw
+
+
+def withdrawn(result: Withdrawal, as_json: bool) -> None:
+    """Print what a withdrawal has forgotten, and what stays."""
+    if as_json:
+        print_json(asdict(result))
+        return
+    kept = f", {result.kept} stay planned, as rendered ones show their views or configurations" if result.kept else ""
+    jobs = "1 job" if result.jobs == 1 else f"{result.jobs} jobs"
+    said = f"{result.samples} samples in {jobs} are forgotten; {result.rendered} are rendered and stay{kept}"
+    click.echo(f"plan {result.plan} of scene {result.scene_id} ({result.name}): {said}")

@@ -164,3 +164,23 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
     with show_store.copying() as on_progress:
         result = joined(store, other, scene, on_progress=on_progress)
     show_store.joined(result, as_json)
+
+
+@click.command()
+@store_option
+@click.option("--scene", metavar="ID", required=True, help="The scene: its id, how it begins, or its name.")
+@click.option("--plan", type=click.IntRange(0), help="The plan's number.  [default: the last one]")
+@json_option
+def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> None:
+    """Forget what a plan holds and nobody has rendered; what is rendered stays.
+
+    The jobs leave the queue as workers meet them. The same samples may be planned again later. Refused where a later
+    plan has passes of the plan's views: withdraw that one first.
+    """
+    from photonfarm.shared.cli import show_store
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.read.find import scene_named
+    from photonfarm.shared.store.write.withdrawal import withdraw as withdrawn
+
+    opened = Store(store)
+    show_store.withdrawn(withdrawn(opened.scene(scene_named(opened, scene)), plan), as_json)

@@ -116,12 +116,12 @@ def _kept(store: Store) -> dict[str, Failure]:
 
 
 def is_missing(store: Store, name: str) -> bool:
-    """Whether a job is one of this store's, and not committed; False for one whose scene is damaged."""
+    """Whether a job is one of this store's, and to be rendered; False for one whose scene is damaged."""
     from photonfarm.shared.queue import RenderArguments
 
     job = RenderArguments.of(name)
     with contextlib.suppress(CorruptError, IndexError):
-        return store.has_scene(job.scene_id) and not store.scene(job.scene_id).is_committed(job.job)
+        return store.has_scene(job.scene_id) and store.scene(job.scene_id).is_to_do(job.job)
     return False
 
 

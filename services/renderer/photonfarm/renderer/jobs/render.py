@@ -155,7 +155,7 @@ class ShardRenderer:
         """
         if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
             raise QueueError(f"store {self._store.root} has no job {job} of scene {scene_id}")
-        if stored.is_committed(job):
+        if not stored.is_to_do(job):
             return False
         stored.reread()
         return self._render(self._scene(stored), job)

@@ -95,7 +95,7 @@ class ShareWorker:
                 self._look()
             while self._waiting:
                 scene_id, job = self._waiting.popleft()
-                if not self._store.scene(scene_id).is_committed(job):
+                if self._store.scene(scene_id).is_to_do(job):
                     return scene_id, job
         return None
 
@@ -165,7 +165,7 @@ class ShareWorker:
             return
         self._taken_look_due = time.monotonic() + TAKEN_LOOK_S
         scene_id, job = self._in_hand
-        if self._store.scene(scene_id).is_committed(job):
+        if not self._store.scene(scene_id).is_to_do(job):
             raise _TakenError
 
     def _record(self, name: str, reason: str) -> None:

@@ -131,15 +131,16 @@ class SceneReader:
         return np.flatnonzero(complete & ~before)
 
     def _load_plans(self) -> None:
-        known, self._plans = len(self._plans), plans.load_all(self._storage, self._name, self._plans)
-        if len(self._plans) > known:
+        known, self._plans = self._plans, plans.load_all(self._storage, self._name, self._plans)
+        if self._plans != known:
+            self._committed = set()  # complete rows are to be counted again
             inputs = [plan.rows for plan in self._plans]
             self._view_row = np.concatenate([rows.sample_view for rows in inputs])
             self._modification_row = np.concatenate([rows.sample_modification for rows in inputs])
             self._pass = np.concatenate([rows.sample_pass for rows in inputs])
-            self.plan_requests += [
-                {"first_row": plan.first_row, "samples": plan.samples, "request": plan.request.model_dump(mode="json")}
-                for plan in self._plans[known:]
+            self.plan_requests = [
+                {"first_row": plan.first_row, "samples": plan.named, "request": plan.request.model_dump(mode="json")}
+                for plan in self._plans
             ]
 
     # ---------------------------------------------------------------------------------------------------------- samples

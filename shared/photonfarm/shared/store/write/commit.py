@@ -83,6 +83,9 @@ class CommitTarget(Protocol):
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
 
+    def is_to_do(self, job: int) -> bool:
+        """Whether a job is planned, and neither committed nor withdrawn."""
+
 
 class JobWriter:
     """Takes a job's rows in any order, and commits them once all are there.
@@ -221,7 +224,7 @@ class JobWriter:
         with self._errors():
             ours = {name: shard.finish() for name, shard in self._shards.items()}
             for _ in range(ATTEMPTS):
-                if self._scene.is_committed(self._rows.job):
+                if not self._scene.is_to_do(self._rows.job):
                     return False
                 alone = self._adopt_all()
                 if alone is None:

@@ -6,8 +6,9 @@ Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+import json
+from collections.abc import Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -35,7 +36,7 @@ from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format import declarations, schema
-from photonfarm.shared.store.io.storage import Storage
+from photonfarm.shared.store.io.storage import Storage, put_json
 
 PLANS = "plans"
 NAME_DIGITS = 6
@@ -75,6 +76,8 @@ class StoredPlan:
     shard_rows: int
     rows: PlannedRows
     halves_from: str | None = None  # another scene, whose halves its jobs take over
+    withdrawn: frozenset[int] = frozenset()  # jobs whose rows count as unused
+    named: int = 0  # samples that it was made with, withdrawn or not
 
     @property
     def end_job(self) -> int:
@@ -235,18 +238,28 @@ def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: i
     would be planned again without end.
     """
     with store_errors("read the plans", f"{storage.where}/{scene}"):
-        end = count(storage, scene, len(loaded)) if until is None else until
-        return loaded + [_load(storage, scene, number) for number in range(len(loaded), end)]
+        names = storage.names(f"{scene}/{PLANS}")
+        end = _counted(storage, scene, names, len(loaded)) if until is None else until
+        found = loaded + [_load(storage, scene, number) for number in range(len(loaded), end)]
+        for number, plan in enumerate(found):
+            if not plan.withdrawn and withdrawal(scene, number).rpartition("/")[2] in names:
+                found[number] = _without_withdrawn(storage, scene, plan)
+        return found
 
 
-def count(storage: Storage, scene: str, loaded: int = 0) -> int:
-    """The number of plans that a scene must have, by the last one's number; the first `loaded` are known to be there.
+def count(storage: Storage, scene: str) -> int:
+    """The number of plans that a scene must have, by the last one's number.
 
     A last plan that is still being written does not count. This shows only in a bucket, where the folder is claimed
     first, and its zarr.json comes last.
     """
-    names = [name for name in storage.names(f"{scene}/{PLANS}") if name.isascii() and name.isdecimal()]
-    found = max((int(name) + 1 for name in names if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
+    return _counted(storage, scene, storage.names(f"{scene}/{PLANS}"), 0)
+
+
+def _counted(storage: Storage, scene: str, names: list[str], loaded: int) -> int:
+    """The number of plans by the names in their folder; the first `loaded` are known to be there."""
+    numbers = [name for name in names if name.isascii() and name.isdecimal()]
+    found = max((int(name) + 1 for name in numbers if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
     if found <= loaded:
         return loaded
     last = folder(scene, found - 1)
@@ -264,9 +277,35 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
         check_version(group.attrs, f"{storage.where}/{name}")
         about = about_plan(dict(group.attrs))
         rows = PlannedRows(*(_input(storage, name, group, each) for each in INPUTS))
-    return StoredPlan(
-        number, name, about.request, about.first_job, about.jobs, about.shard_rows, rows, about.halves_from
-    )
+    numbers = about.first_job, about.jobs, about.shard_rows
+    named = int(np.count_nonzero(rows.sample_modification != UNUSED))
+    return StoredPlan(number, name, about.request, *numbers, rows, about.halves_from, named=named)
+
+
+def withdrawal(scene: str, number: int) -> str:
+    """The file that names the withdrawn jobs of a plan."""
+    return f"{folder(scene, number)}.withdrawn.json"
+
+
+def withdraw(storage: Storage, scene: str, number: int, jobs: Set[int]) -> None:
+    """Name the jobs of a plan whose rows no longer count, in place of those named before."""
+    put_json(storage, {"jobs": sorted(jobs)}, withdrawal(scene, number), replace=True)
+
+
+def _without_withdrawn(storage: Storage, scene: str, plan: StoredPlan) -> StoredPlan:
+    """The plan with the rows of its withdrawn jobs as unused ones."""
+    name = withdrawal(scene, plan.number)
+    try:
+        jobs = [int(job) for job in json.loads(storage.read(name))["jobs"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptError(f"{storage.where}/{name}: names no jobs: {error}; put it back from a copy") from error
+    rows = PlannedRows(*(getattr(plan.rows, each).copy() for each in INPUTS))
+    unused = PlannedRows.empty(plan.shard_rows, rows.modification.shape[1])
+    for job in jobs:
+        first = (job - plan.first_job) * plan.shard_rows
+        for each in INPUTS:
+            getattr(rows, each)[first : first + plan.shard_rows] = getattr(unused, each)
+    return replace(plan, rows=rows, withdrawn=frozenset(jobs))
 
 
 def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]:

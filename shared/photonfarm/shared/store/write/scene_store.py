@@ -175,8 +175,18 @@ class SceneStore:
         `followed` is for callers who ask often, as in `progress`: they may be told late of jobs that a repair has set
         aside, and should ask without it before they take nothing to be missing.
         """
-        committed = self._followed.look() if followed else self.committed_jobs()
-        return [job for job in range(self.jobs()) if job not in committed]
+        done = self._followed.look() if followed else self.committed_jobs()
+        jobs = range(self.jobs())
+        left_out = done | self.withdrawn_jobs()
+        return [job for job in jobs if job not in left_out]
+
+    def withdrawn_jobs(self) -> frozenset[int]:
+        """The jobs of the plans as they were last read that are not to be rendered any more."""
+        return frozenset().union(*(plan.withdrawn for plan in self._plans))
+
+    def is_to_do(self, job: int) -> bool:
+        """Whether a job is planned, and neither committed nor withdrawn."""
+        return not self.is_committed(job) and job < self.jobs() and job not in self.withdrawn_jobs()
 
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""

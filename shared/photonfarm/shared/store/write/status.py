@@ -65,7 +65,7 @@ def scene_status(scene: SceneStore) -> SceneStatus:
     """The status of one scene, as `store_status` has it; raises StoreError if it cannot be read."""
     progress = scene.progress()
     committed = sorted(scene.committed_jobs())  # before the plans: each one's plan is there by now
-    jobs, sums = scene.jobs(), _summed(scene.marker, committed)
+    jobs, withdrawn, sums = scene.jobs(), scene.withdrawn_jobs(), _summed(scene.marker, committed)
     if sums.error is not None and not isinstance(sums.error, CorruptError):
         check_format(scene.storage)
     return SceneStatus(
@@ -73,14 +73,14 @@ def scene_status(scene: SceneStore) -> SceneStatus:
         scene.spec.name,
         progress.planned_samples,
         progress.committed_samples,
-        jobs,
+        jobs - len(withdrawn),
         len(committed),
         sums.size_bytes,
         sums.core_s,
         sums.redrawn,
         sums.unreadable,
         str(sums.error) if sums.error else None,
-        sum(job >= jobs for job in committed),
+        sum(job >= jobs or job in withdrawn for job in committed),
     )
 
 

@@ -1,0 +1,135 @@
+"""What is planned and not rendered is withdrawn; what is rendered stays."""
+
+import json
+
+import numpy as np
+import pytest
+import store_samples as samples
+from click.testing import CliRunner
+
+from photonfarm.shared.cli.store_verbs import withdraw as verb
+from photonfarm.shared.core.errors import CorruptError, SpecError
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.write.status import scene_status
+from photonfarm.shared.store.write.withdrawal import withdraw
+
+REQUEST = Request(modifications=8, views_per_modification=1)
+
+
+@pytest.fixture
+def scene(store: Store) -> SceneStore:
+    """Four jobs of two samples, each with configurations of its own; the first and the third are committed."""
+    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
+    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit, "removal_probability": 0}
+    spec = samples.small_spec(objects=[movable])
+    scene = store.scene(store.plan(spec, REQUEST, shard_rows=2).scene_id)
+    scene.write_base(*samples.base())
+    for job in (0, 2):
+        assert samples.commit(scene, job, samples.outputs(scene, job))
+    return scene
+
+
+def fresh(scene: SceneStore) -> SceneStore:
+    return SceneStore(scene.storage, scene.scene_id)
+
+
+def test_what_is_not_rendered_is_forgotten_and_what_is_stays(scene: SceneStore) -> None:
+    reader = samples.reader_of(scene)
+    before, requests = reader.rows.tolist(), list(reader.plan_requests)
+    done = withdraw(fresh(scene))
+    assert (done.jobs, done.samples, done.rendered, done.kept) == (2, 4, 4, 0)
+    for each in (scene, fresh(scene)):
+        assert each.missing_jobs() == []
+        progress = each.progress()
+        assert (progress.planned_samples, progress.committed_samples) == (4, 4)
+        status = scene_status(each)
+        assert (status.jobs_planned, status.jobs_committed, status.markers_without_plan) == (2, 2, 0)
+    reader.refresh()
+    assert reader.rows.tolist() == before
+    assert reader.planned == 4
+    assert reader.plan_requests == requests, "a run that trained on them goes on"
+    assert withdraw(scene).jobs == 0
+
+
+def test_what_was_forgotten_is_planned_again_and_nothing_is_there_twice(scene: SceneStore) -> None:
+    before = samples.reader_of(scene).rows_by_key()
+    withdraw(scene)
+    planned = scene.plan(REQUEST)
+    assert (planned.new, planned.known) == (4, 4)
+    for job in scene.missing_jobs():
+        assert samples.commit(scene, job, samples.outputs(scene, job))
+    after = samples.reader_of(scene).rows_by_key()
+    assert before.items() <= after.items()
+    assert len(after) == len(samples.reader_of(scene).rows) == 8
+    assert check_store(Store(scene.storage.where), when="now").exit_code == 0
+
+
+def test_a_worker_that_was_at_a_withdrawn_job_throws_it_away(scene: SceneStore) -> None:
+    given = samples.outputs(scene, 1)
+    with scene.job_writer(1) as out:
+        for row, photons in given.photons.items():
+            out.photons(row, photons)
+        for row, buffers in given.buffers.items():
+            out.view(row, buffers, samples.guides(scene.spec, row), given.visibility[row])
+        for row, halves in given.radiance.items():
+            out.radiance(row, halves)
+        withdraw(fresh(scene))
+        assert not out.commit(samples.FIGURES)
+    assert scene.committed_jobs() == {0, 2}
+    assert not scene.is_to_do(1)
+
+
+def test_a_job_that_is_committed_meanwhile_stays(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = scene.committed_jobs()
+    answers = iter([seen])
+    real = SceneStore.committed_jobs
+    assert samples.commit(scene, 1, samples.outputs(scene, 1))
+    monkeypatch.setattr(SceneStore, "committed_jobs", lambda self: next(answers, None) or real(self))
+    done = withdraw(scene)
+    assert (done.jobs, done.rendered) == (1, 6)
+    assert fresh(scene).progress().committed_samples == 6
+
+
+def test_views_that_rendered_samples_show_stay_planned(store: Store) -> None:
+    request = Request(views_per_modification=6)  # one configuration, in the first job
+    scene = store.scene(store.plan(samples.small_spec(), request, shard_rows=2).scene_id)
+    samples.commit(scene, 1, samples.outputs(scene, 1))
+    done = withdraw(scene)
+    assert (done.jobs, done.samples, done.rendered, done.kept) == (1, 2, 2, 2)
+    assert scene.missing_jobs() == [0]
+    samples.commit(scene, 0, samples.outputs(scene, 0))
+    assert samples.reader_of(scene).rows.tolist() == [0, 1, 2, 3]
+
+
+def test_a_later_plan_that_leans_on_it_is_withdrawn_first(scene: SceneStore) -> None:
+    scene.plan(TopUp.of("+8", ["rows=2-3"]))
+    with pytest.raises(SpecError, match=r"plan 1 has samples of its views or configurations; withdraw plan 1 first"):
+        withdraw(scene, 0)
+    assert not list(scene.folder.glob("plans/*.withdrawn.json")), "nothing was written"
+    assert withdraw(scene, 1).samples == 2
+    assert withdraw(scene, 0).jobs == 2
+    with pytest.raises(SpecError, match="has no plan 2; it has 2 plans, numbered from 0"):
+        withdraw(scene, 2)
+
+
+def test_rows_of_withdrawn_jobs_are_unused(scene: SceneStore) -> None:
+    withdraw(scene)
+    (plan,) = fresh(scene).plans()
+    assert plan.withdrawn == {1, 3}
+    unused = plan.rows.sample_modification == -1
+    np.testing.assert_array_equal(np.flatnonzero(unused), [2, 3, 6, 7])
+    assert np.isnan(plan.rows.view[unused]).all()
+    file = scene.folder / "plans/000000.withdrawn.json"
+    assert json.loads(file.read_text()) == {"jobs": [1, 3]}
+    file.write_text("[]")
+    with pytest.raises(CorruptError, match="names no jobs"):
+        fresh(scene).plans()
+
+
+def test_the_verb_says_what_it_has_done(scene: SceneStore) -> None:
+    said = CliRunner().invoke(verb, ["--store", str(scene.storage.where), "--scene", "small"])
+    assert said.exit_code == 0, said.output
+    assert "4 samples in 2 jobs are forgotten; 4 are rendered and stay" in said.output

@@ -56,6 +56,18 @@ def test_a_mirrored_sphere_still_faces_outwards() -> None:
     assert np.all(np.sum(winding * outward, axis=1)[geometry.areas() > 1e-6] > 0)
 
 
+@pytest.mark.parametrize("shape", ["rectangle", "cube"])
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_points_of_mirrored_shapes_have_the_normals_of_their_fronts(shape: str, mirrored: bool) -> None:
+    mi = backend.load(1)
+    to_world = mi.ScalarTransform4f().scale([-1 if mirrored else 1, 1, 1])
+    loaded = scene(shape={"type": shape, "to_world": to_world, "light": {"type": "area", "radiance": 8.0}})
+    cloud = cloud_of(loaded, geometry_of(loaded.shapes(), {}), 100, SCENE_ID)
+    assert np.all(cloud.emission == 8)
+    out = cloud.position if shape == "cube" else np.array([0, 0, 1])
+    assert np.all(np.sum(cloud.normal * out, axis=1) > 0.9)
+
+
 def test_shapes_that_cannot_be_triangulated_are_refused() -> None:
     distance = np.linspace(-1, 1, 4, dtype=np.float32)[:, None, None, None] * np.ones((4, 4, 4, 1), np.float32)
     grid = backend.load(1).TensorXf(distance)

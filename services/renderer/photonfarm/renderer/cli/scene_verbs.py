@@ -46,7 +46,8 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
         return
     for line in (*map(str, made.changes), *made.found):
         click.echo(line)
-    command = f"photonfarm up {quote(str(made.spec))} --modifications 64 --train-steps 0"
+    shown = quote(str(made.spec.with_name(f"{made.spec.stem}-out")))
+    command = f"photonfarm up {quote(str(made.spec))} --modifications 64 --train-steps 0 --out {shown}"
     click.echo(f"{made.spec} and {made.folder} are written; see it by: {command}")
 
 

@@ -39,15 +39,16 @@ def _stacked(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
 
 
 def cloud_of(scene: Any, geometry: Geometry, count: int, radiance_id: str) -> BasePointCloud:
-    """`count` points uniform on the scene's surfaces, as they are at rest; the scene id determines which."""
+    """`count` points uniform on the scene's surfaces, as they are at rest; the radiance id determines which."""
     face, barycentric = sample_surface(geometry, count, Stream(make_key("cloud", radiance_id), "surface"))
     position, si = surfaces_at(scene, geometry, face, barycentric)
     emission = si.emitter(scene).eval(si)
     albedo = diffuse_reflectance(si, mi.Bool(True))
-    dr.eval(si.n, albedo, emission)
+    normal = si.n * dr.sign(dr.dot(si.n, si.sh_frame.n))  # Mitsuba's `n` of a mirrored rectangle is of its back
+    dr.eval(normal, albedo, emission)
     return BasePointCloud(
         position=position.astype(np.float32),
-        normal=rows(si.n, count),
+        normal=rows(normal, count),
         albedo=rows(albedo, count),
         emission=rows(emission, count),
         group=geometry.shape_group[geometry.face_shape[face]],

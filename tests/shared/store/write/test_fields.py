@@ -1,0 +1,54 @@
+"""The columns of stored vectors have names, may be added, and are at rest where a plan lacks them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import store_samples as samples
+import zarr
+
+from photonfarm.shared.core.errors import CorruptError
+from photonfarm.shared.store import SceneStore
+from photonfarm.shared.store.format import declarations
+from photonfarm.shared.store.write.plans import by_name
+
+scene = samples.scene
+TURN = {"name": "turn", "unit": "degrees", "rest": 0.0, "zero": "as modelled"}
+POWER = {"name": "power", "unit": "natural logarithm", "rest": -0.5, "zero": "as the scene states it"}
+
+
+def test_a_plan_describes_its_vectors(scene: SceneStore) -> None:
+    plan = zarr.open_group(scene.folder / "plans/000000", mode="r")
+    groups, fields = plan["modification"].attrs["groups"], plan["modification"].attrs["fields"]
+    assert groups == ["object"]
+    assert [field["name"] for field in fields] == ["x", "y", "z", "present"]
+    assert [field["name"] for field in plan["view"].attrs["fields"]][3:] == ["look_at_x", "look_at_y", "look_at_z"]
+    (stored,) = scene.plans()
+    for kind in ("modification", "view"):
+        density = getattr(stored.rows, f"{kind}_density")
+        unused = np.isnan(getattr(stored.rows, kind).reshape(len(density), -1)).all(axis=1)
+        np.testing.assert_array_equal(density, np.where(unused, np.nan, 1).astype(np.float32))
+
+
+def test_a_plan_that_lacks_a_field_has_it_at_rest(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = scene.plans()[0].rows.modification
+    fields = (*declarations.FIELDS["modification"], TURN, POWER)
+    monkeypatch.setitem(declarations.FIELDS, "modification", fields)
+    after = SceneStore(scene.storage, scene.scene_id).plans()[0].rows.modification
+    np.testing.assert_array_equal(after[..., :4], before)
+    unused = np.isnan(before[..., 0])
+    np.testing.assert_array_equal(after[~unused][:, 4:], np.broadcast_to(np.float32([0, -0.5]), (np.sum(~unused), 2)))
+    assert np.isnan(after[unused]).all()
+
+
+def test_columns_are_found_by_name_in_any_order() -> None:
+    known: Any = declarations.FIELDS["modification"]
+    values = np.arange(8, dtype=np.float32).reshape(1, 2, 4)
+    np.testing.assert_array_equal(by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values)
+
+
+def test_a_field_of_a_newer_program_is_refused(scene: SceneStore) -> None:
+    plan = zarr.open_group(scene.folder / "plans/000000", mode="r+")
+    plan["view"].update_attributes({"fields": [*plan["view"].attrs["fields"], {"name": "fov"}]})
+    with pytest.raises(CorruptError, match="has the field fov, which this program does not know"):
+        SceneStore(scene.storage, scene.scene_id).plans()

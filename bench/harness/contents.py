@@ -29,6 +29,7 @@ from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
 from photonfarm.shared.store.format.schema import RowKind, output_arrays
 from photonfarm.shared.store.format.shards import encode
+from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
 
@@ -198,7 +199,10 @@ class EncodedPool:
         photons = [pool.photons() for _ in range(pool.count("photons"))]
         rows: dict[RowKind, list[Mapping[str, Any]]] = {
             "sample": [_radiance(pool.halves(), spec) for _ in range(pool.count("halves"))],
-            "view": [view_row(pool.buffers(), pool.visibility()) for _ in range(pool.count("buffers"))],
+            "view": [
+                view_row(pool.buffers(), pool.visibility()) | _guides(pool.guides())
+                for _ in range(pool.count("buffers"))
+            ],
             "modification": [
                 {f"photon_{name}": values for name, values in arrays_of(record).items()} for record in photons
             ],
@@ -215,10 +219,14 @@ class EncodedPool:
 
 
 def view_row(buffers: ViewBuffers, visibility: Visibility) -> dict[str, Any]:
-    """What is stored of a view, by array."""
+    """What is stored of a view beside its guides, by array."""
     seen = {"point_seen": visibility.points, "photon_seen": visibility.photons}
     bits = {name: np.packbits(values, bitorder="little") for name, values in seen.items() if len(values)}
     return arrays_of(buffers) | bits
+
+
+def _guides(guides: Guides) -> dict[str, Any]:
+    return {name: rounded(values) if name in NOISY_GUIDES else values for name, values in arrays_of(guides).items()}
 
 
 def _radiance(halves: F32, spec: SceneSpec) -> Mapping[str, F32]:

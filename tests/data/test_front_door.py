@@ -23,10 +23,11 @@ import photonfarm.trainer
 from photonfarm.data import Scene, open_scene
 from photonfarm.shared.core.errors import SpecError, StoreError
 from photonfarm.shared.core.keys import seed_of
+from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.read.find import Query, find_samples
+from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
 
 
 @pytest.fixture(params=["folder", "bucket"])
@@ -64,7 +65,7 @@ def test_public_names(package: ModuleType, names: list[str]) -> None:
 @pytest.mark.parametrize(
     ("function", "parameters"),
     [
-        (photonfarm.data.open_scene, "store, scene, *, guides=None"),
+        (photonfarm.data.open_scene, "store, scene, *, guides=True"),
         (photonfarm.renderer.load_mitsuba, "threads=None"),
         (
             photonfarm.trainer.train,
@@ -92,10 +93,11 @@ def test_a_sample_is_what_was_committed(place: str | Path) -> None:
     scene = open_scene(place, written.scene_id[:8])
     assert (scene.name, scene.id, len(scene)) == ("small", written.scene_id, 10)
     committed = samples.outputs(written, 3)
-    for row, radiance in committed.radiance.items():
-        np.testing.assert_array_equal(scene[row].radiance, radiance)
-        np.testing.assert_array_equal(scene[row].albedo, committed.buffers[row].albedo)
-        np.testing.assert_array_equal(scene[row].photons.power, committed.photons[row].power)
+    for row in written.job_rows(3).samples:
+        sample, photons = scene[row.row], samples.photons(written.spec, row.modification_row)
+        np.testing.assert_array_equal(sample.radiance, committed.radiance[row.row])
+        np.testing.assert_array_equal(sample.albedo, committed.buffers[row.view_row].albedo)
+        np.testing.assert_array_equal(sample.photons.power, photons.power)
     sample = scene[-1]
     assert sample.row == 9
     assert len(set(sample.seeds)) == 2
@@ -175,19 +177,21 @@ def test_a_scene_grows_and_a_snapshot_does_not(tmp_path: Path) -> None:
         scene[4]
 
 
-def test_guides_come_with_the_samples_of_a_scene_that_has_them(tmp_path: Path) -> None:
-    written = stored(tmp_path / "store")
-    with pytest.raises(SpecError):
-        open_scene(tmp_path / "store", "small", guides=True)
-    written.guides.want(GuideSpec())
-    for job in range(3):
-        samples.commit_guides(written, job)
-    scene = open_scene(tmp_path / "store", "small")
-    assert scene.has_guides
-    assert len(scene) == 6  # of the others, guides are to come
-    np.testing.assert_array_equal(scene[5].direct, scene[5].guides["direct"])
+def test_guides_come_with_samples_unless_the_scene_is_opened_without(tmp_path: Path) -> None:
+    written = stored(tmp_path / "store", views=2)
+    scene, without = (open_scene(tmp_path / "store", "small", guides=guides) for guides in (True, False))
+    assert scene.rows.tolist() == without.rows.tolist()
+    for row in (4, 5):
+        sample = scene[row]
+        for name, values in arrays_of(samples.guides(written.spec, row)).items():
+            np.testing.assert_array_equal(sample.guides[name], rounded(values) if name in NOISY_GUIDES else values)
+            np.testing.assert_array_equal(getattr(sample, name), sample.guides[name])
     assert scene.torch()[5]["direct"].shape == (8, 8, 3)
-    assert len(open_scene(tmp_path / "store", "small", guides=False)) == 10
+    assert without[5].guides == {}
+    assert (scene.has_guides, without.has_guides) == (True, False)
+    assert "direct" not in without.torch()[5]
+    with pytest.raises(AttributeError):
+        _ = without[5].direct
 
 
 def test_wrong_names_raise_with_those_that_exist(scene: Scene, tmp_path: Path) -> None:

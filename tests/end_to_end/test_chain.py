@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,9 +12,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.trainer import train
 from photonfarm.trainer.runs import checkpoint
 
 ROOT = Path(__file__).parents[2]
@@ -112,32 +108,6 @@ def test_the_network_shows_a_camera_path_and_buffers_that_were_made_before_alike
     assert photonfarm("buffers", "--scene", "room", "--camera-path", "path.json").returncode == 0
     assert photonfarm("infer", "--buffers", "buffers.npz", "--out", "again").returncode == 0
     assert (folder / "again/frame-0001.png").read_bytes() == (folder / "film/frame-0001.png").read_bytes()
-
-
-def test_a_store_without_guides_is_upgraded_by_workers_and_trained_on_by_the_default_network(
-    photonfarm_in, folder: Path, tmp_path: Path
-) -> None:
-    """As a store of an older photonfarm, which gets the guides that the samples came with."""
-    shutil.copytree(folder / "store", tmp_path / "store", ignore=shutil.ignore_patterns("guides"))
-    with pytest.raises(SpecError, match="store upgrade"):
-        train(tmp_path / "store", "room", tmp_path / "run", max_steps=3)
-    old, rendered = files(tmp_path / "store"), files(folder / "store")
-    with EmbeddedRedis(tmp_path / "redis") as redis:
-        for verb in (("store", "upgrade"), ("work", "--until-complete")):
-            done = photonfarm_in(tmp_path)(*verb, PHOTONFARM_REDIS_URL=redis.url)
-            assert done.returncode == 0, done.stderr
-    upgraded = files(tmp_path / "store")
-    assert old.items() <= upgraded.items(), "nothing was rendered again"
-    guides = {name for name in rendered if "/guides/plans/" in name}
-    assert len(guides) > 8
-    assert {name: upgraded[name] for name in guides} == {name: rendered[name] for name in guides}
-    run = train(tmp_path / "store", "room", tmp_path / "run", max_steps=3)
-    assert run.settings.network.architecture == "guided_transport"
-
-
-def files(store: Path) -> dict[str, bytes]:
-    """The bytes of a store by the names of its files."""
-    return {str(path.relative_to(store)): path.read_bytes() for path in store.rglob("*") if path.is_file()}
 
 
 def test_a_modification_that_is_too_short_is_refused(photonfarm: Command) -> None:

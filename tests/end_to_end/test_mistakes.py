@@ -41,7 +41,6 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("store check --store typo", 4, ["typo: there is no store"]),
         ("store find --store typo", 4, ["typo: there is no store"]),
         ("store merge --out o --store typo", 4, ["typo: there is no store"]),
-        ("store upgrade --store typo", 4, ["typo: there is no store"]),
         ("preview room --store typo", 4, ["typo: there is no store"]),
         ("top-up room --spp 8 --store typo", 4, ["typo: there is no store"]),
         ("buffers --scene room --orbit 2 --store typo", 4, ["typo: there is no store"]),

@@ -6,16 +6,14 @@ from pathlib import Path
 import pytest
 from exports import commit, planned
 
-from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneStore, Store
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """10 samples in jobs of 2, of 5 configurations with 2 views each, with guides; all committed."""
+    """10 samples in jobs of 2, of 5 configurations with 2 views each; all committed."""
     place: Path = tmp_path_factory.mktemp("made") / "store"
     scene = planned(place, modifications=5, views=2)
-    scene.guides.want(GuideSpec())
     for job in range(scene.jobs()):
         commit(scene, job)
     return place

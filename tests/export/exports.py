@@ -32,8 +32,6 @@ def commit(scene: SceneStore, job: int) -> None:
     if BRIGHT in given.radiance:
         given.radiance[BRIGHT] *= np.float32(1e6 / 3)
     samples.commit(scene, job, given)
-    if scene.guides.settings() is not None:
-        samples.commit_guides(scene, job)
 
 
 def exported(scene: SceneStore, out: Path, to: str, on_progress: Any = lambda *_: None, **asked: Any) -> Result:

@@ -16,8 +16,6 @@ from photonfarm.export.export import export_scene
 from photonfarm.export.rows import ranges, rows_in, spans
 from photonfarm.export.settings import ExportRequest
 from photonfarm.shared.cli.main import main
-from photonfarm.shared.core.errors import SpecError, StoreError
-from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneStore
 
 GUIDES = tuple(samples.guides(samples.small_spec(), 0).__dataclass_fields__)
@@ -107,25 +105,7 @@ def test_a_shard_is_an_ordinary_tar_file(scene: SceneStore, tmp_path: Path) -> N
     np.testing.assert_array_equal(depth, open_scene(scene.folder.parent.parent, "small").row(4).depth)
 
 
-# ------------------------------------------------------------------------------------------------- guides, and extras
-
-
-def test_guides_are_said_to_be_missing_and_only_samples_that_have_them_are_exported_with_them(tmp_path: Path) -> None:
-    scene = planned(tmp_path / "store", modifications=5)
-    samples.commit_all(scene)
-    said: list[str] = []
-    store, request = scene.folder.parent.parent, ExportRequest(to="npz")
-    export_scene(store, "small", tmp_path / "without", request, said.append, lambda *_: None)
-    assert any("without guides" in line for line in said)
-    assert "direct" not in read(tmp_path / "without", "npz")[0]
-    with pytest.raises(SpecError):
-        exported(scene, tmp_path / "out", "npz", buffers="albedo,direct")
-    scene.guides.want(GuideSpec())
-    samples.commit_guides(scene, 1)
-    assert exported(scene, tmp_path / "with", "npz").samples == 2
-    assert exported(scene, tmp_path / "few", "npz", buffers="albedo").samples == 5
-    with pytest.raises(StoreError):  # its folder is without guides
-        exported(scene, tmp_path / "without", "npz")
+# -------------------------------------------------------------------------------------------------------- extras
 
 
 def test_points_and_photons_are_exported_once_per_configuration(scene: SceneStore, tmp_path: Path) -> None:

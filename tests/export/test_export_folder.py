@@ -59,7 +59,7 @@ def test_a_killed_export_goes_on_and_ends_as_if_it_had_not_been_killed(
 
 @pytest.mark.parametrize("to", FORMATS)
 def test_a_later_export_takes_only_what_is_new(tmp_path: Path, to: str) -> None:
-    scene = planned(tmp_path / "store")
+    scene = planned(tmp_path / "store", **samples.ALWAYS)
     out = tmp_path / "out"
     with pytest.raises(IncompleteError):
         exported(scene, out, to)

@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 from store_model import Model, Planned, Writer, base_of
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.plan.request import UNUSED, Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
-from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneStore, Store
 
 SPECS = (
@@ -43,7 +42,6 @@ class WritingMachine(RuleBasedStateMachine):
         self.models = [Model(spec, rows) for spec, rows in zip(SPECS, SHARD_ROWS, strict=True)]
         for spec in SPECS:
             self.stores[0].add(spec).write_base(*base_of(spec))
-        self.ask_for_guides(number=0, process=0, light_samples=1)  # as `submit` does; of the other scene in its time
         self.writers: list[Writer] = []
         self.dead: list[int] = []  # numbers of processes
 
@@ -127,34 +125,21 @@ class WritingMachine(RuleBasedStateMachine):
     def _plan_of(plans: list[Any], row: int) -> Any:
         return next(plan for plan in plans if plan.first_row <= row < plan.end_row)
 
-    @rule(number=scene_numbers, process=processes, light_samples=st.sampled_from([1, 1, 1, 2]))
-    def ask_for_guides(self, number: int, process: int, light_samples: int) -> None:
-        """Guides may be asked for at any time; the settings that come first stay."""
-        model, wanted = self.models[number], GuideSpec(light_samples=light_samples)
-        guides = self.scene(number, process).guides
-        if model.wanted not in (None, wanted):
-            with pytest.raises(SpecError):
-                guides.want(wanted)
-            return
-        assert guides.want(wanted) is (model.wanted is None)
-        model.wanted = wanted
-
     # ---------------------------------------------------------------------------------------------------------- writing
 
-    def _some_job(self, number: int, which: int, guides: bool) -> tuple[int, bool] | None:
-        """A missing job, and whether it is of guides, once these are asked for; now and then any job."""
+    def _some_job(self, number: int, which: int) -> int | None:
+        """A missing job; now and then any job."""
         model = self.models[number]
-        guides &= model.wanted is not None
-        missing = sorted(model.every(guides) - model.done(guides))
-        jobs = missing if missing and which % 8 else sorted(model.every(guides))
-        return (jobs[which // 8 % len(jobs)], guides) if jobs else None
+        missing = model.missing()
+        jobs = missing if missing and which % 8 else range(model.jobs)
+        return jobs[which // 8 % len(jobs)] if jobs else None
 
     @precondition(lambda self: any(model.jobs for model in self.models) and len(self.writers) < 4)
-    @rule(number=scene_numbers, process=processes, which=any_index, count=st.integers(0, 12), guides=st.booleans())
-    def open_writer(self, number: int, process: int, which: int, count: int, guides: bool) -> None:
+    @rule(number=scene_numbers, process=processes, which=any_index, count=st.integers(0, 12))
+    def open_writer(self, number: int, process: int, which: int, count: int) -> None:
         """The job may be one that another writer is at, or that is committed."""
-        if (job := self._some_job(number, which, guides)) is not None:
-            writer = Writer(number, self.scene(number, process), *job)
+        if (job := self._some_job(number, which)) is not None:
+            writer = Writer(number, self.scene(number, process), job)
             self.writers.append(writer)
             writer.give(count, which)
 
@@ -167,7 +152,7 @@ class WritingMachine(RuleBasedStateMachine):
     @rule(which=any_index)
     def commit(self, which: int) -> None:
         writer = self.writers.pop(which % len(self.writers))
-        committed = self.models[writer.number].done(writer.guides)
+        committed = self.models[writer.number].committed
         with writer.out:
             writer.give(len(writer.left))
             assert writer.out.commit(samples.FIGURES) is (writer.job not in committed)
@@ -189,26 +174,22 @@ class WritingMachine(RuleBasedStateMachine):
     @precondition(lambda self: any(model.missing() for model in self.models))
     @rule(number=scene_numbers, process=processes, which=any_index)
     def render(self, number: int, process: int, which: int) -> None:
-        """A missing job from beginning to end, as workers do: its guides first."""
-        model = self.models[number]
-        if jobs := model.missing():
-            job = jobs[which % len(jobs)]
-            for guides in (True, False):
-                if job in model.every(guides) - model.done(guides):
-                    self.writers.append(Writer(number, self.scene(number, process), job, guides))
-                    self.commit(len(self.writers) - 1)
+        """A missing job from beginning to end, as workers do."""
+        if jobs := self.models[number].missing():
+            self.writers.append(Writer(number, self.scene(number, process), jobs[which % len(jobs)]))
+            self.commit(len(self.writers) - 1)
 
     @precondition(lambda self: any(model.missing() for model in self.models))
     @rule(
-        number=scene_numbers, process=processes, which=any_index, guides=st.booleans(),
-        given=st.one_of(st.integers(0, 12), st.just(1000)), links=st.integers(1, 13), after=st.booleans(),
+        number=scene_numbers, process=processes, which=any_index,
+        given=st.one_of(st.integers(0, 12), st.just(1000)), links=st.integers(1, 25), after=st.booleans(),
     )  # fmt: skip
-    def die(self, number: int, process: int, which: int, guides: bool, given: int, links: int, after: bool) -> None:
+    def die(self, number: int, process: int, which: int, given: int, links: int, after: bool) -> None:
         """A process of its own, which is killed: in the middle of its rows, or before or after a link of its commit."""
-        if (job := self._some_job(number, which, guides)) is None:
+        if (job := self._some_job(number, which)) is None:
             return
         scene = self.scene(number, process)
-        scene.job_rows(job[0])  # the plans are loaded here: a fork shall not have to
+        scene.job_rows(job)  # the plans are loaded here: a fork shall not have to
         told, tell = os.pipe()
         if (pid := os.fork()) == 0:
             try:
@@ -222,7 +203,7 @@ class WritingMachine(RuleBasedStateMachine):
             said = told_of.read()
         assert said in (b"", b"marker"), said.decode()
         if said == b"marker":
-            self.models[number].done(job[1]).add(job[0])
+            self.models[number].committed.add(job)
         self.dead.append(pid)
 
     # --------------------------------------------------------------------------------------------- processes and sweeps
@@ -246,7 +227,7 @@ class WritingMachine(RuleBasedStateMachine):
         return set(self.stores[0].storage.names("tmp"))
 
 
-def _doomed(scene: SceneStore, job: tuple[int, bool], given: int, links: int, after: bool, tell: int) -> None:
+def _doomed(scene: SceneStore, job: int, given: int, links: int, after: bool, tell: int) -> None:
     """Write in a process of its own, and be killed; says whether the marker was placed before that."""
     try:
         plain, left = os.link, itertools.count(1)
@@ -261,7 +242,7 @@ def _doomed(scene: SceneStore, job: tuple[int, bool], given: int, links: int, af
             if last:
                 os.kill(os.getpid(), signal.SIGKILL)
 
-        writer = Writer(0, scene, *job)
+        writer = Writer(0, scene, job)
         writer.give(given)
         if not writer.left:
             os.link = dying

@@ -1,4 +1,4 @@
-"""What a store of made-up samples and guides should hold, as dictionaries: `test_store_model` compares the two."""
+"""What a store of made-up samples should hold, as dictionaries: `test_store_model` compares the two."""
 
 import hashlib
 from collections.abc import Callable
@@ -11,9 +11,9 @@ import store_samples as samples
 from photonfarm.shared.core.records import BasePointCloud, Geometry, Guides, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.plan.request import UNUSED, PlannedContent, Request, expand, sample_key
 from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.write.guides import NOISY, rounded
+from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
 
 # ------------------------------------------------------------------------------ what is rendered: a function of content
 
@@ -71,7 +71,7 @@ class Planned:
 
 @dataclass
 class Model:
-    """A scene: what is planned, and which jobs are committed, of its samples and of its guides."""
+    """A scene: what is planned, and which jobs are committed."""
 
     spec: SceneSpec
     shard_rows: int
@@ -79,30 +79,18 @@ class Model:
     plans: int = 0
     jobs: int = 0
     committed: set[int] = field(default_factory=set)
-    wanted: GuideSpec | None = None  # None: nobody has asked for guides
-    guided: set[int] = field(default_factory=set)  # jobs whose guides are committed
-
-    def done(self, guides: bool) -> set[int]:
-        """The jobs whose guides are committed, or whose samples are."""
-        return self.guided if guides else self.committed
-
-    def every(self, guides: bool) -> set[int]:
-        """The jobs that there can be: guides have those with new views, once they are asked for."""
-        views = {s.view_row // self.shard_rows for s in self.planned.values()}
-        return set(range(self.jobs)) if not guides else views if self.wanted else set()
 
     def missing(self) -> list[int]:
         """The jobs that workers are to take."""
-        return sorted(self.every(guides=False) - self.committed | self.every(guides=True) - self.guided)
+        return [job for job in range(self.jobs) if job not in self.committed]
 
     def jobs_of(self, sample: Planned) -> set[int]:
         """The jobs that must be committed for a sample to be complete."""
         return {row // self.shard_rows for row in (sample.row, sample.view_row, sample.modification_row)}
 
-    def complete(self, guides: bool = False) -> dict[int, bytes]:
-        """The keys of the complete samples, by row; with `guides`, of those whose views have them."""
-        found = {key: s for key, s in self.planned.items() if self.jobs_of(s) <= self.committed}
-        return {s.row: k for k, s in found.items() if not guides or s.view_row // self.shard_rows in self.guided}
+    def complete(self) -> dict[int, bytes]:
+        """The keys of the complete samples, by row."""
+        return {s.row: key for key, s in self.planned.items() if self.jobs_of(s) <= self.committed}
 
     def views(self) -> dict[tuple[bytes, bytes], list[Planned]]:
         """The passes of each view, by modification and view, in the order of the views' rows."""
@@ -124,21 +112,17 @@ class Model:
 
 
 class Writer:
-    """What takes a job's samples, or its guides, and the rows that it still wants."""
+    """What takes a job's rows, and those that it still wants."""
 
-    def __init__(self, number: int, scene: SceneStore, job: int, guides: bool = False) -> None:
-        self.number, self.job, self.spec, self.guides = number, job, scene.spec, guides
-        self.out: Any = scene.guide_writer(job) if guides else scene.job_writer(job)
+    def __init__(self, number: int, scene: SceneStore, job: int) -> None:
+        self.number, self.job, self.spec = number, job, scene.spec
+        self.out = scene.job_writer(job)
         rows = scene.job_rows(job)
         vectors = {row: modification.vector.tobytes() for row, modification in rows.modifications.items()}
         views = {
             s.view_row: (vectors[s.modification_row], rows.views[s.view_row].vector.tobytes()) for s in rows.samples
         }
         self.left: list[tuple[Callable[..., None], int, Callable[[], Any]]] = []
-        if guides:
-            for row in sorted(rows.new_views):
-                self.left.append((self.out.guides, row, lambda row=row: guides_of(self.spec, *views[row])))
-            return
         for row in sorted(rows.new_modifications if scene.spec.photons.paths else ()):
             self.left.append((self.out.photons, row, lambda row=row: photons_of(self.spec, vectors[row])))
         for row in sorted(rows.new_views):
@@ -147,7 +131,8 @@ class Writer:
             self.left.append((self.out.radiance, s.row, lambda key=s.key: radiance_of(self.spec, key)))
 
     def _view(self, row: int, view: tuple[bytes, bytes]) -> None:
-        self.out.view(row, buffers_of(self.spec, *view), visibility_of(self.spec, *view))
+        rendered = (of(self.spec, *view) for of in (buffers_of, guides_of, visibility_of))
+        self.out.view(row, *rendered)
 
     def give(self, count: int, choose: int = 0) -> None:
         """Hand over so many of the rows, in some order."""
@@ -162,14 +147,13 @@ class Reader:
 
     number: int
     reader: SceneReader
-    guides: bool = False  # whether it reads them too
     seen: set[int] = field(default_factory=set)
     disturbed: set[int] = field(default_factory=set)  # jobs damaged or taken back since it refreshed
 
 
-def compare(reader: SceneReader, row: int, model: Model, *, guides: bool) -> bytes:
+def compare(reader: SceneReader, row: int, model: Model) -> bytes:
     """Read a row, and compare it bit for bit with what the model has under its key; the key."""
-    sample = reader.read(row)
+    sample = reader.read(row, guides=True)
     modification, view = sample.modification.vector.tobytes(), sample.view.vector.tobytes()
     key = model.key(modification, view, sample.pass_)
     assert model.complete().get(row, key) == key
@@ -177,11 +161,9 @@ def compare(reader: SceneReader, row: int, model: Model, *, guides: bool) -> byt
     np.testing.assert_array_equal(sample.radiance, radiance_of(model.spec, key))
     for name, values in arrays_of(buffers_of(model.spec, modification, view)).items():
         np.testing.assert_array_equal(getattr(sample.buffers, name), values, name)
-    assert (sample.guides is not None) == guides
-    if sample.guides is not None:
-        for name, values in arrays_of(guides_of(model.spec, modification, view)).items():
-            expected = rounded(values) if name in NOISY else values
-            np.testing.assert_array_equal(getattr(sample.guides, name), expected, name)
+    for name, values in arrays_of(guides_of(model.spec, modification, view)).items():
+        expected = rounded(values) if name in NOISY_GUIDES else values
+        np.testing.assert_array_equal(getattr(sample.guides, name), expected, name)
     if model.spec.photons.paths:
         stored = arrays_of(reader.read_photons(row))
         for name, values in arrays_of(photons_of(model.spec, modification)).items():

@@ -44,6 +44,8 @@ def outputs(scene: SceneStore, job: int) -> Any:
     given = samples.outputs(scene, job)
     if job == 1:
         given.radiance[5][0, 0, 0, 0] = 1e9
+    for buffers in given.buffers.values():
+        buffers.normal[::2] *= -1  # no view sees everything from behind
     for row, photons in given.photons.items():
         photons.power[0] += row  # no two modifications alike
     return given

@@ -39,10 +39,10 @@ def with_tensorstore(folder: Path):
 
 
 READERS = {"zarr": with_zarr, "tensorstore": with_tensorstore}
-BUFFERS = ("depth", "albedo", "normal")
+OF_VIEWS = ("depth", "albedo", "normal",
+            "emission", "direct", "gloss", "specular", "roughness", "mean_depth", "mean_normal", "throughput",
+            "beyond_albedo", "beyond_normal", "beyond_depth", "point_light")  # fmt: skip
 SEEN = ("point_seen", "photon_seen")
-GUIDES = ("emission", "direct", "gloss", "specular", "roughness", "mean_depth", "mean_normal", "throughput",
-          "beyond_albedo", "beyond_normal", "beyond_depth", "point_light")  # fmt: skip
 PHOTONS = ("photon_position", "photon_direction", "photon_normal", "photon_power", "photon_bounce")
 
 
@@ -52,7 +52,7 @@ def document(path: Path):
 
 def main(store: Path, backend: str, out: Path) -> None:
     stated = document(store / "photonfarm.json")
-    assert (stated["format"], stated["version"]) == ("photonfarm store", 4)
+    assert (stated["format"], stated["version"]) == ("photonfarm store", 5)
     arrays = {}
     for folder in sorted((store / "scenes").iterdir()):
         if re.fullmatch("[0-9a-f]{32}", folder.name):
@@ -66,24 +66,17 @@ class Scene:
     def __init__(self, folder: Path, read) -> None:
         self.folder, self.read = folder, read
         self.spec = document(folder / "spec.json")
-        self.committed, self.guided = jobs_in(folder / "committed"), jobs_in(folder / "guides/committed")
+        self.committed = self.committed_jobs()
         self.plans = [Plan(folder / "plans" / name, read) for name in self.plan_names()]
         self.shard_rows = self.plans[0].shard_rows if self.plans else 1
-        self.guides = {plan.folder.name: self.guides_of(plan, read) for plan in self.plans}
+
+    def committed_jobs(self):
+        names = [path.name for path in (self.folder / "committed").glob("*")]
+        return {int(name[:12]) for name in names if re.fullmatch(r"[0-9]{12}\.json", name)}
 
     def plan_names(self):
         names = [path.parent.name for path in self.folder.glob("plans/*/zarr.json")]
         return sorted((name for name in names if re.fullmatch("[0-9]{6,}", name)), key=int)
-
-    def guides_of(self, plan, read):
-        """The arrays of the guides of a plan; none if no view of it has some."""
-        folder = self.folder / "guides/plans" / plan.folder.name
-        if not (folder / "zarr.json").exists():
-            return {}
-        attributes = document(folder / "zarr.json")["attributes"]
-        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 4)
-        assert attributes["first_job"] * plan.shard_rows == plan.first_row
-        return {array.name: read(array) for array in arrays_in(folder)}
 
     def everything(self):
         found = {}
@@ -93,14 +86,10 @@ class Scene:
                     found[f"base/{group}/{array.name}"] = self.read(array)
         for plan in self.plans:
             found |= {f"plans/{plan.folder.name}/{name}": values for name, values in plan.arrays.items()}
-            guides = self.guides[plan.folder.name]
-            found |= {f"guides/plans/{plan.folder.name}/{name}": values for name, values in guides.items()}
         for row in self.complete_rows():
             found |= {f"samples/{row}/{name}": values for name, values in self.sample(row).items()}
         for job in sorted(self.committed):
-            self.check_marker(self.folder, job)
-        for job in sorted(self.guided):
-            self.check_marker(self.folder / "guides", job)
+            self.check_marker(job)
         return found
 
     # --------------------------------------------------------------------------------------------------- samples
@@ -129,18 +118,13 @@ class Scene:
         key = make_key("sample", self.folder.name, modification, view, number)
         assert key == self.stored("sample_key", row).tobytes()
         read = {"radiance": self.radiance(row), "modification": modification, "view": view, "pass": number}
-        read |= {name: self.stored(name, view_row) for name in BUFFERS}
+        read |= {name: self.stored(name, view_row) for name in OF_VIEWS}
         slots = self.spec["photons"]["paths"] * self.spec["photons"]["depth"]
         for name, count in zip(SEEN, (self.spec["points"], slots), strict=True):
             if count:
                 read[name] = np.unpackbits(self.stored(name, view_row), bitorder="little")[:count]
         if self.spec["photons"]["paths"]:
             read |= {name: self.stored(name, modification_row) for name in PHOTONS}
-        if view_row // self.shard_rows in self.guided:
-            assert "light_samples" in document(self.folder / "guides/settings.json")
-            plan = self.plan_of(view_row)
-            of_plan = self.guides[plan.folder.name]
-            read |= {f"guides/{name}": of_plan[name][view_row - plan.first_row] for name in GUIDES}
         read["rays"] = rays(view.astype("f8"), self.spec)
         seeds = [seed(key, "half A"), seed(key, "half B")]
         read["seeds"] = [*seeds, seed(make_key("modification", self.folder.name, modification), "photons")]
@@ -154,11 +138,11 @@ class Scene:
 
     # --------------------------------------------------------------------------------------------------- markers
 
-    def check_marker(self, folder, job):
-        marker = document(folder / f"committed/{job:012d}.json")
+    def check_marker(self, job):
+        marker = document(self.folder / f"committed/{job:012d}.json")
         assert marker["job"] == job
         for name, about in marker["files"].items():
-            data = (folder / name).read_bytes()
+            data = (self.folder / name).read_bytes()
             assert len(data) == about["size"]
             assert checksum_of_shard(data, self.shard_rows) == about["crc32c"]
 
@@ -167,7 +151,7 @@ class Plan:
     def __init__(self, folder: Path, read) -> None:
         self.folder = folder
         attributes = document(folder / "zarr.json")["attributes"]
-        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 4)
+        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 5)
         self.shard_rows = attributes["shard_rows"]
         self.first_row = attributes["first_job"] * self.shard_rows
         self.rows = attributes["jobs"] * self.shard_rows
@@ -175,12 +159,6 @@ class Plan:
 
     def attributes_of(self, name):
         return document(self.folder / name / "zarr.json")["attributes"]
-
-
-def jobs_in(folder: Path):
-    """The jobs that have their marker in a folder, which may be missing."""
-    names = [path.name for path in folder.glob("*")]
-    return {int(name[:12]) for name in names if re.fullmatch(r"[0-9]{12}\.json", name)}
 
 
 def arrays_in(folder: Path):

@@ -22,6 +22,7 @@ class Outputs:
 
     radiance: dict[int, F32]
     buffers: dict[int, ViewBuffers]
+    guides: dict[int, Guides]
     visibility: dict[int, Visibility]
     photons: dict[int, Photons]
 
@@ -36,6 +37,10 @@ def small_spec(**changes: Any) -> SceneSpec:
         "photons": {"paths": 4, "depth": 2},
     }  # fmt: skip
     return parse_spec({**described, **changes}, where="test")
+
+
+ALWAYS = {"objects": [{**small_spec().objects[0].model_dump(), "removal_probability": 0.0}]}
+"""What makes the object of `small_spec` be always there, so that no two configurations are equal."""
 
 
 @pytest.fixture
@@ -62,6 +67,7 @@ def outputs(scene: SceneStore, job: int) -> Outputs:
             row: ViewBuffers(values(row, size), values(row + 1, (*size, 3)), values(row + 2, (*size, 3)))
             for row in rows.new_views
         },
+        {row: guides(spec, row) for row in rows.new_views},
         {row: visibility(spec, row) for row in rows.new_views},
         {row: photons(spec, row) for row in rows.new_modifications if spec.photons.paths},
     )
@@ -104,7 +110,7 @@ def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGUR
         for row, photons_ in given.photons.items():
             out.photons(row, photons_)
         for row, buffers in given.buffers.items():
-            out.view(row, buffers, guides(scene.spec, row), given.visibility[row])
+            out.view(row, buffers, given.guides[row], given.visibility[row])
         for row, halves in given.radiance.items():
             out.radiance(row, halves)
         return out.commit(figures, **options)

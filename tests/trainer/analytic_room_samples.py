@@ -40,7 +40,7 @@ class AnalyticSource:
     def base(self) -> tuple[Geometry, BasePointCloud]:
         return self._base
 
-    def follow_guides(self) -> None: ...
+    def read_guides(self) -> None: ...
 
     @property
     def planned(self) -> int:
@@ -137,7 +137,8 @@ def commit_job(scene: SceneStore, job: int) -> bool:
             out.radiance(sample.row, noisy(clean, sample.row, 1.0))
             if sample.view_row in new_views:
                 seen = visibility(scene.spec, cloud, *shown, photons.get(sample.modification_row))
-                out.view(sample.view_row, buffers, seen)
+                guides = known(clean, buffers, min(LIT_POINTS, scene.spec.points))
+                out.view(sample.view_row, buffers, guides, seen)
                 new_views.remove(sample.view_row)
         for row in rows.new_modifications & photons.keys():
             out.photons(row, photons[row])

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from analytic_scene import small_spec
+from store_samples import guides
 
 from bench.harness.contents import EncodedPool, Pool, commit, commit_encoded
 from photonfarm.shared.core.records import Photons, ViewBuffers, Visibility
@@ -28,7 +29,7 @@ def pool(scale: float) -> Pool:
     buffers = [ViewBuffers(random(SIZE, SIZE), *random(2, SIZE, SIZE, 3)) for _ in range(2)]
     photons = [Photons(*random(4, SLOTS, 3), bounce=np.zeros(SLOTS, np.int8)) for _ in range(2)]
     visibility = [Visibility(random(16) < 0.5, random(SLOTS) < 0.5) for _ in range(2)]
-    return Pool(halves, buffers, visibility, photons)
+    return Pool(halves, buffers, [guides(small_spec(), row) for row in range(2)], visibility, photons)
 
 
 def planned(folder: Path, spec: SceneSpec) -> SceneStore:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import math
 import operator
-import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 from analytic_scene import AnalyticScene, small_spec
 from numpy.typing import NDArray
-from store_samples import commit_guides
+from store_samples import guides
 
 from bench.harness import room_study
 from bench.harness.contents import Pool, commit
@@ -24,7 +23,7 @@ from bench.studies.budget_arms import HALF_SPP, ArmSamples, Share, requests
 from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Store
 from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics.intervals import t_975
@@ -34,7 +33,7 @@ SIZE, SLOTS = 8, 8
 Root = tuple[Path, str]
 
 
-def pool() -> Pool:
+def pool(spec: SceneSpec) -> Pool:
     rng = np.random.default_rng(1)
 
     def random(*shape: int) -> Any:
@@ -44,7 +43,8 @@ def pool() -> Pool:
     buffers = [ViewBuffers(random(SIZE, SIZE), *random(2, SIZE, SIZE, 3))]
     position, direction, normal, power = random(4, SLOTS, 3)
     photons = [Photons(position, direction, normal, power, np.zeros(SLOTS, np.int8))]
-    return Pool(halves, buffers, [Visibility(random(16) < 0.5, random(SLOTS) < 0.5)], photons)
+    seen = [Visibility(random(16) < 0.5, random(SLOTS) < 0.5)]
+    return Pool(halves, buffers, [guides(spec, row) for row in range(3)], seen, photons)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Root:
         request = Request(modifications=modifications, views_per_modification=views, passes=passes)
         scene.plan(request, shard_rows=16)
     for job in scene.missing_jobs():
-        commit(scene, job, pool())
+        commit(scene, job, pool(spec))
     return Path(store.root), spec.scene_id
 
 
@@ -99,15 +99,11 @@ def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) 
     assert not len(arm.refresh())
 
 
-def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root, tmp_path: Path) -> None:
+def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root) -> None:
     """What is read together of a sample is what another source reads of it alone."""
-    scene = Store(shutil.copytree(root[0], tmp_path / "store")).scene(root[1])
-    scene.guides.want(GuideSpec())
-    for job in scene.missing_jobs():
-        commit_guides(scene, job)
-    arm, source = ArmSamples(tmp_path / "store", root[1], Share(2, 1, 1), 4), StoreSource(tmp_path / "store", root[1])
+    arm, source = ArmSamples(*root, Share(2, 1, 1), 4), StoreSource(*root)
     for each in (arm, source):
-        each.follow_guides()
+        each.read_guides()
     rows, _ = arm.refresh().tolist(), source.refresh()
     assert rows_held_out(arm, rows, HELD_OUT) == [False] * 4 + [True]
     for row, sample in zip(rows, arm.read_samples(rows), strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from analytic_scene import small_spec
 from numpy.typing import NDArray
-from store_samples import commit_guides
+from store_samples import guides
 
 from bench.harness.contents import Pool, commit
 from bench.harness.network_errors import Errors, replicates, seed_spread
@@ -210,12 +210,10 @@ def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, str
         scene = store.add(spec)
         for request in asked:
             scene.plan(request, shard_rows=16)
-        pool = Pool(images, [buffers], [Visibility(np.ones(16, np.bool_), np.ones(8, np.bool_))], [photons])
+        seen = Visibility(np.ones(16, np.bool_), np.ones(8, np.bool_))
+        pool = Pool(images, [buffers], [guides(spec, 0)], [seen], [photons])
         for job in scene.missing_jobs():
             commit(scene, job, pool)
-        scene.guides.want(spec.guides)
-        for job in scene.missing_jobs():
-            commit_guides(scene, job)
         found[kind] = Path(store.root), spec.scene_id
     return found
 
@@ -248,7 +246,7 @@ def test_none_is_trained_on_what_is_held_out(roots: dict[str, tuple[Path, str]])
 
 def test_networks_with_guides_can_be_trained_on_chosen_samples(roots: dict[str, tuple[Path, str]]) -> None:
     source = FirstSamples(*roots["path"], SAMPLES)
-    source.follow_guides()
+    source.read_guides()
     rows = source.refresh().tolist()
     assert all(sample.guides is not None for sample in source.read_samples(rows[:2]))
     assert sum(are_held_out(source.modification_keys(rows), HELD_OUT)) == 1

@@ -55,7 +55,7 @@ def test_a_sweep_by_a_machine_with_a_wrong_clock_leaves_what_living_writers_need
         for row, photons in given.photons.items():
             out.photons(row, photons)
         for row, buffers in given.buffers.items():
-            out.view(row, buffers, given.visibility[row])
+            out.view(row, buffers, given.guides[row], given.visibility[row])
         first, *others = given.radiance
         out.radiance(first, given.radiance[first])
         assert machine(skew_s, root_of(scene), "print(store.sweep(), store.sweep(stray_age_s=0))") == "0 0"
@@ -108,7 +108,7 @@ def test_a_part_stamped_by_a_machine_that_is_hours_behind_is_left_to_its_writer(
         for row, photons in given.photons.items():
             out.photons(row, photons)
         for row, buffers in given.buffers.items():
-            out.view(row, buffers, given.visibility[row])
+            out.view(row, buffers, given.guides[row], given.visibility[row])
         for row, halves in given.radiance.items():
             out.radiance(row, halves)
         foreign = scene.storage.part().with_name("another-machine-1a2b3c4d5e-17-0-0.partial")

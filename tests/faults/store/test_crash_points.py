@@ -51,7 +51,7 @@ else:
     renderer.render(Store(sys.argv[2]).scene_ids()[0], 0)
 """
 
-# A commit of this job writes 11 arrays and the marker: a link each, once what it links is synced.
+# A commit of this job writes 23 arrays and the marker: a link each, once what it links is synced.
 POINTS = {
     "after render, before the commit": ("commit", "commit", 1, "before"),
     "after the temporary files, before the first is synced": ("commit", "fdatasync", 1, "before"),
@@ -59,8 +59,8 @@ POINTS = {
     "in the middle, before a link": ("commit", "link", 5, "before"),
     "in the middle, after a link": ("commit", "link", 5, "after"),
     "after all files, before the folders are synced": ("commit", "fsync", 1, "before"),
-    "before the marker": ("commit", "link", 12, "before"),
-    "after the marker": ("commit", "link", 12, "after"),
+    "before the marker": ("commit", "link", 24, "before"),
+    "after the marker": ("commit", "link", 24, "after"),
     "while the base is written": ("base", "fsync", 3, "before"),
     "before the base gets its name": ("base", "rename", 1, "before"),
     "after the base has got its name": ("base", "rename", 1, "after"),
@@ -70,9 +70,9 @@ POINTS = {
 NAMED = {
     "in the middle, before a link": 4,
     "in the middle, after a link": 5,
-    "after all files, before the folders are synced": 11,
-    "before the marker": 11,
-    "after the marker": 11,
+    "after all files, before the folders are synced": 23,
+    "before the marker": 23,
+    "after the marker": 23,
 }
 """Files of the job that have their names by then; at all other points none has."""
 

@@ -19,10 +19,10 @@ from hypothesis.stateful import invariant, precondition, rule, run_state_machine
 from store_machine import SPECS, WritingMachine, any_index, processes, scene_numbers
 from store_model import Reader, Writer, compare
 
-from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError
+from photonfarm.shared.core.errors import CorruptError, StoreError
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.write.guides import beside
+from photonfarm.shared.store.format.schema import output_arrays
 
 EXAMPLES = int(os.environ.get("PHOTONFARM_MODEL_EXAMPLES", "0"))
 STEPS = int(os.environ.get("PHOTONFARM_MODEL_STEPS", "30"))
@@ -34,35 +34,22 @@ class StoreMachine(WritingMachine):
     def __init__(self, root: Path) -> None:
         super().__init__(root)
         self.readers: list[Reader] = []
-        self.watchers = [(n, g, SceneReader(root, SPECS[n].scene_id, guides=g)) for n in (0, 1) for g in (False, True)]
+        self.watchers = [SceneReader(root, spec.scene_id) for spec in SPECS]
         self.quarantined: dict[str, bytes] = {}
         self.steps = 0
 
     # ---------------------------------------------------------------------------------------------------------- reading
 
     @precondition(lambda self: len(self.readers) < 3)
-    @rule(number=scene_numbers, guides=st.booleans())
-    def open_reader(self, number: int, guides: bool = False) -> None:
-        self.readers.append(Reader(number, SceneReader(self.root, SPECS[number].scene_id, guides=guides), guides))
-
-    @precondition(lambda self: self.readers)
-    @rule(which=any_index)
-    def follow_guides(self, which: int) -> None:
-        """A reader follows guides from now on, if its scene is to have some."""
-        following = self.readers[which % len(self.readers)]
-        if self.models[following.number].wanted is None:
-            with pytest.raises(SpecError):
-                following.reader.follow_guides()
-            return
-        following.reader.follow_guides()
-        if not following.guides:
-            following.guides, following.seen = True, set()
+    @rule(number=scene_numbers)
+    def open_reader(self, number: int) -> None:
+        self.readers.append(Reader(number, SceneReader(self.root, SPECS[number].scene_id)))
 
     @precondition(lambda self: self.readers)
     @rule(which=any_index)
     def refresh(self, which: int) -> None:
         following = self.readers[which % len(self.readers)]
-        complete = set(self.models[following.number].complete(following.guides))
+        complete = set(self.models[following.number].complete())
         new = set(following.reader.refresh().tolist())
         assert new == complete - following.seen
         assert set(following.reader.taken_back.tolist()) == following.seen - complete
@@ -92,7 +79,7 @@ class StoreMachine(WritingMachine):
         model = self.models[following.number]
         sample = next(s for s in model.planned.values() if s.row == row)
         try:
-            compare(following.reader, row, model, guides=following.guides)
+            compare(following.reader, row, model)
         except CorruptError:
             assert model.jobs_of(sample) & following.disturbed, "what nobody has touched reads whole"
 
@@ -101,37 +88,29 @@ class StoreMachine(WritingMachine):
     @precondition(lambda self: any(model.committed for model in self.models))
     @rule(
         number=scene_numbers, process=processes, which=any_index, file=any_index, at=st.floats(0, 1),
-        guides=st.booleans(),
         harm=st.sampled_from(["flip", "flip", "cut", "cut", "delete", "cut marker", "delete marker"]),
     )  # fmt: skip
-    def damage_and_repair(
-        self, number: int, process: int, which: int, file: int, at: float, harm: str, guides: bool = False
-    ) -> None:
-        """One file of a committed job; the repair takes back this job alone, and loses nothing that is left.
-
-        Of a job's guides it leaves the samples where they are, and the other way round.
-        """
+    def damage_and_repair(self, number: int, process: int, which: int, file: int, at: float, harm: str) -> None:
+        """One file of a committed job; the repair takes back this job alone, and loses nothing that is left."""
         model = self.models[number]
-        done = model.done(guides := guides and bool(model.guided))
-        if not done:
+        if not model.committed:
             return
         scene = self.scene(number, process)
-        part, called = (scene.guides, "guides of job") if guides else (scene, "job")
-        job = sorted(done)[which % len(done)]
-        marker = f"{part.name}/committed/{job:012d}.json"
-        files = sorted(f"{part.name}/{name}" for name in part.marker(job)["files"])
+        job = sorted(model.committed)[which % len(model.committed)]
+        marker = f"{scene.name}/committed/{job:012d}.json"
+        files = sorted(f"{scene.name}/{name}" for name in scene.marker(job)["files"])
         _harm(self.root / (marker if "marker" in harm else files[file % len(files)]), harm.split()[0], at)
         self._disturb(number, job)
-        fresh = Reader(number, SceneReader(self.root, SPECS[number].scene_id, guides=guides), guides, disturbed={job})
+        fresh = Reader(number, SceneReader(self.root, SPECS[number].scene_id), disturbed={job})
         for row in fresh.reader.refresh().tolist():
             self._read(fresh, row)
 
         left = {name: (self.root / name).read_bytes() for name in [marker, *files] if (self.root / name).exists()}
         report = check_store(self.stores[process], when="now", repair=True)
-        done.discard(job)
+        model.committed.discard(job)
         aside = {each.scene_id: each.set_aside for each in report.scenes}
         without_marker = harm == "delete marker"  # nobody knows that it was there
-        assert aside.pop(model.spec.scene_id) == (() if without_marker else (f"{called} {job}",))
+        assert aside.pop(model.spec.scene_id) == (() if without_marker else (f"job {job}",))
         assert set(aside.values()) <= {()}
         assert report.exit_code == (0 if without_marker else 7)
         moved = {name: content for name, content in left.items() if not (self.root / name).exists()}
@@ -152,10 +131,9 @@ class StoreMachine(WritingMachine):
         left = [
             path
             for plan in scene.plans()
-            for guides, folder in ((False, plan.folder), (True, beside(plan, scene.guides.name).folder))
-            for path in sorted((self.root / folder).glob("*/c.*"))
-            if guides or path.parent.name in WRITTEN
-            if plan.first_job + int(path.name.split(".")[1]) not in model.done(guides)
+            for path in sorted((self.root / plan.folder).glob("*/c.*"))
+            if path.parent.name in output_arrays(model.spec)
+            if plan.first_job + int(path.name.split(".")[1]) not in model.committed
         ]
         if left:
             path = left[which % len(left)]
@@ -179,22 +157,18 @@ class StoreMachine(WritingMachine):
         for model in self.models:
             scene = Store(self.root).scene(model.spec.scene_id)
             assert scene.committed_jobs() == model.committed
-            assert scene.guides.committed_jobs() == model.guided
-            assert scene.guides.settings() == model.wanted
             assert scene.missing_jobs() == model.missing()
-            usable = model.complete(guides=model.wanted is not None)
-            assert scene.progress().usable_samples == len(usable)
+            assert scene.progress().committed_samples == len(model.complete())
 
     def who_looks_after_each_step_sees_every_complete_sample_bit_for_bit(self) -> None:
         self.steps += 1
-        for number, guides, watcher in self.watchers:
-            model = self.models[number]
-            complete = model.complete(guides)
+        for model, watcher in zip(self.models, self.watchers, strict=True):
+            complete = model.complete()
             watcher.refresh()
             assert watcher.rows.tolist() == sorted(complete)
             assert watcher.planned == len(model.planned)
             for i in range(min(2, len(complete))):
-                compare(watcher, sorted(complete)[(self.steps * 2 + i) % len(complete)], model, guides=guides)
+                compare(watcher, sorted(complete)[(self.steps * 2 + i) % len(complete)], model)
 
     def what_is_quarantined_stays(self) -> None:
         for path, content in self.quarantined.items():
@@ -210,32 +184,25 @@ class StoreMachine(WritingMachine):
             while self.writers:
                 self.give_up(0)
             for number, model in enumerate(self.models):
-                for guides in (False, True):
-                    for job in sorted(model.every(guides) - model.done(guides)):
-                        self.writers.append(Writer(number, self.scene(number, 0), job, guides))
-                        self.commit(0)
-                guides = model.wanted is not None
-                reader = SceneReader(self.root, model.spec.scene_id, guides=guides)
+                for job in model.missing():
+                    self.writers.append(Writer(number, self.scene(number, 0), job))
+                    self.commit(0)
+                reader = SceneReader(self.root, model.spec.scene_id)
                 assert len(reader.refresh()) == len(model.planned)
                 rows = reader.rows.tolist()
-                assert {compare(reader, row, model, guides=guides) for row in rows} == model.planned.keys()
+                assert {compare(reader, row, model) for row in rows} == model.planned.keys()
             for following in self.readers:
                 self.refresh(self.readers.index(following))
                 for row in sorted(following.seen):
                     self._read(following, row)
             report = check_store(Store(self.root), when="now")
             assert report.exit_code == 0
-            assert self.stores[0].sweep(stray_age_s=0) <= 14 * len(self.dead)  # 12 guides, their folder and marker
+            assert self.stores[0].sweep(stray_age_s=0) <= 25 * len(self.dead)  # 24 arrays and the marker
             assert self._parts() == set()
         finally:
             for writer in self.writers:
                 with writer.out:
                     pass
-
-
-WRITTEN = {"radiance", "radiance_wide", "depth", "albedo", "normal"} | {
-    f"photon_{name}" for name in ("position", "direction", "normal", "power", "bounce")
-}
 
 
 def _harm(path: Path, harm: str, at: float) -> None:
@@ -252,22 +219,20 @@ def _harm(path: Path, harm: str, at: float) -> None:
             file.write(bytes([content[place] ^ 1 << place % 8]))
 
 
-@pytest.mark.parametrize("guides", [False, True], ids=["samples", "guides"])
 def test_a_reader_that_did_not_look_while_a_job_was_repaired_and_rendered_again_reads_what_is_there_now(
-    tmp_path: Path, guides: bool
+    tmp_path: Path,
 ) -> None:
     """The committed jobs are the same as before, and the shard that it has kept open is the damaged one."""
     machine = StoreMachine(tmp_path / "store")
     machine.plan(number=0, process=0, sizes=(2, 1, 1), seed=0)
     machine.render(number=0, process=0, which=0)
-    machine.open_reader(number=0, guides=guides)
+    machine.open_reader(number=0)
     machine.refresh(which=0)
     rows = len(machine.readers[0].seen)
     for row in range(rows):
         machine.read(which=0, row=row)
-    part = machine.scene(0, 0).guides if guides else machine.scene(0, 0)
-    for file in range(len(part.marker(0)["files"])):
-        machine.damage_and_repair(number=0, process=0, which=0, file=file, at=0.3, harm="flip", guides=guides)
+    for file in range(len(machine.scene(0, 0).marker(0)["files"])):
+        machine.damage_and_repair(number=0, process=0, which=0, file=file, at=0.3, harm="flip")
         machine.render(number=0, process=0, which=0)
         machine.refresh(which=0)
         for row in range(rows):

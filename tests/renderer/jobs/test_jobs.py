@@ -51,6 +51,10 @@ def recorded(analytic: ModuleType) -> type:
             self.calls.append(("buffers", view.vector.tobytes()))
             return super().buffers(view)
 
+        def guides(self, view: Any, key: Any, *how: Any) -> Any:
+            self.calls.append(("guides", key))
+            return super().guides(view, key, *how)
+
         def photons(self, seed: int) -> Any:
             self.calls.append(("photons", seed))
             return super().photons(seed)
@@ -82,11 +86,14 @@ def test_each_modification_is_applied_once_a_job_and_each_view_seen_once_in_all(
     render_all(scene, store, recorded)
     assert len(asked(recorded, "apply")) == 3
     assert len(asked(recorded, "buffers")) == len(set(asked(recorded, "buffers"))) == 6
+    reader = SceneReader(store.root, scene.scene_id)
+    keys = reader.view_keys(reader.refresh().tolist())
+    assert sorted(asked(recorded, "guides")) == sorted(set(keys)), "their noise follows from the keys of their views"
     assert len(asked(recorded, "photons")) == 3
     assert recorded.loads == 1
 
 
-def test_passes_added_later_render_neither_buffers_nor_photons_again(
+def test_passes_added_later_render_neither_buffers_nor_guides_nor_photons_again(
     scene: SceneStore, store: Store, recorded: type
 ) -> None:
     render_all(scene, store, recorded)
@@ -94,7 +101,7 @@ def test_passes_added_later_render_neither_buffers_nor_photons_again(
     recorded.calls.clear()
     render_all(scene, store, recorded)
     assert len(asked(recorded, "half")) == 12
-    assert asked(recorded, "buffers") == asked(recorded, "photons") == []
+    assert asked(recorded, "buffers") == asked(recorded, "guides") == asked(recorded, "photons") == []
 
 
 @pytest.mark.parametrize("shard_rows", [1, 3])
@@ -220,19 +227,21 @@ def test_after_three_renders_that_are_not_finite_the_job_fails_and_nothing_is_st
     assert scene.missing_jobs() == [0, 1]
 
 
-def test_buffers_that_are_not_finite_fail_the_job_and_name_view_and_sample(
-    scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("what", "name"), [("buffers", "normal"), ("guides", "direct")])
+def test_buffers_and_guides_that_are_not_finite_fail_the_job_and_name_view_and_sample(
+    scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch, what: str, name: str
 ) -> None:
-    plain = recorded.buffers
+    plain = getattr(recorded, what)
 
-    def broken(self: Any, view: Any) -> Any:
-        buffers = plain(self, view)
-        buffers.normal[0, 0, 0] = np.nan
-        return buffers
+    def broken(*how: Any) -> Any:
+        made = plain(*how)
+        getattr(made, name)[0, 0, 0] = np.nan
+        return made
 
-    monkeypatch.setattr(recorded, "buffers", broken)
-    with pytest.raises(IncompleteError, match="normal of view 0"):
+    monkeypatch.setattr(recorded, what, broken)
+    with pytest.raises(IncompleteError, match=f"{name} of view 0 .sample "):
         render_all(scene, store, recorded)
+    assert scene.missing_jobs() == [0, 1]
 
 
 def test_a_committed_job_is_not_rendered_again(scene: SceneStore, store: Store, recorded: type) -> None:

@@ -16,7 +16,7 @@ from photonfarm.shared.core.records import Guides, arrays_of
 from photonfarm.shared.scene.modification import rest
 from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.write.guides import NOISY
+from photonfarm.shared.store.write.rounding import NOISY_GUIDES
 
 backend.load(threads=1)
 
@@ -45,7 +45,7 @@ def bytes_of(found: Guides) -> dict[str, bytes]:
 
 def test_another_key_gives_other_noise_and_the_same_of_all_else(room: LoadedScene, somewhere: View, lit: Lit) -> None:
     one, other = (bytes_of(room.guides(somewhere, make_key("view", i), GuideSpec(), lit)) for i in (1, 2))
-    assert {name for name in one if one[name] != other[name]} == set(NOISY)
+    assert {name for name in one if one[name] != other[name]} == set(NOISY_GUIDES)
     assert set(one) == {field.name for field in fields(Guides)}
 
 
@@ -82,14 +82,14 @@ def of_many_views(room: LoadedScene, somewhere: View) -> Callable[[str], tuple[I
     position, normal = lit_points(room.base()[1], modification)
     lit = position[:64], normal[:64]
     of_modification = modification.key(room.spec.radiance_id)
-    noisy: dict[str, list[Images]] = {name: [] for name in NOISY}
+    noisy: dict[str, list[Images]] = {name: [] for name in NOISY_GUIDES}
     halves = []
     for number in range(48):
         vector = somewhere.vector + np.float32(number)
         found = room.guides(somewhere, view_key(of_modification, vector), GuideSpec(light_samples=1), lit)
         for name, values in noisy.items():
             values.append(getattr(found, name).astype(np.float64))
-        sample = make_key("sample", room.spec.scene_id, modification.vector, vector, 0)
+        sample = make_key("sample", room.spec.radiance_id, modification.vector, vector, 0)
         halves.append(room.render_halves(somewhere, [seed_of(sample, f"half {half}") for half in "AB"]))
     a, b = np.stack(halves).astype(np.float64).swapaxes(0, 1)
     return lambda name: (np.stack(noisy[name]), a, b)

@@ -20,10 +20,9 @@ from photonfarm.shared.farm.dry_run import DryRun, costs_by_renderer, rehearse
 from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
 from photonfarm.shared.plan.request import Extent, Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
 from photonfarm.shared.store import Store
-from photonfarm.shared.store.format.schema import bytes_of_rows, most_guide_bytes
+from photonfarm.shared.store.format.schema import bytes_of_rows
 
 COSTS = SampleCosts("0" * 32, 0.5, 0.25, 0.125, 0.0625, 1000.0 * KAPPA)  # so noisy that 8 spp are too few
 STATIC_NOISE = 50**2 * KAPPA * 0.0625 / 0.375  # for which 50 spp are best
@@ -84,7 +83,7 @@ def test_the_size_counts_each_view_and_each_configuration_once() -> None:
 
 def test_a_request_for_no_store_and_for_an_empty_one_is_counted_alike_and_makes_none(tmp_path: Path) -> None:
     for store in (tmp_path / "none", Store(tmp_path / "empty", create=True).root):
-        found = rehearsed(tmp_path, Path(store), measure=False, passes=3)
+        found = rehearsed(tmp_path, Path(store), measure=False, passes=3, spec=spec_file(tmp_path, **samples.ALWAYS))
         assert (found.planned, found.planned_before, found.dry_run) == (36, 0, True)
         of = bytes_of_rows(samples.small_spec())
         assert found.size_bytes == sum(
@@ -110,10 +109,8 @@ def test_of_a_grown_request_only_what_is_new_counts(
 ) -> None:
     asked = verb()
     store = Store(tmp_path / "store", create=True)
-    always = {**samples.small_spec().objects[0].model_dump(), "removal_probability": 0.0}  # no two are equal
-    spec = spec_file(tmp_path, objects=[always])
+    spec = spec_file(tmp_path, **samples.ALWAYS)
     request = {"modifications": 6, "views_per_modification": 2}
-    store.add(load_spec(spec)).guides.ask(GuideSpec())
     store.plan(load_spec(spec), dry_run.Request(**request))
     found = rehearsed(tmp_path, Path(store.root), spec=spec, **grown)
     assert (found.planned, found.extent) == (samples_, extent)
@@ -122,31 +119,6 @@ def test_of_a_grown_request_only_what_is_new_counts(
         core_s = 0.5 * extent.configurations + 0.25 * extent.views + samples_ * (0.125 + 8 * 0.0625)
         assert found.core_s == pytest.approx(core_s)
     assert (found.suggestion, found.reduction) == (None, None)  # it would render again what is planned
-
-
-def test_guides_that_views_of_older_plans_would_get_are_counted_and_paid_for(tmp_path: Path, verb: Verb) -> None:
-    verb(replace(COSTS, guides_s=0.2).json())
-    store, spec = Store(tmp_path / "store", create=True), spec_file(tmp_path)
-    request = {"modifications": 6, "views_per_modification": 2}
-    scene = store.scene(store.plan(load_spec(spec), Request(**request), shard_rows=4).scene_id)
-    found = rehearsed(tmp_path, Path(store.root), spec=spec)
-    assert (found.planned, found.planned_before, found.guide_views) == (0, 12, 12)
-    assert found.size_bytes == most_guide_bytes(scene.spec, 12, 3, 4)
-    assert found.core_s == pytest.approx(12 * 0.2)
-    lines = run(spec, Path(store.root)).stdout.splitlines()
-    assert lines[1] == "guides of 12 views that are planned would be asked for too"
-    assert lines[2].endswith("2.4 core-seconds: 0.6 s on the 4 cores here")
-    assert len(lines) == 3
-    assert scene.guides.settings() is None
-    scene.guides.ask(scene.spec.guides)
-    assert rehearsed(tmp_path, Path(store.root), spec=spec).guide_views == 0
-
-
-def test_guides_with_other_settings_are_refused_as_submit_refuses_them(tmp_path: Path, verb: Verb) -> None:
-    store, spec = Store(tmp_path / "store", create=True), spec_file(tmp_path)
-    store.add(load_spec(spec)).guides.ask(GuideSpec(light_samples=9))
-    with pytest.raises(SpecError, match="light_samples"):
-        rehearsed(tmp_path, Path(store.root), spec=spec)
 
 
 def test_equal_configurations_are_counted_once(tmp_path: Path) -> None:
@@ -214,12 +186,12 @@ def test_of_a_static_scene_only_samples_per_pixel_are_suggested_and_its_configur
 
 def test_without_the_renderer_the_size_is_said_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dry_run, "is_installed", lambda _: False)
-    result = run(spec_file(tmp_path), tmp_path / "none")
+    result = run(spec_file(tmp_path), tmp_path / "none", "--modifications", "1", "--views", "12")
     assert result.exit_code == 0
     assert "12 samples would be planned, 0 are already\nat most 0.1 MB before compression\n" in result.stdout
     reason = "the renderer, which measures them, is not installed here"
     warning, told = result.stderr.splitlines()
-    assert warning.startswith("warning: `photonfarm train` will refuse this: ")  # none of six is held out
+    assert warning.startswith("warning: `photonfarm train` will refuse this: ")
     assert told == f"cost and time are not known: {reason}"
 
 
@@ -287,7 +259,6 @@ def test_of_a_static_scene_the_command_speaks_of_samples_alone(tmp_path: Path, v
 def test_where_samples_are_planned_the_command_says_why_it_suggests_nothing(tmp_path: Path, verb: Verb) -> None:
     verb()
     spec, store = spec_file(tmp_path), Store(tmp_path / "store", create=True)
-    store.add(load_spec(spec)).guides.ask(GuideSpec())
     store.plan(load_spec(spec), dry_run.Request(modifications=1, views_per_modification=2))
     lines = run(spec, Path(store.root)).stdout.splitlines()
     assert lines[2] == "no suggestion: another half_spp would render the 2 planned samples again"

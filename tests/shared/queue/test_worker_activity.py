@@ -27,9 +27,7 @@ def test_an_activity_is_read_as_it_was_reported_and_is_gone_once_cleared(connect
     assert queue.queue_status(connection).activities == {}
 
 
-@pytest.mark.parametrize(
-    "value", ["", "1 2", "-1 2 3 - x", "1 2 9999999 - x", "\u0661 2 3 - x", "one two three - x", b"\xff\xfe"]
-)
+@pytest.mark.parametrize("value", ["", "1 2", "-1 2 - x", "1 9999999 - x", "\u0661 2 - x", "one two - x", b"\xff\xfe"])
 def test_what_strangers_write_as_an_activity_is_left_out(connection: Redis, value: str) -> None:
     connection.set(DOING + "eve", value)
     assert queue.queue_status(connection).activities == {}
@@ -37,7 +35,7 @@ def test_what_strangers_write_as_an_activity_is_left_out(connection: Redis, valu
 
 @pytest.mark.parametrize("job", ["../../etc", f"{'ab' * 16}-007", f"{'ab' * 16}-{1 << 48}"])
 def test_a_strangers_activity_is_short_and_printable_and_of_no_job(connection: Redis, job: str) -> None:
-    connection.set(DOING + "eve\x1b[2J", f"1 2 3 {job} \x1b[31m{'x' * 10_000}")
+    connection.set(DOING + "eve\x1b[2J", f"1 2 {job} \x1b[31m{'x' * 10_000}")
     ((name, found),) = queue.queue_status(connection).activities.items()
     assert name.isprintable()
     assert found.phase.isprintable()

@@ -103,16 +103,16 @@ CONTENT = {
 """Digests of the scene files that the ready specs were written for."""
 
 IDS = {
-    "bathroom": "d150ec9c97ddd333e6fcd931dd0919db",
-    "dining-room": "989c71cae04af5f37774e9455604d8cf",
-    "kitchen": "848f5c87dc14be48fdea0218bffb4edd",
-    "living-room": "1b63a2efb3796489c994418811283684",
-    "living-room-2": "475d36339b90d8fa260c313bbea7fb7b",
-    "veach-ajar": "4efcebcd82c979d7e28529bb2d1ad079",
+    "bathroom": "105f963272e420a9b8068dbf451154d2",
+    "dining-room": "73e0d5e8c5199e078e992857d082cf61",
+    "kitchen": "bd3b0fa038f7cf018a8aed65acc19adf",
+    "living-room": "9c3611a3c27bfe09f3722cf36185b091",
+    "living-room-2": "24f4d18f6197e23ecd19dad4f1b2ca37",
+    "veach-ajar": "8a12797ba443effbf9aaf06a315115ef",
 }
-"""Their scene ids before there were factors."""
+"""Their scene ids."""
 
-BUILT_IN = {"room": "0802f8263cca1a560f1098864b9657ea", "cornell": "4009a6479cdda83c3f21bbcf7a31eef5"}
+BUILT_IN = {"room": "1b5675205d490b4b58919c4eb7bf0f9f", "cornell": "bba6e67c9335e9210548ba4128e4d470"}
 
 
 @pytest.mark.parametrize("name", IDS)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonfarm.shared.core.errors import SpecError, StoreError
-from photonfarm.shared.core.records import Photons
+from photonfarm.shared.core.records import Guides, Photons, arrays_of
 from photonfarm.shared.farm.configuration import named_configuration
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.frames import Frames
@@ -24,7 +24,9 @@ def made(*, photons: bool) -> Frames:
     images = [rng.random((2, 4, 6, *more), np.float32) for more in ((), (3,), (3,))]
     moved = Modification(rng.random((3, 3), np.float32), np.array([True, False, True]))
     seen = [rng.random((2, count)) < 0.5 for count in (7, 5 if photons else 0)]
-    return Frames("abc", moved, tuple(View(*rng.random((2, 3), np.float32)) for _ in range(2)), *images, *seen, traced)
+    views = tuple(View(*rng.random((2, 3), np.float32)) for _ in range(2))
+    guides = Guides(*rng.random((len(fields(Guides)), 2, 4, 6), np.float32))
+    return Frames("abc", moved, views, *images, *seen, traced, guides)
 
 
 @pytest.mark.parametrize("photons", [True, False])
@@ -43,6 +45,9 @@ def test_frames_come_back_as_they_were_written(tmp_path: Path, photons: bool) ->
     for name, seen in (("points", frames.point_seen), ("photons", frames.photon_seen)):
         np.testing.assert_array_equal(getattr(again.visibility(1), name), seen[1])
         assert getattr(again.visibility(1), name).dtype == np.bool_
+    for name, values in arrays_of(frames.guides).items():
+        np.testing.assert_array_equal(getattr(again.guides, name), values)
+        np.testing.assert_array_equal(getattr(again.guides_of(1), name), values[1])
     assert (again.photons is None) == (not photons)
     for field in fields(Photons) if photons else ():
         np.testing.assert_array_equal(getattr(again.photons, field.name), getattr(frames.photons, field.name))

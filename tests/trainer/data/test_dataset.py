@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from analytic_room_samples import known
 
 from photonfarm.shared.core.errors import CorruptError
-from photonfarm.shared.core.records import ViewBuffers, Visibility
+from photonfarm.shared.core.records import LIT_POINTS, ViewBuffers, Visibility
 from photonfarm.shared.plan.hold_out import are_held_out, rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.view import Camera
@@ -85,11 +86,12 @@ def test_a_batch_holds_what_was_committed_exactly_also_where_float16_cannot(scen
     bright = np.zeros((2, 16, 16, 3), np.float32)
     bright[1, 3, 4] = brightest
     buffers = ViewBuffers(*(np.full((16, 16, *more), 0.25, np.float32) for more in ((), (3,), (3,))))
+    guides = known(bright[0], buffers, min(LIT_POINTS, scene.spec.points))
     seen = np.random.default_rng(0).random(256) < 0.5
     with scene.job_writer(0) as out:
         for sample in rows.samples:
             out.radiance(sample.row, bright if sample.row == 1 else 0 * bright + 0.5)
-            out.view(sample.view_row, buffers, Visibility(seen, np.zeros(0, bool)))
+            out.view(sample.view_row, buffers, guides, Visibility(seen, np.zeros(0, bool)))
         out.commit(Figures(core_s=1, wall_s=1, redrawn=0, worker="test", versions={"test": "1"}))
     with Feed(StoreSource(scene.storage.root, scene.scene_id), tiny()) as feed:
         feed.ask([1, 0])

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic_room import analytic_base, analytic_spec, render, visibility
-from analytic_room_samples import commit_job
+from analytic_room_samples import commit_job, known
 from click.testing import CliRunner
 from PIL import Image
 
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError
 from photonfarm.shared.core.pictures import display
+from photonfarm.shared.core.records import LIT_POINTS, Guides, arrays_of
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.camera_path import orbit
@@ -60,12 +61,15 @@ def frames(scene: SceneStore):
     """Function (configuration, views, photons) → what the renderer would write."""
 
     def make(modification: Modification, views: list[View], photons=None) -> Frames:
-        buffers = [render(scene.spec, modification, view)[1] for view in views]
+        rendered = [render(scene.spec, modification, view) for view in views]
+        buffers = [each for _, each in rendered]
+        guides = [arrays_of(known(clean, each, min(LIT_POINTS, scene.spec.points))) for clean, each in rendered]
+        stacked = Guides(**{name: np.stack([each[name] for each in guides]) for name in guides[0]})
         images = (np.stack([getattr(b, name) for b in buffers]) for name in ("depth", "albedo", "normal"))
         told = scene.base()[1], modification
         seen = [visibility(scene.spec, *told, view, photons) for view in views]
         flags = (np.stack([getattr(each, name) for each in seen]) for name in ("points", "photons"))
-        return Frames(scene.scene_id, modification, tuple(views), *images, *flags, photons)
+        return Frames(scene.scene_id, modification, tuple(views), *images, *flags, photons, stacked)
 
     return make
 
@@ -83,11 +87,11 @@ def decoded(file: Path, width: int, height: int) -> np.ndarray:
     return np.frombuffer(raw, np.uint8).reshape(-1, height, width, 3)
 
 
-@pytest.mark.parametrize("architecture", ["light_transport_photons", "cnn"])
+@pytest.mark.parametrize(("architecture", "steps"), [("light_transport_photons", 1), ("cnn", 1), ("guided", 4)])
 def test_a_frame_of_a_path_is_the_image_of_the_stored_sample_of_the_same_view(
-    store: Path, scene: SceneStore, trained, frames, tmp_path: Path, architecture: str
+    store: Path, scene: SceneStore, trained, frames, tmp_path: Path, architecture: str, steps: int
 ) -> None:
-    """The store's buffers are rounded, so that a grey may differ by one step."""
+    """The store's buffers are rounded, so that a grey may differ by a step, and guides more."""
     reader = SceneReader(store, scene.scene_id)
     reader.refresh()
     run, sample = trained(architecture), reader.read(5)
@@ -97,7 +101,7 @@ def test_a_frame_of_a_path_is_the_image_of_the_stored_sample_of_the_same_view(
     infer.show_frames(store, run, path, tmp_path / "path")
     shown, wanted = (pixels(tmp_path / name) for name in ("path/frame-0001.png", "sample/prediction.png"))
     assert shown.shape == (256, 256, 3)
-    assert np.abs(shown.astype(int) - wanted).max() <= 1
+    assert np.abs(shown.astype(int) - wanted).max() <= steps
     assert np.abs(pixels(tmp_path / "path/frame-0000.png").astype(int) - wanted).max() > 10
 
 

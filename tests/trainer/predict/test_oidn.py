@@ -27,7 +27,8 @@ def test_it_is_measured_on_a_store_like_any_predictor_and_better_than_what_it_is
     make_source, tiny, oidn: Oidn, of: int
 ) -> None:
     """Its measured error against the one that the clean images give, within 3 σ of the pairs' differences."""
-    source = make_source(24, size=32, noise=0.5)
+    count = 96
+    source = make_source(count, size=32, noise=1.0)
     given_images = {}
     with Feed(source, tiny(), needs=Needs(points=False, kept=of)) as feed:
 
@@ -39,11 +40,11 @@ def test_it_is_measured_on_a_store_like_any_predictor_and_better_than_what_it_is
             given_images.update(zip(batch.rows, images, strict=True))
             return images
 
-        before, after = (measure(p, batches(feed, range(24), 3)) for p in (filled, remembered))
+        before, after = (measure(p, batches(feed, range(count), 3)) for p in (filled, remembered))
     assert after.error.mean < 0.7 * before.error.mean if of == 1 else after.error.mean < before.error.mean
-    truth = np.array([np.mean((given_images[row] - source.clean(row)) ** 2) for row in range(24)])
+    truth = np.array([np.mean((given_images[row] - source.clean(row)) ** 2) for row in range(count)])
     difference = after.per_sample - truth
-    assert abs(difference.mean()) < 3 * difference.std(ddof=1) / np.sqrt(24)
+    assert abs(difference.mean()) < 3 * difference.std(ddof=1) / np.sqrt(count)
 
 
 def test_bright_light_stays_as_bright_as_it_is(oidn: Oidn) -> None:

@@ -15,8 +15,9 @@ from PIL import Image
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.pictures import display
-from photonfarm.shared.plan.hold_out import rows_held_out
+from photonfarm.shared.plan.hold_out import are_held_out, rows_held_out
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.store import SceneReader, SceneStore
 from photonfarm.shared.store.read.merge import MergedView, merge_view
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
@@ -311,7 +312,10 @@ def test_what_cannot_be_compared_is_refused(
 
 def test_a_store_with_nothing_held_out_says_so(scene: SceneStore, commit, make_source, tiny, tmp_path: Path) -> None:
     train(make_source(24), tiny(max_steps=1), tmp_path / "run")
-    scene.plan(Request(modifications=1), shard_rows=8)
+    spec = scene.spec
+    keys = {seed: sample_modification(spec, seed, 0).key(spec.scene_id) for seed in range(32)}
+    seed = next(seed for seed, key in keys.items() if are_held_out([key], tiny().hold_out) == [False])
+    scene.plan(Request(modifications=1, seed=seed), shard_rows=8)
     commit(scene, 0)
     with pytest.raises(IncompleteError, match=r"none .* held out"):
         compare(scene.folder.parent.parent, [TrainedRun.load(tmp_path / "run")])

@@ -248,7 +248,7 @@ def test_clipped_gradients_miss_the_clean_gradient(rendered) -> None:
     """Clipped at the clean gradient's own norm, which would never touch it."""
     clean = gradients(rendered, LOSSES["linear"], rendered.converged)
     norm = math.sqrt(sum(float(g.square().sum()) for g in clean.mean))
-    noisy = gradients(rendered, LOSSES["linear"], rendered.noisy[: K // 2], clip=norm)
+    noisy = gradients(rendered, LOSSES["linear"], rendered.noisy, clip=norm)
     each, together = deviations(noisy, clean)
     assert together > 5
-    assert np.mean(np.array(each) > 3) > 0.8
+    assert np.mean(np.array(each) > 3) > 0.5

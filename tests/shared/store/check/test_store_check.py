@@ -50,7 +50,7 @@ def test_a_check_changes_nothing(store: Store, scene: SceneStore) -> None:
 # ------------------------------------------------------------------------------------------------------------ damage
 
 
-@pytest.mark.parametrize("name", ["radiance", "radiance_wide", "normal", "photon_bounce"])
+@pytest.mark.parametrize("name", ["radiance", "radiance_wide", "normal", "direct", "photon_bounce"])
 def test_a_flipped_bit_anywhere_in_a_shard_is_found_and_named(store: Store, scene: SceneStore, name: str) -> None:
     path = shard(scene, name, 1)
     whole = path.read_bytes()
@@ -132,9 +132,10 @@ def test_a_value_that_is_not_finite_is_found(store: Store, scene: SceneStore, mo
         given.radiance[1][1, 2, 3, 0] = np.nan
         given.radiance[2][0, 0, 0, 0] = np.inf
         given.buffers[3].depth[0, 0] = -np.inf
+        given.guides[3].mean_normal[0, 0, 0] = np.nan
 
     recommitted(scene, 0, poison)
-    assert found(checked(store)) == {"not-finite": 3}
+    assert found(checked(store)) == {"not-finite": 4}
 
 
 def test_rows_that_are_missing_or_that_the_plan_does_not_use_are_found(
@@ -151,7 +152,7 @@ def test_rows_that_are_missing_or_that_the_plan_does_not_use_are_found(
         del given.buffers[8]
 
     recommitted(scene, 2, misplace)
-    assert found(checked(store)) == {"unused-row": 1, "missing-row": 1 + 5}
+    assert found(checked(store)) == {"unused-row": 1, "missing-row": 1 + 17}
 
 
 def test_a_bad_sector_is_a_finding_like_others_and_its_job_is_set_aside(

@@ -120,9 +120,9 @@ def test_a_marker_that_a_worker_places_in_the_middle_of_a_repair_is_set_aside_wi
     assert found(checked(store)) == {}
 
 
-# A repair of this job places two records by a link each, and renames the marker and nine files.
+# A repair of this job places two records by a link each, and renames the marker and 23 files.
 POINTS = [("link", 1, "before"), ("link", 2, "before"), ("link", 2, "after"), ("fsync", 3, "before")]
-POINTS += [("rename", n, when) for n in (1, 2, 5, 10) for when in ("before", "after")]
+POINTS += [("rename", n, when) for n in (1, 2, 12, 24) for when in ("before", "after")]
 
 
 def killed(function: str, count: int, when: str, work: Callable[[], object]) -> None:

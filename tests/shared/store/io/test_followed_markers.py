@@ -11,7 +11,6 @@ import s3_server
 import store_samples as samples
 from obstore.store import from_url
 
-from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.format.followed_markers import WHOLE_S, FollowedMarkers
 from photonfarm.shared.store.io.local import LocalStorage
@@ -95,23 +94,6 @@ def test_a_scene_can_be_asked_often_what_is_missing_and_how_far_it_is(url: str) 
         assert scene.progress(followed=True) == scene.progress()
     remove(url, 1, scene.name)
     assert (scene.missing_jobs(followed=True), scene.missing_jobs()) == ([], [1])
-
-
-def test_missing_guides_are_followed_too(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their markers are as many as those of samples; all are listed once, and then what is new."""
-    scene = bucket_samples.planned(url, modifications=4)
-    scene.guides.want(GuideSpec())
-    for job in (0, 1):
-        samples.commit(scene, job, samples.outputs(scene, job))
-    listed, plain = [], markers.jobs
-    monkeypatch.setattr(markers, "jobs", lambda storage, name: listed.append(name) or plain(storage, name))
-    samples.commit_guides(scene, 0)
-    assert scene.missing_jobs(followed=True) == [1]
-    assert sorted(listed) == [scene.name, scene.guides.name]
-    samples.commit_guides(scene, 1)
-    listed.clear()
-    assert scene.missing_jobs(followed=True) == []
-    assert listed == []
 
 
 def test_in_a_folder_every_look_sees_all(tmp_path: Path) -> None:

@@ -44,10 +44,13 @@ def check(batch: Batch, source: SceneReader, rows: list[int]) -> None:
     """Compare with the samples read one by one."""
     assert batch.rows.tolist() == rows
     for place, row in enumerate(rows):
-        sample = source.read(row)
+        sample = source.read(row, guides=bool(batch.guides))
         np.testing.assert_array_equal(batch.linear(place), sample.radiance)
         for name, values in arrays_of(sample.buffers).items():
             np.testing.assert_array_equal(batch.buffers[name][place], values)
+        assert set(batch.guides) == (set(arrays_of(sample.guides)) if sample.guides else set())
+        for name, values in batch.guides.items():
+            np.testing.assert_array_equal(values[place], getattr(sample.guides, name))
         for name, seen in arrays_of(sample.visibility).items():
             np.testing.assert_array_equal(getattr(batch.visibility(place), name), seen)
         assert batch.modification_rows[place] == source.modification_row(row)
@@ -55,7 +58,7 @@ def check(batch: Batch, source: SceneReader, rows: list[int]) -> None:
 
 def test_batches_in_any_order_and_with_repeats_are_the_samples_read_one_by_one(source: SceneReader) -> None:
     rng = np.random.default_rng(0)
-    memory = Batch.empty(source.spec, 6)
+    memory = Batch.empty(source.spec, 6, guides=True)
     for _ in range(20):
         rows = rng.integers(0, 8, rng.integers(1, 7)).tolist()
         check(source.read_batch(rows, memory), source, rows)
@@ -89,13 +92,15 @@ def test_a_sample_that_float16_cannot_hold_comes_in_float32_and_is_nan_for_whoev
     assert not source.read_batch([1, 2], memory).wide  # nothing is left of the batch before
 
 
-def test_what_a_batch_has_no_memory_for_is_not_read(scene: SceneStore, source: SceneReader) -> None:
-    for file in scene.folder.glob("plans/*/depth/c.*"):
+@pytest.mark.parametrize("gone", ["depth", "direct"])
+def test_what_a_batch_has_no_memory_for_is_not_read(scene: SceneStore, source: SceneReader, gone: str) -> None:
+    for file in scene.folder.glob(f"plans/*/{gone}/c.*"):
         file.unlink()
-    batch = source.read_batch([0, 1], Batch.empty(source.spec, 2, buffers=False))
-    assert batch.buffers == batch.seen == {}
+    buffers, guides = gone != "depth", gone != "direct"
+    batch = source.read_batch([0, 1], Batch.empty(source.spec, 2, buffers=buffers, guides=guides))
+    assert (bool(batch.buffers), bool(batch.seen), bool(batch.guides)) == (buffers, buffers, guides)
     with pytest.raises(CorruptError):
-        source.read_batch([0, 1], Batch.empty(source.spec, 2))
+        source.read_batch([0, 1], Batch.empty(source.spec, 2, guides=True))
 
 
 @pytest.mark.parametrize("row", [-1, 8, 10**12])

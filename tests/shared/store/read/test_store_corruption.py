@@ -24,7 +24,7 @@ def scene(tmp_path: Path) -> SceneStore:
 def read_everything(scene: SceneStore) -> None:
     reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
     for row in reader.refresh():
-        reader.read(int(row))
+        reader.read(int(row), guides=True)
         reader.read_photons(int(row))
     reader.base()
 
@@ -39,7 +39,8 @@ def shard(scene: SceneStore, name: str) -> Path:
     return path
 
 
-OUTPUTS = ("radiance", "radiance_wide", "depth", "albedo", "normal", "photon_position", "photon_power", "photon_bounce")
+OUTPUTS = ("radiance", "radiance_wide", "depth", "albedo", "normal", "direct", "point_light", "photon_position",
+           "photon_power", "photon_bounce")  # fmt: skip
 
 
 @pytest.mark.parametrize("name", OUTPUTS)

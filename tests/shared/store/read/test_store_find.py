@@ -15,12 +15,10 @@ import zarr
 from click.testing import CliRunner
 
 from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.cli.show_store import commands
 from photonfarm.shared.core.errors import SpecError, StoreError
+from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import PlannedRows, Request
-from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format.schema import guide_arrays
 from photonfarm.shared.store.read.find import Matches, Query, find_samples, scene_named
 from photonfarm.shared.store.write.plans import StoredPlan
 
@@ -127,10 +125,12 @@ def test_where_a_sample_lies_is_where_zarr_reads_it(store: Store, scene: SceneSt
     for row in (2, 5, 13):
         (found,) = find(store, row=row).samples
         places = {place.array: place for place in found.places}
-        sample = reader.read(row)
+        sample = reader.read(row, guides=True)
+        assert sample.guides is not None
         name = "radiance_wide" if row == 5 else "radiance"
         assert ({"radiance", "radiance_wide"} & places.keys()) == {name}
-        for array, values in ((name, sample.radiance), ("depth", sample.buffers.depth)):
+        known = {name: sample.radiance, "depth": sample.buffers.depth, **arrays_of(sample.guides)}
+        for array, values in known.items():
             place = places[array]
             stored = zarr.open_array(store.root / Path(place.file).parent, mode="r")
             np.testing.assert_array_equal(stored[place.index].astype(np.float32), values)
@@ -146,28 +146,6 @@ def test_a_sample_is_complete_with_the_jobs_of_its_row_view_and_modification(sto
     assert found[12].complete
     reader = SceneReader(store.root, scene.scene_id)
     assert reader.refresh().tolist() == [row for row in sorted(found) if found[row].complete]
-
-
-def test_guides_are_listed_where_the_scene_is_to_have_some(store: Store, scene: SceneStore) -> None:
-    (before,) = find(store, row=12).samples
-    assert before.guided is None
-    assert not {place.array for place in before.places} & guide_arrays(scene.spec).keys()
-    scene.guides.want(GuideSpec())
-    assert samples.commit_guides(scene, 0)
-    found = {s.row: s for s in find(store).samples}
-    assert (found[12].guided, found[4].guided) == (True, False)  # views of jobs 0 and 1
-    reader = SceneReader(store.root, scene.scene_id)
-    reader.follow_guides()
-    reader.refresh()
-    known = reader.read(12).guides
-    places = {place.array: place for place in found[12].places[len(before.places) :]}
-    assert places.keys() == guide_arrays(scene.spec).keys()
-    for name, place in places.items():
-        assert (place.there, place.file.split("/")[2]) == (True, "guides")
-        stored = zarr.open_array(store.root / Path(place.file).parent, mode="r")
-        np.testing.assert_array_equal(stored[place.index], getattr(known, name))
-    assert commands(found[12], store.root).keys() == {"look at it"}
-    assert commands(found[4], store.root).keys() == {"look at it", "render job 1"}
 
 
 def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene: SceneStore) -> None:
@@ -235,7 +213,6 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     told = run("--row", "8")
     assert told.exit_code == 0
     assert "row 8, pass 0: not complete" in told.stdout
-    assert "guides" not in told.stdout
     assert f"photonfarm work --store {store.root} --scene {scene.scene_id} --job 2" in told.stdout
     printed = json.loads(run("--job", "0", "--limit", "2", "--json").stdout)
     assert (printed["count"], [s["row"] for s in printed["samples"]]) == (4, [0, 1])
@@ -248,5 +225,3 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     assert looked.returncode == 0, looked.stderr
     assert looked.stdout.startswith("[[[[")
     assert "the nearest is" in run("--modification", "9 9 9 1").stderr
-    scene.guides.want(GuideSpec())
-    assert "guides        of job 2: missing" in run("--row", "8").stdout

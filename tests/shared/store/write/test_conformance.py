@@ -32,8 +32,8 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     """Three scenes.
 
     Of the first, two plans: jobs 0 to 2 and 3 to 5, of 8 rows each. Job 3 wants passes of views in jobs 0 to 2; job 4
-    is not committed, and job 5 has no files. Rows 20 to 23 are unused. Jobs 0 and 1 have guides. The second is static
-    (G = 0) and without photons; the third looks straight up.
+    is not committed, and job 5 has no files. Rows 20 to 23 are unused. The second is static (G = 0) and without
+    photons; the third looks straight up.
     """
     store = Store(tmp_path_factory.mktemp("conformance") / "store", create=True)
     grown(store)
@@ -58,10 +58,6 @@ def grown(store: Store) -> SceneStore:
             given.radiance[row][0, 0, 0, 0] = 1e9
         samples.commit(scene, job, given)
     (scene.folder / "committed/000000000004.json").unlink()
-    scene.guides.want(spec.guides)
-    for job in range(3):
-        samples.commit_guides(scene, job)
-    (scene.folder / "guides/committed/000000000002.json").unlink()
     return scene
 
 
@@ -82,7 +78,7 @@ def plainly(store: Store, by: str, out: Path) -> Arrays:
 def test_zarr_and_tensorstore_read_the_same_bytes_of_every_array(store: Store, read: dict[str, Arrays]) -> None:
     arrays = {path.parent for path in Path(store.root).rglob("zarr.json") if '"array"' in path.read_text()}
     assert {f"{store.root}/scenes/{name}" for name in read["zarr"] if "/samples/" not in name} == set(map(str, arrays))
-    assert len(arrays) == (6 + 12 + 6 + 12 + 10 + 12) + (6 + 6) + (6 + 12)
+    assert len(arrays) == (6 + 24 + 6 + 24 + 10) + (6 + 18) + (6 + 24)
     assert read["zarr"].keys() == read["tensorstore"].keys()
     for name, values in read["zarr"].items():
         other = read["tensorstore"][name]
@@ -101,34 +97,16 @@ def test_it_finds_the_samples_that_photonfarm_finds_and_reads_the_same(store: St
             same(reader, row, {name: read["zarr"][f"{scene.scene_id}/samples/{row}/{name}"] for name in names(scene)})
 
 
-def test_it_finds_the_guides_that_photonfarm_finds_and_reads_the_same(store: Store, read: dict[str, Arrays]) -> None:
-    found = {}
-    for scene in store.scenes():
-        begin = f"{scene.scene_id}/samples/"
-        reader = SceneReader(store.root, scene.scene_id, guides=True)
-        rows = reader.refresh().tolist()
-        names = [name for name in read["zarr"] if name.startswith(begin) and "/guides/" in name]
-        assert {int(name.split("/")[2]) for name in names} == set(rows)
-        for row in rows:
-            known = reader.read(row).guides
-            assert known is not None
-            for name, values in arrays_of(known).items():
-                np.testing.assert_array_equal(read["zarr"][f"{begin}{row}/guides/{name}"], values, err_msg=name)
-        found[scene.scene_id] = rows
-    first = samples.small_spec(exposure=4.0).scene_id
-    assert {scene_id for scene_id, rows in found.items() if rows} == {first}
-    assert 0 < len(found[first]) < 28, "some complete samples show views of job 2"
-
-
 def names(scene: SceneStore) -> list[str]:
     outputs = set(schema.output_arrays(scene.spec)) - {"radiance_wide"}
     return [*outputs, "modification", "view", "pass", "rays", "seeds"]
 
 
 def same(reader: SceneReader, row: int, plain: Arrays) -> None:
-    sample = reader.read(row)
+    sample = reader.read(row, guides=True)
+    assert sample.guides is not None
     expected = {"radiance": sample.radiance, "view": sample.view.vector, "modification": sample.modification.vector}
-    expected |= arrays_of(sample.buffers) | {"point_seen": sample.visibility.points}
+    expected |= arrays_of(sample.buffers) | arrays_of(sample.guides) | {"point_seen": sample.visibility.points}
     if reader.spec.photons.paths:
         expected |= {f"photon_{name}": values for name, values in arrays_of(reader.read_photons(row)).items()}
         expected["photon_seen"] = sample.visibility.photons
@@ -161,7 +139,7 @@ def test_the_store_has_what_is_hard_to_read(store: Store, read: dict[str, Arrays
 
 
 @pytest.mark.parametrize("by", ["zarr", "tensorstore"])
-@pytest.mark.parametrize("array", ["plans/000000/radiance", "plans/000000/sample_key", "guides/plans/000000/direct"])
+@pytest.mark.parametrize("array", ["plans/000000/radiance", "plans/000000/sample_key", "plans/000000/direct"])
 def test_a_flipped_bit_is_found_by_both(store: Store, tmp_path: Path, by: str, array: str) -> None:
     shutil.copytree(next(Path(store.root).glob(f"scenes/*/{array}")), tmp_path / array)
     file = next((tmp_path / array).glob("c.0*"))

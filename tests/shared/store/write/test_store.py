@@ -13,6 +13,7 @@ from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.records import ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
 
 scene, reader_of = samples.scene, samples.reader_of
 
@@ -24,7 +25,8 @@ def test_every_committed_sample_reads_back_as_it_was_rendered(scene: SceneStore)
     for job in range(3):
         given, rows = samples.outputs(scene, job), scene.job_rows(job)
         for s in rows.samples:
-            read = reader.read(s.row)
+            assert reader.read(s.row).guides is None, "not asked for"
+            read = reader.read(s.row, guides=True)
             np.testing.assert_array_equal(read.radiance, given.radiance[s.row])
             assert read.radiance.dtype == np.float32
             np.testing.assert_array_equal(read.modification.vector, rows.modifications[s.modification_row].vector)
@@ -32,11 +34,28 @@ def test_every_committed_sample_reads_back_as_it_was_rendered(scene: SceneStore)
             assert reader.modification_key(s.row) == read.modification.key(scene.spec.radiance_id)
             for name, array in arrays_of(given.buffers[s.view_row]).items():
                 np.testing.assert_array_equal(getattr(read.buffers, name), array)
+            for name, array in arrays_of(given.guides[s.view_row]).items():
+                expected = rounded(array) if name in NOISY_GUIDES else array
+                np.testing.assert_array_equal(getattr(read.guides, name), expected, err_msg=name)
+                assert (expected != array).any() == (name in NOISY_GUIDES)
             for name, array in arrays_of(given.visibility[s.view_row]).items():
                 np.testing.assert_array_equal(getattr(read.visibility, name), array)
-            expected = samples.photons(scene.spec, s.modification_row)
+            photons = samples.photons(scene.spec, s.modification_row)
             for name, array in arrays_of(reader.read_photons(s.row)).items():
-                np.testing.assert_array_equal(array, getattr(expected, name))
+                np.testing.assert_array_equal(array, getattr(photons, name))
+
+
+def test_noisy_guides_are_rounded_to_8_significant_bits_to_the_nearest_and_ties_to_even() -> None:
+    exact = np.array([0, 1, -1, 255, 256, 0.5**20, 2.0**127, 1.0078125], np.float32)
+    np.testing.assert_array_equal(rounded(exact), exact)
+    unit = np.float32(2.0**-7)  # between numbers of 8 bits from 1 on
+    between = np.array([1 + unit / 2, 1 + 3 * unit / 2, 1 + 0.51 * unit, 1 + 1.49 * unit], np.float32)
+    np.testing.assert_array_equal(rounded(between), np.array([1, 1 + 2 * unit, 1 + unit, 1 + unit], np.float32))
+    many = np.random.default_rng(1).gamma(0.5, 3.0, 100_000).astype(np.float32)
+    error = rounded(many) / many.astype(np.float64) - 1
+    assert np.abs(error).max() <= 2.0**-8
+    assert abs(error.mean()) < 4 * 2.0**-8 / np.sqrt(3 * len(many)), "as many up as down"
+    assert not (rounded(many).view(np.uint32) & 0xFFFF).any()
 
 
 def test_radiance_is_scaled_by_the_power_of_two_nearest_to_the_exposure(store: Store) -> None:
@@ -66,12 +85,13 @@ def test_no_value_is_clamped_and_none_becomes_infinite(scene: SceneStore, bright
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-@pytest.mark.parametrize("where", ["radiance", "depth"])
+@pytest.mark.parametrize("where", ["radiance", "depth", "direct", "roughness"])
 def test_a_value_that_is_not_finite_is_refused_and_nothing_is_committed(
     scene: SceneStore, where: str, value: float
 ) -> None:
     given = samples.outputs(scene, 0)
-    target = given.radiance[1] if where == "radiance" else given.buffers[1].depth
+    rendered = arrays_of(given.buffers[1]) | arrays_of(given.guides[1]) | {"radiance": given.radiance[1]}
+    target = rendered[where]
     target.flat[5] = value
     with pytest.raises(IncompleteError, match=f"{where}.* of row 1"):
         samples.commit(scene, 0, given)
@@ -82,10 +102,12 @@ def test_outputs_that_are_not_exactly_the_jobs_are_refused(scene: SceneStore) ->
     given = samples.outputs(scene, 0)
     lacking = {row: halves for row, halves in given.radiance.items() if row != 3}
     wrong = {**given.buffers, 0: ViewBuffers(*(np.zeros((4, 4), np.float32),) * 3)}
+    wide = samples.small_spec(film={"width": 16, "height": 8})
     fewer = {**given.visibility, 0: replace(given.visibility[0], points=np.ones(15, np.bool_))}
     for named, changes in {
         "radiance": {"radiance": lacking},
         "depth": {"buffers": wrong},
+        "emission": {"guides": {**given.guides, 0: samples.guides(wide, 0)}},
         "point_seen": {"visibility": fewer},
     }.items():
         with pytest.raises(IncompleteError, match=named):
@@ -171,7 +193,7 @@ def test_a_marker_tells_the_files_and_the_figures(scene: SceneStore) -> None:
     for name, about in marker["files"].items():
         assert (scene.folder / name).stat().st_size == about["size"]
         assert re.fullmatch("[0-9a-f]{8}", about["crc32c"])
-    assert {Path(name).parent.name for name in marker["files"]} >= {"radiance", "depth", "photon_power"}
+    assert {Path(name).parent.name for name in marker["files"]} >= {"radiance", "depth", "direct", "photon_power"}
 
 
 def test_a_sample_is_complete_only_with_its_views_and_modifications_job(scene: SceneStore) -> None:

@@ -25,13 +25,11 @@ DOCUMENT = Path(__file__).parents[4] / "docs/store-format.md"
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneStore:
-    """Two jobs of 4 samples and 1; base and job 0 are there, and its guides. Not to be changed."""
+    """Two jobs of 4 samples and 1; base and job 0 are there. Not to be changed."""
     store = Store(tmp_path_factory.mktemp("format") / "store", create=True)
     scene = store.scene(store.plan(samples.small_spec(), Request(modifications=5), shard_rows=4).scene_id)
     scene.write_base(*samples.base())
     samples.commit(scene, 0, samples.outputs(scene, 0))
-    scene.guides.want(scene.spec.guides)
-    samples.commit_guides(scene, 0)
     return scene
 
 
@@ -56,7 +54,6 @@ TABLES = {
     "inputs": table(declarations.PLAN_INPUTS),
     "outputs": table(declarations.OUTPUTS),
     "base": BASE,
-    "guides": table(declarations.GUIDES),
 }
 
 
@@ -77,9 +74,8 @@ def test_the_document_is_of_this_version_and_names_the_constants() -> None:
 
 
 def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) -> None:
-    plan, guides = scene.folder / "plans/000000", scene.folder / "guides/plans/000000"
+    plan = scene.folder / "plans/000000"
     declared = {plan / array.name: array for array in (*declarations.PLAN_INPUTS, *declarations.OUTPUTS)}
-    declared |= {guides / array.name: array for array in declarations.GUIDES}
     declared |= {
         scene.folder / "base" / group / a.name: a for group, arrays in declarations.BASE.items() for a in arrays
     }
@@ -100,7 +96,7 @@ def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) ->
         lengths = {"G": 1, "H": 8, "W": 8, "K": 8, "L": 16, "⌈P/8⌉": 2, "⌈K/8⌉": 1}
         inner = [n if isinstance(n, int) else lengths[n] for n in array.shape[1:]]
         assert about["shape"] == [rows, *inner]
-        is_output = array in (*declarations.OUTPUTS, *declarations.GUIDES)
+        is_output = array in declarations.OUTPUTS
         assert about["chunk_grid"]["configuration"]["chunk_shape"] == [4 if is_output else rows, *inner]
 
 
@@ -128,9 +124,9 @@ def test_every_chain_of_codecs_is_the_documents(scene: SceneStore) -> None:
 def test_the_store_and_every_group_state_format_and_version(scene: SceneStore) -> None:
     documents = [json.loads(path.read_text()) for path in scene.folder.rglob("zarr.json")]
     groups = [about["attributes"] for about in documents if about["node_type"] == "group"]
-    assert len(groups) == 5
+    assert len(groups) == 4
     for stated in [*groups, json.loads(scene.storage.read("photonfarm.json"))]:
-        assert (stated["format"], stated["version"]) == ("photonfarm store", 4)
+        assert (stated["format"], stated["version"]) == ("photonfarm store", 5)
 
 
 def test_each_store_has_an_id_of_its_own_which_it_keeps(store: Store, tmp_path: Path) -> None:
@@ -175,15 +171,16 @@ def test_inputs_read_as_unused_where_nothing_is_written(scene: SceneStore) -> No
         ({"format": "photonfarm store", "version": 1}, "older photonfarm"),
         ({"format": "photonfarm store", "version": 2}, "older photonfarm"),
         ({"format": "photonfarm store", "version": 3}, "older photonfarm"),
-        ({"format": "photonfarm store", "version": 5}, "newer photonfarm"),
+        ({"format": "photonfarm store", "version": 4}, "older photonfarm"),
+        ({"format": "photonfarm store", "version": 6}, "newer photonfarm"),
         ({"format": "photonfarm store", "version": 10**30}, "newer photonfarm"),
         ({"format": "photonfarm store", "version": 0}, r"Restore photonfarm\.json"),
-        ({"format": "photonfarm store", "version": "4"}, r"Restore photonfarm\.json"),
-        ({"format": "photonfarm store", "version": 4.0}, r"Restore photonfarm\.json"),
+        ({"format": "photonfarm store", "version": "5"}, r"Restore photonfarm\.json"),
+        ({"format": "photonfarm store", "version": 5.0}, r"Restore photonfarm\.json"),
         ({"format": "photonfarm store", "version": True}, r"Restore photonfarm\.json"),
         ({"format": "photonfarm store", "version": None}, r"Restore photonfarm\.json"),
-        ({"format": "someone's store", "version": 4}, "Give the folder of a photonfarm store"),
-        ({"format": None, "version": 4}, "Give the folder of a photonfarm store"),
+        ({"format": "someone's store", "version": 5}, "Give the folder of a photonfarm store"),
+        ({"format": None, "version": 5}, "Give the folder of a photonfarm store"),
     ],
 )
 def test_another_version_is_refused_by_all_who_open_a_store(store: Store, stated: dict[str, Any], advice: str) -> None:
@@ -217,11 +214,8 @@ def change(path: Path, **additions: Any) -> None:
 
 def add_everywhere(scene: SceneStore) -> None:
     """Files, folders, arrays, attributes and keys that this version does not know, wherever there may be some."""
-    root, plan, guides = scene.folder.parents[1], scene.folder / "plans/000000", scene.folder / "guides"
-    of_guides = guides, guides / "plans", guides / "plans/000000", guides / "committed"
-    for folder in (
-        root, root / "scenes", scene.folder, scene.folder / "plans", plan, scene.folder / "committed", *of_guides
-    ):  # fmt: skip
+    root, plan = scene.folder.parents[1], scene.folder / "plans/000000"
+    for folder in (root, root / "scenes", scene.folder, scene.folder / "plans", plan, scene.folder / "committed"):
         for name in ("notes.txt", "notes.json", ".hidden"):
             (folder / name).write_text("someone's")
         (folder / "more").mkdir()
@@ -229,20 +223,19 @@ def add_everywhere(scene: SceneStore) -> None:
     (scene.folder / "committed/1.json").write_text("{}")
     (scene.folder / "committed/000000000001.json.bak").write_text("{}")
     change(root / "photonfarm.json", made_by="another")
-    change(guides / "settings.json", bounces=2)
-    for marker_file in (scene.folder / "committed/000000000000.json", guides / "committed/000000000000.json"):
-        marker = json.loads(marker_file.read_text())
-        marker["figures"]["joules"] = 3
-        marker["files"]["plans/000000/variance/c.0.0"] = {"size": 3, "crc32c": "00000000", "storage": "cold"}
-        marker_file.write_text(json.dumps({**marker, "signature": "…"}))
+    marker_file = scene.folder / "committed/000000000000.json"
+    marker = json.loads(marker_file.read_text())
+    marker["figures"]["joules"] = 3
+    marker["files"]["plans/000000/variance/c.0.0"] = {"size": 3, "crc32c": "00000000", "storage": "cold"}
+    marker_file.write_text(json.dumps({**marker, "signature": "…"}))
     base = scene.folder / "base"
-    for path in (plan, plan / "radiance", base, base / "cloud/position", guides / "plans/000000"):
+    for path in (plan, plan / "radiance", base, base / "cloud/position"):
         about = json.loads((path / "zarr.json").read_text())
         change(path / "zarr.json", attributes={**about["attributes"], "colour": "green", "codec": {"a": 1}})
     about = json.loads((plan / "zarr.json").read_text())
     about["attributes"]["request"]["tilt"] = 3
     (plan / "zarr.json").write_text(json.dumps(about))
-    for path in (plan, base, base / "cloud", guides / "plans/000000"):
+    for path in (plan, base, base / "cloud"):
         group = zarr.open_group(str(path), mode="r+")
         group.create_array("variance", data=np.ones((3, 2)))
         group.create_group("appendix")
@@ -266,10 +259,10 @@ def test_unknown_files_arrays_attributes_and_keys_are_ignored(scene: SceneStore,
 
 def read_all(scene: SceneStore) -> list[bytes]:
     """Something of every kind that a reader reads, as bytes."""
-    reader = SceneReader(scene.folder.parents[1], scene.scene_id, guides=True)
+    reader = SceneReader(scene.folder.parents[1], scene.scene_id)
     found = []
     for row in reader.refresh().tolist():
-        sample = reader.read(row)
+        sample = reader.read(row, guides=True)
         found += [sample.radiance.tobytes(), reader.read_photons(row).power.tobytes()]
         found += [values.tobytes() for values in arrays_of(sample.guides).values()]
     geometry, cloud = reader.base()

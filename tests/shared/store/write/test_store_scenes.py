@@ -184,7 +184,7 @@ def test_a_store_that_goes_under_a_worker_is_told_and_not_begun_anew(
             for row, photons in given.photons.items():
                 out.photons(row, photons)
             for row, buffers in given.buffers.items():
-                out.view(row, buffers, given.visibility[row])
+                out.view(row, buffers, given.guides[row], given.visibility[row])
             for row, halves in given.radiance.items():
                 out.radiance(row, halves)
             out._join()
@@ -244,6 +244,6 @@ def test_scenes_without_the_store_s_document_are_refused_with_advice_and_never_a
 @pytest.mark.parametrize("content", ["", "{}", "[]"])
 def test_a_format_file_that_is_empty_says_what_it_should_hold(store: Store, content: str) -> None:
     (store.root / "photonfarm.json").write_text(content)
-    said = re.escape('{"format": "photonfarm store", "version": 4')
+    said = re.escape('{"format": "photonfarm store", "version": 5')
     with pytest.raises(CorruptError, match=said):
         Store(store.root)

@@ -27,7 +27,7 @@ class FollowedMarkers:
     """The jobs of a scene that have a marker."""
 
     def __init__(self, storage: Storage, scene: str, *, clock: Callable[[], float] = time.monotonic) -> None:
-        """Take the folder of a scene, or of its guides; nothing is listed yet."""
+        """Take the folder of a scene; nothing is listed yet."""
         self._storage, self._scene, self._clock = storage, scene, clock
         self._known: set[int] = set()
         self._whole_due = clock()

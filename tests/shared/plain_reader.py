@@ -69,6 +69,8 @@ class Scene:
         self.committed = self.committed_jobs()
         self.plans = [Plan(folder / "plans" / name, read) for name in self.plan_names()]
         self.shard_rows = self.plans[0].shard_rows if self.plans else 1
+        self.radiance_id = self.plans[0].attributes["radiance_id"] if self.plans else None
+        self.committed -= {job for plan in self.plans for job in plan.withdrawn}
 
     def committed_jobs(self):
         names = [path.name for path in (self.folder / "committed").glob("*")]
@@ -106,7 +108,7 @@ class Scene:
         for plan in self.plans:
             for row in range(plan.first_row, plan.first_row + plan.rows):
                 view, modification = self.stored("sample_view", row), self.stored("sample_modification", row)
-                if modification != -1:
+                if modification != -1 and row // self.shard_rows not in plan.withdrawn:
                     wanted = {int(needed) // self.shard_rows for needed in (row, view, modification)}
                     if wanted <= self.committed:
                         yield row
@@ -115,7 +117,7 @@ class Scene:
         view_row, modification_row = (int(self.stored(f"sample_{kind}", row)) for kind in ("view", "modification"))
         modification, view = self.stored("modification", modification_row), self.stored("view", view_row)
         number = int(self.stored("sample_pass", row))
-        key = make_key("sample", self.folder.name, modification, view, number)
+        key = make_key("sample", self.radiance_id, modification, view, number)
         assert key == self.stored("sample_key", row).tobytes()
         read = {"radiance": self.radiance(row), "modification": modification, "view": view, "pass": number}
         read |= {name: self.stored(name, view_row) for name in OF_VIEWS}
@@ -125,9 +127,15 @@ class Scene:
                 read[name] = np.unpackbits(self.stored(name, view_row), bitorder="little")[:count]
         if self.spec["photons"]["paths"]:
             read |= {name: self.stored(name, modification_row) for name in PHOTONS}
+        kinds = ("modification", modification_row), ("view", view_row)
+        read["densities"] = [self.stored(f"{kind}_density", row) for kind, row in kinds]
+        about = self.plan_of(modification_row).attributes_of("modification")
+        named = ((group, field) for group in about["groups"] for field in about["fields"])
+        read["changed"] = [f"{group} {field['name']}" for (group, field), value
+                           in zip(named, modification.reshape(-1), strict=True) if value != field["rest"]]  # fmt: skip
         read["rays"] = rays(view.astype("f8"), self.spec)
         seeds = [seed(key, "half A"), seed(key, "half B")]
-        read["seeds"] = [*seeds, seed(make_key("modification", self.folder.name, modification), "photons")]
+        read["seeds"] = [*seeds, seed(make_key("modification", self.radiance_id, modification), "photons")]
         return {name: np.asarray(values) for name, values in read.items()}
 
     def radiance(self, row):
@@ -150,8 +158,10 @@ class Scene:
 class Plan:
     def __init__(self, folder: Path, read) -> None:
         self.folder = folder
-        attributes = document(folder / "zarr.json")["attributes"]
-        assert (attributes["format"], attributes["version"]) == ("photonfarm store", 5)
+        self.attributes = attributes = document(folder / "zarr.json")["attributes"]
+        assert (attributes["format"], attributes["version"], attributes["parts"]) == ("photonfarm store", 5, 2)
+        withdrawn = folder.with_name(f"{folder.name}.withdrawn.json")
+        self.withdrawn = document(withdrawn)["jobs"] if withdrawn.exists() else []
         self.shard_rows = attributes["shard_rows"]
         self.first_row = attributes["first_job"] * self.shard_rows
         self.rows = attributes["jobs"] * self.shard_rows

@@ -30,7 +30,7 @@ class Outputs:
 def small_spec(**changes: Any) -> SceneSpec:
     """One movable object, 8 × 8 pixels; content is not looked for on disk."""
     unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
-    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit, "removal_probability": 0.3}
+    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit, "removal_probability": 0.2191}
     described = {
         "name": "small", "scene": {"builtin": "cornell"}, "objects": [movable], "points": 16,
         "view": {"origin": unit, "look_at": unit}, "film": {"width": 8, "height": 8},

@@ -233,7 +233,7 @@ class OneByOne:
     def plan(self, request: Request) -> PlannedRows | None:
         new = []
         for modification, view, pass_ in self.named(request):
-            key = make_key("sample", self.spec.scene_id, modification.vector, view, pass_)
+            key = make_key("sample", self.spec.radiance_id, modification.vector, view, pass_)
             if key not in self.samples:
                 self.samples.add(key)
                 new.append((modification.vector, view, pass_, key))
@@ -248,10 +248,12 @@ class OneByOne:
             row = self.modifications.setdefault(modification.tobytes(), next_modification)
             if row == next_modification:
                 rows.modification[row - first] = modification
+                rows.modification_density[row - first] = 1
                 next_modification += 1
             view_row = self.views.setdefault((row, view.tobytes()), next_view)
             if view_row == next_view:
                 rows.view[view_row - first] = view
+                rows.view_density[view_row - first] = 1
                 next_view += 1
             rows.sample_modification[i], rows.sample_view[i], rows.sample_pass[i] = row, view_row, pass_
             rows.sample_key[i] = np.frombuffer(key, np.uint8)
@@ -294,8 +296,10 @@ def test_plans_equal_those_made_sample_by_sample_to_the_bit(name: str, wanted: l
         found = expand(
             oracle.spec, request, PlannedContent(known), first_job=first_row // shard_rows, shard_rows=shard_rows
         )
-        scene_id, every = oracle.spec.scene_id, oracle.named(request)
-        named = {make_key("sample", scene_id, modification.vector, view, pass_) for modification, view, pass_ in every}
+        radiance_id, every = oracle.spec.radiance_id, oracle.named(request)
+        named = {
+            make_key("sample", radiance_id, modification.vector, view, pass_) for modification, view, pass_ in every
+        }
         assert found.new + found.known == len(named)
         if expected is None:
             assert found.rows is None

@@ -82,7 +82,7 @@ def test_new_passes_have_keys_of_their_own_made_of_content(scene: SceneStore) ->
         rows = scene.job_rows(job)
         for s in rows.samples:
             modification, view = rows.modifications[s.modification_row], rows.views[s.view_row]
-            assert s.key == make_key("sample", scene.scene_id, modification.vector, view.vector, s.pass_)
+            assert s.key == make_key("sample", scene.spec.radiance_id, modification.vector, view.vector, s.pass_)
 
 
 def test_a_job_of_a_top_up_edits_the_scene_least(scene: SceneStore) -> None:

@@ -103,16 +103,16 @@ CONTENT = {
 """Digests of the scene files that the ready specs were written for."""
 
 IDS = {
-    "bathroom": "105f963272e420a9b8068dbf451154d2",
-    "dining-room": "73e0d5e8c5199e078e992857d082cf61",
-    "kitchen": "bd3b0fa038f7cf018a8aed65acc19adf",
-    "living-room": "9c3611a3c27bfe09f3722cf36185b091",
-    "living-room-2": "24f4d18f6197e23ecd19dad4f1b2ca37",
-    "veach-ajar": "8a12797ba443effbf9aaf06a315115ef",
+    "bathroom": "0326b23bbc0af858b2bf55dbb03f2f57",
+    "dining-room": "ca9a1cef1644dde27acbf417340e2bd7",
+    "kitchen": "40ea8b073717f4e9552e5476c3539a38",
+    "living-room": "747cafd494555044a556d6cbb6c993f0",
+    "living-room-2": "3c02215b5c59b38d96351ac1d81a1451",
+    "veach-ajar": "339825d4947a28017b0d658970d54d69",
 }
 """Their scene ids."""
 
-BUILT_IN = {"room": "1b5675205d490b4b58919c4eb7bf0f9f", "cornell": "bba6e67c9335e9210548ba4128e4d470"}
+BUILT_IN = {"room": "a3479b18fa8162737f00026bd99ecc98", "cornell": "729d41a5db144aad9ef8628e19b4ff6c"}
 
 
 @pytest.mark.parametrize("name", IDS)

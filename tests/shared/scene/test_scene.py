@@ -112,14 +112,30 @@ def test_plain_path_tracing_and_light_paths_without_connections_are_allowed(scen
         assert SceneSpec.model_validate_json(spec.model_dump_json()) == spec
 
 
-@pytest.mark.parametrize(("key", "default", "other"), [("guided_light", False, True), ("light_samples", 1, 2)])
-def test_a_spec_with_later_settings_at_their_defaults_has_the_id_it_always_had(
-    scenes: Path, key: str, default: object, other: object
-) -> None:
-    plain, off, on = (parse_spec(changed(transport=t), where="spec") for t in ({}, {key: default}, {key: other}))
-    assert key not in plain.identity()["transport"]
-    assert plain.scene_id == off.scene_id != on.scene_id
-    assert SceneSpec.model_validate_json(on.model_dump_json()) == on
+@pytest.mark.parametrize(
+    ("changes", "differ"),
+    [
+        ({"name": "other"}, set()),
+        ({"exposure": 2.0}, set()),
+        ({"transport": {"connections": 0, "light_ratio": 0.5, "guided_light": True, "light_samples": 2}}, set()),
+        ({"transport": {"rr_depth": 9}}, set()),
+        ({"points": 7}, {"inputs_id"}),
+        ({"guides": {"light_samples": 1}}, {"inputs_id"}),
+        ({"photons": {"paths": 7}}, {"inputs_id"}),
+        ({"transport": {"max_depth": 3}}, {"radiance_id"}),
+        ({"transport": {"half_spp": 3}}, {"radiance_id"}),
+        ({"film": {"width": 64}}, {"radiance_id"}),
+        ({"points": 7, "film": {"width": 64}}, {"inputs_id", "radiance_id"}),
+        ({"objects": ball(removal_probability=0.3)["objects"]}, {"radiance_id"}),
+    ],
+)
+def test_each_id_follows_what_it_is_of(scenes: Path, changes: dict[str, object], differ: set[str]) -> None:
+    plain, other = (parse_spec(changed(**each), where="spec") for each in ({}, changes))
+    found = {name for name in ("radiance_id", "inputs_id") if getattr(plain, name) != getattr(other, name)}
+    assert found == differ
+    assert (plain.scene_id != other.scene_id) == bool(differ)
+    assert (plain.identity() != other.identity()) == bool(differ)
+    assert SceneSpec.model_validate_json(other.model_dump_json()) == other
 
 
 def test_a_folder_does_not_hide_the_spec_of_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -146,14 +162,6 @@ def test_the_scene_id_follows_the_content_and_not_the_place(scenes: Path, tmp_pa
     assert parse_spec(changed(), where="spec", beside=moved).scene_id == here
     (moved / "small/meshes/floor.ply").write_bytes(b"another")
     assert parse_spec(changed(), where="spec", beside=moved).scene_id != here
-
-
-def test_the_scene_id_follows_every_setting_but_the_name(scenes: Path) -> None:
-    changes = [{}, {"exposure": 2.0}, {"points": 7}, {"transport": {"max_depth": 3}}, {"film": {"width": 64}}]
-    ids = [parse_spec(changed(**change), where="spec").scene_id for change in changes]
-    ids.append(parse_spec(ball(removal_probability=0.3), where="spec").scene_id)
-    assert len(set(ids)) == len(ids)
-    assert parse_spec(changed(name="other"), where="spec").scene_id == ids[0]
 
 
 def test_a_changed_copy_has_an_id_of_its_own(scenes: Path) -> None:

@@ -313,7 +313,7 @@ def test_what_cannot_be_compared_is_refused(
 def test_a_store_with_nothing_held_out_says_so(scene: SceneStore, commit, make_source, tiny, tmp_path: Path) -> None:
     train(make_source(24), tiny(max_steps=1), tmp_path / "run")
     spec = scene.spec
-    keys = {seed: sample_modification(spec, seed, 0).key(spec.scene_id) for seed in range(32)}
+    keys = {seed: sample_modification(spec, seed, 0).key(spec.radiance_id) for seed in range(32)}
     seed = next(seed for seed, key in keys.items() if are_held_out([key], tiny().hold_out) == [False])
     scene.plan(Request(modifications=1, seed=seed), shard_rows=8)
     commit(scene, 0)

@@ -153,8 +153,8 @@ def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene:
         assert scene_named(store, name) == scene.scene_id
     with pytest.raises(StoreError):
         scene_named(store, "other")
-    other = store.add(samples.small_spec(exposure=2.0))
-    third = store.add(samples.small_spec(name="third", exposure=3.0))
+    other = store.add(samples.small_spec(points=20))
+    third = store.add(samples.small_spec(name="third", points=30))
     assert len(store.scene_ids()) == 3
     with pytest.raises(StoreError) as refused:
         scene_named(store, "small")

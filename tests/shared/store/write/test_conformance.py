@@ -18,6 +18,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.view import Camera
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.format import schema
+from photonfarm.shared.store.write.withdrawal import withdraw
 
 ROOT = Path(__file__).parents[4]
 PLAIN_READER = Path(__file__).parents[2] / "plain_reader.py"
@@ -33,7 +34,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
     Of the first, two plans: jobs 0 to 2 and 3 to 5, of 8 rows each. Job 3 wants passes of views in jobs 0 to 2; job 4
     is not committed, and job 5 has no files. Rows 20 to 23 are unused. The second is static (G = 0) and without
-    photons; the third looks straight up.
+    photons; the third looks straight up, and its second plan was withdrawn.
     """
     store = Store(tmp_path_factory.mktemp("conformance") / "store", create=True)
     grown(store)
@@ -42,7 +43,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     samples.commit_all(scene)
     above = {"min": [0, 1, 0], "max": [0, 2, 0]}
     upwards = samples.small_spec(name="up", view={"origin": {"min": [0, 0, 0], "max": [0, 0, 0]}, "look_at": above})
-    samples.commit_all(store.scene(store.plan(upwards, Request(modifications=2)).scene_id))
+    above_scene = store.scene(store.plan(upwards, Request(modifications=2)).scene_id)
+    samples.commit_all(above_scene)
+    above_scene.plan(Request(modifications=2, seed=1))
+    withdraw(above_scene)
     return store
 
 
@@ -78,7 +82,7 @@ def plainly(store: Store, by: str, out: Path) -> Arrays:
 def test_zarr_and_tensorstore_read_the_same_bytes_of_every_array(store: Store, read: dict[str, Arrays]) -> None:
     arrays = {path.parent for path in Path(store.root).rglob("zarr.json") if '"array"' in path.read_text()}
     assert {f"{store.root}/scenes/{name}" for name in read["zarr"] if "/samples/" not in name} == set(map(str, arrays))
-    assert len(arrays) == (6 + 24 + 6 + 24 + 10) + (6 + 18) + (6 + 24)
+    assert len(arrays) == 2 * (8 + 24) + 10 + (8 + 18) + 2 * (8 + 24)
     assert read["zarr"].keys() == read["tensorstore"].keys()
     for name, values in read["zarr"].items():
         other = read["tensorstore"][name]
@@ -99,7 +103,7 @@ def test_it_finds_the_samples_that_photonfarm_finds_and_reads_the_same(store: St
 
 def names(scene: SceneStore) -> list[str]:
     outputs = set(schema.output_arrays(scene.spec)) - {"radiance_wide"}
-    return [*outputs, "modification", "view", "pass", "rays", "seeds"]
+    return [*outputs, "modification", "view", "pass", "rays", "seeds", "densities", "changed"]
 
 
 def same(reader: SceneReader, row: int, plain: Arrays) -> None:
@@ -113,8 +117,12 @@ def same(reader: SceneReader, row: int, plain: Arrays) -> None:
     for name, values in expected.items():
         np.testing.assert_array_equal(plain[name], values, err_msg=name)
     assert plain["pass"] == sample.pass_
+    assert plain["densities"].tolist() == [1, 1]
+    moved, vector = zip("xyz", sample.modification.translation.reshape(-1), strict=False), sample.modification
+    changed = [f"object {axis}" for axis, value in moved if value] + ["object present"] * (not vector.present.all())
+    assert plain["changed"].tolist() == changed
     np.testing.assert_allclose(plain["rays"], Camera.of(sample.view, reader.spec).rays(), atol=1e-6)
-    key = make_key("sample", reader.spec.scene_id, sample.modification.vector, sample.view.vector, sample.pass_)
+    key = make_key("sample", reader.spec.radiance_id, sample.modification.vector, sample.view.vector, sample.pass_)
     named = [(key, "half A"), (key, "half B"), (reader.modification_key(row), "photons")]
     assert plain["seeds"].tolist() == [seed_of(*purpose) for purpose in named]
 

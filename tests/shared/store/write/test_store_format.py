@@ -52,7 +52,8 @@ BASE = "\n".join(
 )
 TABLES = {
     "inputs": table(declarations.PLAN_INPUTS),
-    "outputs": table(declarations.OUTPUTS),
+    "outputs": table([array for array in declarations.OUTPUTS if array not in declarations.GUIDES]),
+    "guides": table(declarations.GUIDES),
     "base": BASE,
 }
 
@@ -69,7 +70,7 @@ def test_the_document_is_of_this_version_and_names_the_constants() -> None:
     assert json.dumps({**declarations.stamp(), "id": "…"}, ensure_ascii=False) in text
     assert f"One chunk is {schema.INPUT_ROWS_PER_CHUNK} rows" in text
     assert f"L is {LIT_POINTS}, or P if that is less" in text
-    assert all(f"| `{setting}` |" in text for setting in GuideSpec.model_fields)
+    assert all(f"`guides.{setting}`" in text for setting in GuideSpec.model_fields)
     assert all(f"`emitters.{key}`" in text for key in Emitters.model_fields)
 
 
@@ -87,6 +88,9 @@ def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) ->
         attributes = dict(about["attributes"])
         exponent = attributes.pop("radiance_exponent", None)
         assert (exponent is not None) == array.name.startswith("radiance")
+        if array.name in declarations.FIELDS:
+            assert attributes.pop("fields") == list(declarations.FIELDS[array.name])
+        assert attributes.pop("groups", None) == (["object"] if array.name == "modification" else None)
         assert attributes == {"unit": array.unit, "convention": array.convention}
         assert about["data_type"] == np.dtype(array.dtype).name
         assert about["dimension_names"] == list(array.axes)

@@ -57,7 +57,7 @@ assert not [name for name in sys.modules if name.startswith("photonfarm")]
 def test_every_array_is_zarr_3_with_a_checksum_last_and_says_what_it_holds(scene: SceneStore) -> None:
     documents = [json.loads(p.read_text()) for p in (scene.folder).rglob("zarr.json")]
     arrays = [d for d in documents if d["node_type"] == "array"]
-    assert len(arrays) == 6 + 24 + 10
+    assert len(arrays) == 8 + 24 + 10
     for array in arrays:
         codecs = array["codecs"]
         if codecs[0]["name"] == "sharding_indexed":

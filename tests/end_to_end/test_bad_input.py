@@ -126,7 +126,7 @@ def test_wrong_usage_is_exit_code_2(here) -> None:
     [
         (("room", "--modifications", "2", "--hold-out", "0.125"), "2 configurations planned none"),
         (("room", "--modifications", "2", "--hold-out", "0.999"), "2 configurations planned all"),
-        (("cornell", "--modifications", "3", "--views", "2", "--hold-out", "0.99"), "6 views planned all"),
+        (("cornell", "--modifications", "3", "--views", "2", "--hold-out", "0.9999"), "6 views planned all"),
     ],
 )
 def test_up_refuses_a_hold_out_that_leaves_one_side_empty_before_it_writes_anything(
@@ -193,9 +193,9 @@ def test_up_holds_out_enough_of_a_small_plan(tmp_path: Path, spec: str, count: i
 
 def test_numbers_that_a_refused_hold_out_names_are_enough(tmp_path: Path) -> None:
     with pytest.raises(SpecError) as refused:
-        check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=9))
+        check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=7))
     share, count = re.findall(r"--hold-out (\S+) .* --modifications (\d+)", str(refused.value))[0]
-    check_hold_out(load_spec("room"), tmp_path / "none", float(share), Request(modifications=9))
+    check_hold_out(load_spec("room"), tmp_path / "none", float(share), Request(modifications=7))
     check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=int(count)))
     with pytest.raises(SpecError):
         check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=int(count) - 1))

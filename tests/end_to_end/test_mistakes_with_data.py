@@ -136,7 +136,7 @@ DEPTH = "differs in transport.max_depth (8 there, 6 here)"
         (NOTHING, "submit den.toml --shard-rows 3 --modifications 40 --no-queue", 3, ["shard_rows = 3"]),
         (NOTHING, "submit den.toml --store . --no-queue", 4, [".: is neither empty nor a store"]),
         (NOTHING, "preview den.toml --out den.toml/a.html", 4, ["den.toml/a.html: cannot write the sheet"]),
-        (lambda f: edit(f / "store/photonfarm.json", version=2), "status", 4, ["version 2", "version 4"]),
+        (lambda f: edit(f / "store/photonfarm.json", version=2), "status", 4, ["version 2", "version 5"]),
         (lambda f: (f / "store/photonfarm.json").write_text("{"), "status", 4, ["is not the document of a store"]),
         (lambda f: (f / "store/photonfarm.json").unlink(), "status", 4, ["is missing, and scenes are there"]),
         (lambda f: shard(f, "radiance").unlink(), "preview den.toml", 4, ["/radiance/c.", "store check --repair"]),

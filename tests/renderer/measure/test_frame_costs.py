@@ -215,7 +215,7 @@ def test_each_part_is_charged_with_its_own_seconds(
 def store(tmp_path_factory: pytest.TempPathFactory, small: Callable[..., SceneSpec]) -> Store:
     """A store with four rows of the room: two views of each of two configurations."""
     made = Store(tmp_path_factory.mktemp("rows") / "store", create=True)
-    request = Request(modifications=2, views_per_modification=2)
+    request = Request(modifications=2, views_per_modification=2, seed=1)
     scene_id = made.plan(small(load_spec("room")), request, shard_rows=4).scene_id
     ShardRenderer(made, worker="test").render(scene_id, 0)
     return made

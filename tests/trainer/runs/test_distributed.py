@@ -64,7 +64,7 @@ def together(make: Callable[[], Any], settings: TrainSettings, run: Path, **how:
 
     def target(group: Ranks) -> None:
         if group.rank:
-            assist(lambda _: make(), settings, run, group)
+            assist(lambda *_: make(), settings, run, group)
             return
         with leading(group):
             train(make(), settings, run, Hooks(group=group, **how))
@@ -137,7 +137,7 @@ def test_all_processes_go_back_together_and_keep_the_same_average(make_source, t
 
     In one session, and in another that goes on from its checkpoint, with what lies beside that.
     """
-    settings = tiny(batch=4, learning_rate=0.1, average=0.9, schedule="cosine", warm_up=0)
+    settings = tiny(batch=4, learning_rate=0.3, average=0.9, schedule="cosine", warm_up=0)
 
     def make() -> Any:
         honest, source = Learner.step, make_source(24)

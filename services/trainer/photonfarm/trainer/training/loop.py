@@ -187,7 +187,10 @@ class Session:
         self._hooks.group.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
-        return {"scene_id": self._feed.spec.scene_id, "settings": self._settings.model_dump(mode="json")}
+        spec = self._feed.spec
+        return {
+            "scene_id": spec.scene_id, "exposure": spec.exposure, "settings": self._settings.model_dump(mode="json"),
+        }  # fmt: skip
 
     def _save(self) -> None:
         with self._watch.on("save"):
@@ -206,7 +209,6 @@ class Session:
         samples = len(self._stream.growth.rows)
         return {
             **self._identity(),
-            "exposure": self._feed.spec.exposure,
             "step": self._step,
             "seconds": self._watch.seconds,
             "last_error": self._last_error,

@@ -103,7 +103,7 @@ def test_each_process_reads_its_own_part_and_only_rank_0_what_is_held_out(make_s
     def target(group: Ranks) -> None:
         source = make_source(24)
         if group.rank:
-            assist(lambda _: source, tiny(batch=4), run, group)
+            assist(lambda *_: source, tiny(batch=4), run, group)
         else:
             with leading(group):
                 train(source, tiny(batch=4), run, Hooks(group=group))

@@ -79,9 +79,9 @@ def seen() -> Seen:
     spec = room.model_copy(update={"film": film, "transport": transport, "photons": photons, "points": POINTS})
     scene = LoadedScene.load(spec)
     base = scene.base()
-    modification = sample_modification(spec, 0, 0)
+    modification = sample_modification(spec, 0, 2)
     key = modification.key(spec.radiance_id)
-    view = sample_view(spec, key, 0, 0)
+    view = sample_view(spec, key, 0, 2)
     scene.apply(modification)
     traced, _ = photons_of(scene, key)
     assert traced is not None
@@ -250,5 +250,5 @@ def test_clipped_gradients_miss_the_clean_gradient(rendered) -> None:
     norm = math.sqrt(sum(float(g.square().sum()) for g in clean.mean))
     noisy = gradients(rendered, LOSSES["linear"], rendered.noisy, clip=norm)
     each, together = deviations(noisy, clean)
-    assert together > 5
-    assert np.mean(np.array(each) > 3) > 0.5
+    assert together > 4.5
+    assert np.mean(np.array(each) > 3) > 0.8

@@ -193,9 +193,9 @@ def test_up_holds_out_enough_of_a_small_plan(tmp_path: Path, spec: str, count: i
 
 def test_numbers_that_a_refused_hold_out_names_are_enough(tmp_path: Path) -> None:
     with pytest.raises(SpecError) as refused:
-        check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=7))
+        check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=3))
     share, count = re.findall(r"--hold-out (\S+) .* --modifications (\d+)", str(refused.value))[0]
-    check_hold_out(load_spec("room"), tmp_path / "none", float(share), Request(modifications=7))
+    check_hold_out(load_spec("room"), tmp_path / "none", float(share), Request(modifications=3))
     check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=int(count)))
     with pytest.raises(SpecError):
         check_hold_out(load_spec("room"), tmp_path / "none", HOLD_OUT, Request(modifications=int(count) - 1))

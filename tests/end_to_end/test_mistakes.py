@@ -52,7 +52,7 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("work --job 3", 2, ["--scene"]),
         ("redis --port 70000", 2, ["'--port'"]),
         ("up room --modifications 1", 3, ["1 configuration is planned", "--modifications 2 plans enough"]),
-        ("up room --hold-out 0.1 --modifications 7", 3, ["hold_out = 0.1: of the 7", "--hold-out 0.33", "tions 8"]),
+        ("up room --hold-out 0.1 --modifications 3", 3, ["hold_out = 0.1: of the 3", "--hold-out 0.16", "tions 4"]),
         ("--config none.toml status", 3, ["none.toml"]),
         ("infer --row 0", 4, ["run: there is no such folder"]),
     ],
@@ -144,11 +144,11 @@ def test_a_number_may_be_written_as_people_write_it(here: Path) -> None:
 
 def test_submit_says_so_if_training_will_refuse_what_it_plans(here: Path) -> None:
     for option in ("--dry-run --no-measure", "--no-queue"):
-        code, _, err = said(f"submit room --modifications 7 {option}")
+        code, _, err = said(f"submit room --modifications 3 {option}")
         (line,) = err.splitlines()
         assert (code, line.startswith("warning: `photonfarm train` will refuse this: hold_out = 0.125")) == (0, True)
-        assert "--hold-out 0.33 holds out one of these, and --modifications 8 plans enough" in line
-    for enough in (8, 3):  # the second time the store has the others
+        assert "--hold-out 0.16 holds out one of these, and --modifications 4 plans enough" in line
+    for enough in (4, 2):  # the second time the store has the others
         assert said(f"submit room --modifications {enough} --no-queue")[2] == ""
 
 

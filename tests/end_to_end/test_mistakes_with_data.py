@@ -163,7 +163,7 @@ DEPTH = "differs in transport.max_depth (8 there, 6 here)"
         (NOTHING, "evaluate --kept 4", 2, ["--denoiser"]),
         (NOTHING, "train cornell", 3, ["run: was trained on scene"]),
         (NOTHING, f"train den.toml --architecture guided {TRAIN}", 3, ["network.architecture = 'cnn'"]),
-        (NOTHING, f"train den.toml --run new --architecture cnn {FEW}", 3, ["none is held out", "--hold-out 0.1"]),
+        (NOTHING, f"train den.toml --run new --architecture cnn {FEW}", 3, ["none is held out", "--hold-out 0."]),
         (NOTHING, "train den.toml --run new --set widht=3", 3, ["widht: unknown key; nearest: width"]),
         (NOTHING, "train den.toml --run new --set width=many", 3, ["network.width = 'many': a whole number"]),
         (NOTHING, "train den.toml --run new --set width", 2, ["'width' is not KEY=VALUE"]),

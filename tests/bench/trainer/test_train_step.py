@@ -8,7 +8,7 @@ from photonfarm.trainer.runs.settings import preset
 
 
 def test_every_network_takes_its_steps_and_its_parts_are_timed(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train_step, "SAMPLES", 16)
+    monkeypatch.setattr(train_step, "SAMPLES", 32)
     where = tmp_path, filled(resized(16, 64), tmp_path)
     settings = preset("small", network={"width": 4, "points": 64})
     timed = [measure(where, for_architecture(settings, name), WorkTimer("cpu", 1), 2) for name in shown()]

@@ -62,7 +62,8 @@ def test_a_spec_is_measured_once_written_and_then_known(
     for table in ("transport", "photons"):
         assert f"[{table}] {'written' if table in first['changes'] else 'stays as it is'}" in err
     written = load_spec(tmp_path / "box.toml")
-    assert written.transport.model_dump() == {"max_depth": 3, "rr_depth": 5, **first["settings"]["transport"]}
+    defaults = {"max_depth": 3, "rr_depth": 5, "guided_light": False, "light_samples": 1}
+    assert written.transport.model_dump() == {**defaults, **first["settings"]["transport"]}
     assert written.photons.model_dump() == first["settings"]["photons"]
     assert "max_depth = 3  # edges\n" in (tmp_path / "box.toml").read_text()
 

@@ -1,0 +1,63 @@
+"""Stores in a bucket are joined, plans in it withdrawn, and its specs replaced."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import store_samples as samples
+from bucket_samples import planned
+
+from photonfarm.shared.farm.join import join
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.write.withdrawal import withdraw
+
+
+class KilledError(Exception):
+    """In place of a signal."""
+
+
+def test_a_folder_is_joined_into_a_bucket_and_goes_on_where_it_was_cut_off(url: str, tmp_path: Path) -> None:
+    there = planned(tmp_path / "store", modifications=8)
+    there.write_base(*samples.base())
+    samples.commit_all(there)
+    here = planned(url, modifications=1)
+    here.write_base(*samples.base())
+    samples.commit_all(here)
+
+    def killed(_scene: str, done: int, _total: int) -> None:
+        if done:
+            raise KilledError
+
+    with pytest.raises(KilledError):
+        join(url, tmp_path / "store", on_progress=killed)
+    (told,) = join(url, tmp_path / "store")
+    assert told.planned == 0, "the first one has planned them"
+    assert told.jobs
+    folder, bucket = (SceneReader(place, there.scene_id) for place in (tmp_path / "store", url))
+    folder.refresh()
+    bucket.refresh()
+    first, second = folder.rows_by_key(), bucket.rows_by_key()
+    assert first.keys() == second.keys()
+    copied = {row: second[key] for key, row in first.items() if second[key] >= 2}  # not this store's own
+    assert len(copied) == 7
+    for row, copy in copied.items():
+        a, b = folder.read(row, guides=True), bucket.read(copy, guides=True)
+        assert a.guides is not None
+        assert b.guides is not None
+        np.testing.assert_array_equal(a.radiance, b.radiance)
+        np.testing.assert_array_equal(a.guides.direct, b.guides.direct)
+    assert check_store(Store(url), when="now").exit_code == 0
+
+
+def test_a_plan_in_a_bucket_is_withdrawn_and_its_spec_replaced(url: str) -> None:
+    scene = planned(url, modifications=3)
+    samples.commit(scene, 0, samples.outputs(scene, 0))
+    done = withdraw(scene)
+    assert (done.samples, done.rendered) == (1, 2)
+    store = Store(url)
+    planned_again = store.plan(samples.small_spec(exposure=8.0), Request(modifications=3))
+    assert (planned_again.new, planned_again.known) == (1, 2)
+    spec = Store(url).scene(scene.scene_id).spec
+    assert (spec.exposure, spec.radiance_exponent) == (8.0, 0)

@@ -44,14 +44,16 @@ def cloud_of(scene: Any, geometry: Geometry, count: int, radiance_id: str) -> Ba
     position, si = surfaces_at(scene, geometry, face, barycentric)
     emission = si.emitter(scene).eval(si)
     albedo = diffuse_reflectance(si, mi.Bool(True))
-    normal = si.n * dr.sign(dr.dot(si.n, si.sh_frame.n))  # Mitsuba's `n` of a mirrored rectangle is of its back
-    dr.eval(normal, albedo, emission)
+    front = dr.dot(si.n, si.sh_frame.n)
+    dr.eval(si.n, front, albedo, emission)
+    shape = geometry.face_shape[face]
+    is_mirrored = np.bincount(shape, np.array(front), len(geometry.shape_group)) < 0  # then Mitsuba's `n` is the back's
     return BasePointCloud(
         position=position.astype(np.float32),
-        normal=rows(normal, count),
+        normal=rows(si.n, count) * np.where(is_mirrored[shape], -1, 1).astype(np.float32)[:, None],
         albedo=rows(albedo, count),
         emission=rows(emission, count),
-        group=geometry.shape_group[geometry.face_shape[face]],
+        group=geometry.shape_group[shape],
         face=face,
     )
 

@@ -146,7 +146,7 @@ class ShardRenderer:
         self._scenes: dict[str, _Loaded] = {}  # in the order of their last use
 
     def render(self, scene_id: str, job: int) -> bool:
-        """Render and commit a job; False if it was committed already, or another worker committed it meanwhile.
+        """Render and commit a job; False if it was committed or withdrawn already, or is meanwhile.
 
         It also returns False if a repair removed the job's files meanwhile: the job is then missing, and queued again.
 

@@ -149,8 +149,8 @@ class SceneReader:
         """Read complete samples in the order of `rows`, in their stored types; every byte is checked.
 
         They are read into the first places of `out`, which are returned, with all that it has memory for; without it,
-        into new memory, without guides. Raises
-        CorruptError if bytes are not what was committed; the content of `out` is then undefined.
+        into new memory, without guides. Raises CorruptError if bytes are not what was committed; the content of `out`
+        is then undefined.
         """
         chosen = np.asarray(rows, np.int64)
         self._check_complete(chosen)

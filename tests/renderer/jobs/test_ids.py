@@ -14,6 +14,7 @@ from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.read.other_scenes import with_same_radiance
 
 REQUEST = Request(modifications=3, views_per_modification=2)
 
@@ -164,3 +165,38 @@ def test_halves_of_another_radiance_are_refused(tmp_path: Path, spec: SceneSpec,
     with pytest.raises(SpecError, match="is the scene itself"):
         store.plan(spec, REQUEST, halves_from=spec.scene_id)
     assert store.scene_ids() == [spec.scene_id], "nothing was written"
+
+
+def test_halves_that_are_damaged_there_are_rendered_and_the_healthy_scene_is_planned(
+    tmp_path: Path, spec: SceneSpec, analytic: ModuleType
+) -> None:
+    store = Store(tmp_path / "store", create=True)
+    scene = rendered(store, spec, analytic)
+    file = scene.folder / "plans/000000/radiance/c.0.0.0.0.0"
+    content = bytearray(file.read_bytes())
+    content[40] ^= 1
+    file.write_bytes(content)
+    other = analytic.small_spec(points=32)
+    taken = rendered(store, other, analytic, halves_from=scene.scene_id)
+    assert [taken.marker(job)["figures"]["taken_over"] for job in range(3)] == [1, 2, 2]
+    (scene.folder / "plans/000000/zarr.json").write_text("{")
+    assert with_same_radiance(Store(tmp_path / "store"), other) is None
+    assert with_same_radiance(Store(tmp_path / "store"), analytic.small_spec(points=48)) == other.scene_id
+
+
+def test_two_scenes_that_take_halves_from_each_other_are_repeated(
+    tmp_path: Path, spec: SceneSpec, analytic: ModuleType
+) -> None:
+    store = Store(tmp_path / "store", create=True)
+    other = analytic.small_spec(points=32)
+    for each, halves_from in ((spec, None), (other, spec.scene_id), (spec, other.scene_id)):
+        request = REQUEST if halves_from is None else Request(modifications=4, views_per_modification=2)
+        store.plan(each, request, shard_rows=None if store.has_scene(each.scene_id) else 2, halves_from=halves_from)
+    renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
+    for each in (spec, other):
+        for job in store.scene(each.scene_id).missing_jobs():
+            renderer.render(each.scene_id, job)
+    for each in (spec, other):
+        again = repeat(store.root, each.scene_id, 6, None, print, load=analytic.AnalyticScene)
+        assert again.comparison is not None
+        assert again.comparison.is_equal

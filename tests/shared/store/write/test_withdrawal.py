@@ -1,6 +1,8 @@
 """What is planned and not rendered is withdrawn; what is rendered stays."""
 
 import json
+import shutil
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +15,8 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.format import markers
+from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.status import scene_status
 from photonfarm.shared.store.write.withdrawal import withdraw
 
@@ -133,3 +137,57 @@ def test_the_verb_says_what_it_has_done(scene: SceneStore) -> None:
     said = CliRunner().invoke(verb, ["--store", str(scene.storage.where), "--scene", "small"])
     assert said.exit_code == 0, said.output
     assert "4 samples in 2 jobs are forgotten; 4 are rendered and stay" in said.output
+
+
+def test_processes_that_follow_see_each_withdrawal_of_a_plan(scene: SceneStore) -> None:
+    reader, other = samples.reader_of(scene), fresh(scene)
+    other.plans()
+    for jobs in ({1}, {1, 3}, {3}):
+        plans.withdraw(scene.storage, scene.name, 0, jobs)
+        reader.refresh()
+        assert reader.planned == 8 - 2 * len(jobs)
+        assert other.missing_jobs() == sorted({1, 3} - jobs)
+    assert samples.commit(other, 1, samples.outputs(other, 1))
+    assert reader.refresh().tolist() == [2, 3]
+
+
+def test_a_top_up_that_was_made_before_a_withdrawal_is_made_anew(
+    scene: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    build = plans.build
+
+    def slowly(*args: Any, **options: Any) -> None:
+        monkeypatch.undo()
+        build(*args, **options)
+        withdraw(fresh(scene))
+
+    monkeypatch.setattr(plans, "build", slowly)
+    planned = scene.plan(TopUp.of("+8"))
+    assert (planned.plan, planned.new) == (2, 4), "passes of the views that are left"
+    found = fresh(scene).plans()
+    assert len(found[1].withdrawn) == found[1].jobs
+    assert fresh(scene).progress().planned_samples == 8
+    assert check_store(Store(scene.storage.where), when="now").exit_code == 0
+
+
+def test_a_marker_placed_after_a_withdrawal_is_set_aside(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    place = markers.place
+
+    def late(*args: Any) -> bool:
+        monkeypatch.undo()
+        withdraw(fresh(scene))
+        return place(*args)
+
+    monkeypatch.setattr(markers, "place", late)
+    assert not samples.commit(scene, 1, samples.outputs(scene, 1))
+    assert scene.committed_jobs() == {0, 2}
+    status = scene_status(fresh(scene))
+    assert (status.jobs_planned, status.jobs_committed, status.markers_without_plan) == (2, 2, 0)
+
+
+def test_a_base_that_is_lost_is_written_by_a_job_that_is_left(scene: SceneStore) -> None:
+    withdraw(scene)
+    shutil.rmtree(scene.folder / "base")
+    report = check_store(Store(scene.storage.where), when="now", repair=True)
+    assert report.exit_code == 7
+    assert fresh(scene).missing_jobs() == [2]

@@ -2,26 +2,44 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
+from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.store import SceneReader
 
+log = logging.getLogger(__name__)
+
 
 class OtherHalves:
-    """The complete samples of a scene with the same radiance id, by their content keys."""
+    """The complete samples of a scene with the same radiance id, by their content keys.
+
+    What is damaged there is not found, and so it is rendered.
+    """
 
     def __init__(self, store: str | Path, scene_id: str) -> None:
-        """Look at what is complete now."""
-        self._reader = SceneReader(store, scene_id)
-        self._reader.refresh()
-        self._rows = self._reader.rows_by_key()
+        """Take the scene; `refresh` looks what is complete."""
+        self._scene_id, self._reader = scene_id, SceneReader(store, scene_id)
+        self._rows: dict[Key, int] = {}
+
+    def refresh(self) -> None:
+        """Look what is complete now."""
+        try:
+            if len(self._reader.refresh()) or len(self._reader.taken_back):
+                self._rows = self._reader.rows_by_key()
+        except CorruptError as error:
+            self._rows = {}
+            log.warning("no halves are taken over from scene %s: %s", self._scene_id, error)
 
     def find(self, key: Key) -> F32 | None:
-        """The halves of a sample, (2, H, W, 3) linear, unscaled, every byte checked; None if it is not complete there.
-
-        Raises CorruptError if bytes are not what was committed.
-        """
+        """The halves of a sample, (2, H, W, 3) linear, unscaled, every byte checked; None if they are not there."""
         row = self._rows.get(key)
-        return None if row is None else self._reader.read_radiance(row)
+        if row is None:
+            return None
+        try:
+            return self._reader.read_radiance(row)
+        except CorruptError as error:
+            log.warning("halves of sample %s are rendered: %s", key.hex(), error)
+            return None

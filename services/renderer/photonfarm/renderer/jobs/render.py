@@ -144,6 +144,7 @@ class ShardRenderer:
         self._worker = worker
         self._load = load
         self._scenes: dict[str, _Loaded] = {}  # in the order of their last use
+        self._others: dict[str, OtherHalves] = {}  # by the id of the scene whose halves they are
 
     def render(self, scene_id: str, job: int) -> bool:
         """Render and commit a job; False if it was committed or withdrawn already, or is meanwhile.
@@ -175,6 +176,8 @@ class ShardRenderer:
             what = "was committed by another worker while it was rendered here; that one stays"
             if not stored.is_committed(job):
                 what = "its files were set aside by a repair while it was committed here; it will be rendered again"
+            if stored.is_withdrawn(job):
+                what = "was withdrawn while it was rendered here, and is thrown away"
             log.warning("scene %s, job %d: %s", scene_id, job, what)
         return committed
 
@@ -187,7 +190,12 @@ class ShardRenderer:
 
     def _other_halves(self, stored: SceneStore, job: int) -> OtherHalves | None:
         other = stored.halves_from(job)
-        return None if other is None else OtherHalves(self._store.root, other)
+        if other is None:
+            return None
+        if other not in self._others:
+            self._others[other] = OtherHalves(self._store.root, other)
+        self._others[other].refresh()
+        return self._others[other]
 
     def _figures(self, began: tuple[float, float], rendering: _Rendering, spec: SceneSpec) -> Figures:
         """The cost of the work since `began`, for a marker."""

@@ -171,13 +171,17 @@ def _row_of(stored: SceneStore, key: Key) -> int | None:
 def _as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
     """The scene's spec with the strategy that a sample was rendered by, if it is there."""
     strategy: dict[str, Any] = {}
-    holder: SceneStore | None = stored
-    while holder is not None and (row := _row_of(holder, key)) is not None:
+    holder, visited = stored, set[str]()
+    while holder.scene_id not in visited and (row := _row_of(holder, key)) is not None:
+        visited.add(holder.scene_id)
         job = row // holder.plans()[0].shard_rows
-        if holder.is_committed(job):
-            strategy = holder.marker(job)["figures"]["strategy"]
-        other = holder.halves_from(job)
-        holder = None if other is None else opened.scene(other)
+        if not holder.is_committed(job):
+            break
+        figures = holder.marker(job)["figures"]
+        strategy, other = figures["strategy"], holder.halves_from(job)
+        if other is None or not figures.get("taken_over"):
+            break
+        holder = opened.scene(other)
     return stored.spec.model_copy(update={"transport": stored.spec.transport.model_copy(update=strategy)})
 
 

@@ -33,7 +33,7 @@ FORMAT = 4
 ANEW = "remove it, and the run begins anew"
 TENSOR = "tensor"
 
-LASTING = ("scene_id", "network", "batch", "hold_out", "optimiser", "loss", "seed")
+LASTING = ("scene_id", "exposure", "network", "batch", "hold_out", "optimiser", "loss", "seed")
 """The settings that a run keeps for ever. The others may change when it is resumed."""
 
 OPTIONS = ("architecture", "precision", "demodulation", "batch", "hold_out", "optimiser", "loss", "seed")
@@ -162,17 +162,18 @@ def versions() -> dict[str, str]:
 
 
 def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str, Any]) -> Changes:
-    """Raise SpecError if the checkpoint is of another scene, or has other `LASTING` settings.
+    """Raise SpecError if the checkpoint is of another scene or exposure, or has other `LASTING` settings.
 
-    Returns the other settings that have changed. Both arguments have `scene_id` and `settings`.
+    Returns the other settings that have changed. Both arguments have `scene_id` and `settings`, and perhaps `exposure`.
     """
-    then, now = ({"scene_id": one["scene_id"], **one["settings"]} for one in (state, identity))
+    kept = [name for name in ("scene_id", "exposure") if name in state and name in identity]
+    then, now = ({**{name: one[name] for name in kept}, **one["settings"]} for one in (state, identity))
     check_of_this_version(path, then["network"])
     changed = differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
         found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
-        options = " ".join(_option(key, then) for key, (then, _) in lasting.items() if key != "scene_id")
+        options = " ".join(_option(key, then) for key, (then, _) in lasting.items() if key not in kept)
         same = f"the same values{f' ({options})' if options else ''}"
         raise SpecError(f"{path}: was trained with {found}; use another run directory, or {same}")
     return changed

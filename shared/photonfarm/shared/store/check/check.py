@@ -17,7 +17,7 @@ from photonfarm.shared.store.check.content_check import CheckTotals
 from photonfarm.shared.store.check.halves import SIGNIFICANCE, HalvesResult, HalvesTest
 from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.check.job_pool import JobPool
-from photonfarm.shared.store.check.plan_check import PlanCheck
+from photonfarm.shared.store.check.plan_check import PlanCheck, jobs_to_render
 from photonfarm.shared.store.check.plan_repair import PlanRepair
 from photonfarm.shared.store.check.repeated_seeds import equal_samples
 from photonfarm.shared.store.check.unplanned_files import unplanned_files
@@ -234,12 +234,12 @@ class _SceneChecking:
             if quarantine.base(self._name, why):
                 aside.append("base")
             committed = markers.jobs(self._storage, self._name)
-            jobs = scene.plans[-1].end_job if scene is not None and scene.plans else 0
-            if scene is not None and committed.issuperset(range(jobs)) and jobs:
+            jobs = jobs_to_render(scene.plans) if scene is not None and scene.plans else set()
+            if scene is not None and jobs and committed >= jobs:
                 # nothing is missing, and only a job that is rendered writes the base
                 reason = Finding(Cause.BASE, "this job is whole: it is rendered again for the base", self._scene_id)
-                self._set_aside(scene, quarantine, jobs - 1, [reason])
-                aside.append(f"job {jobs - 1} (whole; rendered again, as a job writes the base)")
+                self._set_aside(scene, quarantine, max(jobs), [reason])
+                aside.append(f"job {max(jobs)} (whole; rendered again, as a job writes the base)")
         return aside
 
     def _set_aside(self, scene: CheckTarget, quarantine: Quarantine, job: int, why: list[Finding]) -> bool:

@@ -169,8 +169,8 @@ class PlanCheck:
 
         if not self._storage.exists(f"{folder}/zarr.json"):
             if committed:
-                jobs = self.plans[-1].end_job if self.plans else 0
-                waits = not self._storage.names(folder) and not committed >= set(range(jobs))
+                wanted = jobs_to_render(self.plans or [])
+                waits = not self._storage.names(folder) and not committed >= wanted
                 cause = Cause.BASE_TO_COME if waits else Cause.BASE
                 yield Finding(cause, "is missing, and jobs are committed", self._id, file=folder)
             return
@@ -192,6 +192,11 @@ class PlanCheck:
         yield from found
         if not found and (detail := _base_references(*read_base(self._storage, self._scene), len(self._spec.groups))):
             yield Finding(Cause.BASE, detail, self._id, file=folder)
+
+
+def jobs_to_render(found: list[StoredPlan]) -> set[int]:
+    """All jobs of plans but the withdrawn ones."""
+    return {job for plan in found for job in range(plan.first_job, plan.end_job) if job not in plan.withdrawn}
 
 
 def declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: int) -> str:

@@ -45,9 +45,12 @@ def first_plan_note(store: Store, spec: SceneSpec) -> str | None:
 
 def with_same_radiance(store: Store, spec: SceneSpec) -> str | None:
     """The id of the other scene that has most complete samples of the same radiance id; None without one."""
-    there, _ = store.each(lambda scene: scene)
-    alike = [s for s in there.values() if s.spec.radiance_id == spec.radiance_id and s.scene_id != spec.scene_id]
-    counted = {scene.scene_id: scene.progress().committed_samples for scene in alike}
+
+    def complete(scene: SceneStore) -> int:
+        alike = scene.spec.radiance_id == spec.radiance_id and scene.scene_id != spec.scene_id
+        return scene.progress().committed_samples if alike else 0
+
+    counted, _ = store.each(complete)
     best = max(counted, key=lambda scene_id: counted[scene_id], default=None)
     return best if best and counted[best] else None
 
@@ -62,7 +65,10 @@ def told_apart(store: Store, scene_ids: Sequence[str]) -> str:
 
 def samples_of(scene: SceneStore) -> str:
     """How many samples of a scene are complete, in words."""
-    found = scene.progress()
+    try:
+        found = scene.progress()
+    except StoreError:
+        return "its plans cannot be read"
     return f"{found.committed_samples} of {found.planned_samples} samples complete"
 
 

@@ -23,7 +23,7 @@ from photonfarm.shared.core.records import F32, Guides, Photons, ViewBuffers, Vi
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.shards import Shard, ShardWriter, encode
-from photonfarm.shared.store.io.storage import Storage, discard, renew_copy
+from photonfarm.shared.store.io.storage import Storage, discard, read_or_none, renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 from photonfarm.shared.store.write.quarantine import Quarantine
@@ -85,6 +85,9 @@ class CommitTarget(Protocol):
 
     def is_to_do(self, job: int) -> bool:
         """Whether a job is planned, and neither committed nor withdrawn."""
+
+    def is_withdrawn(self, job: int) -> bool:
+        """Whether a job is withdrawn by now."""
 
 
 class JobWriter:
@@ -204,8 +207,8 @@ class JobWriter:
     def commit(self, figures: Figures, clock: Clock = _utc_now) -> bool:
         """Make the rows part of the store, all or nothing; False if another worker's commit came first.
 
-        It is also False if a repair has set aside files that were already named here, with another commit that relied
-        on them, say; then the job is missing, and rendered again.
+        It is also False if the job is withdrawn, and if a repair has set aside files that were already named here, with
+        another commit that relied on them, say; then the job is missing, and rendered again.
 
         Files that another writer left are kept if every row of the job can be read from them and from the new ones, and
         are replaced otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError if
@@ -234,6 +237,9 @@ class JobWriter:
                 if not alone and not (self._is_readable() and self._summaries() == described):
                     continue
                 placed = self._place(described, figures)
+                if self._scene.is_withdrawn(self._rows.job):
+                    self._set_marker_aside("withdrawn while it was committed", clock)
+                    return False
                 if (placed and alone and self._are_there(described)) or self._is_marker_right(clock):
                     return placed
             raise CorruptError(
@@ -304,11 +310,18 @@ class JobWriter:
             wrong = self._mismatched(named)
         if not wrong:
             return True
-        detail = "files were moved or replaced while the job was committed; those that are there stay"
-        why = Finding(Cause.CHECKSUM, detail, self._scene.scene_id, self._rows.job, file=name)
-        when = clock().isoformat(timespec="seconds")
-        Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
+        self._set_marker_aside(
+            "files were moved or replaced while the job was committed; those that are there stay", clock
+        )
         return False
+
+    def _set_marker_aside(self, detail: str, clock: Clock) -> None:
+        name = markers.name_of(self._scene.name, self._rows.job)
+        marker = read_or_none(self._storage, name)
+        if marker is not None:
+            why = Finding(Cause.CHECKSUM, detail, self._scene.scene_id, self._rows.job, file=name)
+            when = clock().isoformat(timespec="seconds")
+            Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
 
     def _mismatched(self, named: Mapping[str, Mapping[str, Any]]) -> list[str]:
         """The arrays whose files differ from the marker."""

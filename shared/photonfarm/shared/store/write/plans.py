@@ -220,15 +220,23 @@ def build(
 
 
 def radiance_exponent(storage: Storage, scene: str) -> int | None:
-    """The power of two by which a scene's first plan stores radiance; None without a plan that can be read."""
+    """The power of two by which a scene's plans store radiance; None without plans.
+
+    Raises CorruptError if there are plans and none can be read.
+    """
     import zarr
 
-    first = folder(scene, 0)
-    try:
-        group = zarr.open_group(storage.zarr(first), mode="r", zarr_format=3, use_consolidated=False)
-        return int(str(group.attrs["radiance_exponent"]))
-    except (FileNotFoundError, ValueError, KeyError, TypeError, RuntimeError):
-        return None
+    error: Exception | None = None
+    for number in range(count(storage, scene)):
+        name = folder(scene, number)
+        try:
+            group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
+            return int(str(group.attrs["radiance_exponent"]))
+        except (FileNotFoundError, ValueError, KeyError, TypeError, RuntimeError) as failed:
+            error = failed
+    if error is not None:
+        raise CorruptError(f"{storage.where}/{scene}/{PLANS}: no plan can be read, and the spec is lost; {RESTORE}")
+    return None
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
@@ -242,7 +250,7 @@ def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: i
         end = _counted(storage, scene, names, len(loaded)) if until is None else until
         found = loaded + [_load(storage, scene, number) for number in range(len(loaded), end)]
         for number, plan in enumerate(found):
-            if not plan.withdrawn and withdrawal(scene, number).rpartition("/")[2] in names:
+            if withdrawal(scene, number).rpartition("/")[2] in names:
                 found[number] = _without_withdrawn(storage, scene, plan)
         return found
 
@@ -293,12 +301,16 @@ def withdraw(storage: Storage, scene: str, number: int, jobs: Set[int]) -> None:
 
 
 def _without_withdrawn(storage: Storage, scene: str, plan: StoredPlan) -> StoredPlan:
-    """The plan with the rows of its withdrawn jobs as unused ones."""
+    """The plan with the rows of its withdrawn jobs as unused ones; itself if it has them so already."""
     name = withdrawal(scene, plan.number)
     try:
         jobs = [int(job) for job in json.loads(storage.read(name))["jobs"]]
     except (ValueError, KeyError, TypeError) as error:
         raise CorruptError(f"{storage.where}/{name}: names no jobs: {error}; put it back from a copy") from error
+    if plan.withdrawn == frozenset(jobs):
+        return plan
+    if plan.withdrawn:  # others than now: what was masked is read anew
+        plan = _load(storage, scene, plan.number)
     rows = PlannedRows(*(getattr(plan.rows, each).copy() for each in INPUTS))
     unused = PlannedRows.empty(plan.shard_rows, rows.modification.shape[1])
     for job in jobs:

@@ -21,7 +21,15 @@ from photonfarm.shared.core.errors import CorruptError, SpecError, StoreError, s
 from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.plan.joined import Joined
-from photonfarm.shared.plan.request import MAX_SHARD_ROWS, SHARD_ROWS, Extent, PlannedContent, Request, SamplesToPlan
+from photonfarm.shared.plan.request import (
+    MAX_SHARD_ROWS,
+    SHARD_ROWS,
+    UNUSED,
+    Extent,
+    PlannedContent,
+    Request,
+    SamplesToPlan,
+)
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
@@ -124,11 +132,25 @@ class SceneStore:
                 try:
                     plans.build(built, self.spec, request, expansion.rows, **numbers, halves_from=halves_from)
                     if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
+                        if self._leans_on_withdrawn(len(found), found):
+                            continue
                         jobs = len(expansion.rows.sample_pass) // rows_per_job
                         new, known, extent = expansion.new, expansion.known, expansion.extent
                         return PlanResult(self.scene_id, len(found), new, known, jobs, extent)
                 finally:
                     shutil.rmtree(built, ignore_errors=True)
+
+    def _leans_on_withdrawn(self, number: int, before: list[StoredPlan]) -> bool:
+        """Whether a new plan refers to rows that were withdrawn while it was made; then it is withdrawn whole."""
+        now = self.plans()
+        gone = frozenset().union(*(new.withdrawn - old.withdrawn for new, old in zip(now, before, strict=False)))
+        plan = now[number]
+        references = np.concatenate([plan.rows.sample_view, plan.rows.sample_modification])
+        jobs = np.unique(references[references != UNUSED]) // plan.shard_rows
+        if not gone.intersection(jobs.tolist()):
+            return False
+        plans.withdraw(self.storage, self.name, number, set(range(plan.first_job, plan.end_job)))
+        return True
 
     def _shard_rows(self, found: list[StoredPlan], wanted: int | None, usual: int) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
@@ -183,6 +205,11 @@ class SceneStore:
     def withdrawn_jobs(self) -> frozenset[int]:
         """The jobs of the plans as they were last read that are not to be rendered any more."""
         return frozenset().union(*(plan.withdrawn for plan in self._plans))
+
+    def is_withdrawn(self, job: int) -> bool:
+        """Whether a job is withdrawn by now."""
+        self.plans()
+        return job in self.withdrawn_jobs()
 
     def is_to_do(self, job: int) -> bool:
         """Whether a job is planned, and neither committed nor withdrawn."""

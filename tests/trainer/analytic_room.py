@@ -33,7 +33,7 @@ def analytic_spec(
     box = {"min": [-0.8, -0.8, -0.8], "max": [0.8, 0.8, 0.8]}
     described = {
         "name": "analytic",
-        "content": "lambert",
+        "content": "box-3696",
         "credits": {"title": "A closed form", "author": "Lambert & Sons", "licence": "CC0-1.0"},
         "scene": {"builtin": "cornell"},
         "exposure": exposure,

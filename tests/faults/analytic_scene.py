@@ -16,12 +16,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
+from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format.schema import output_arrays
 from photonfarm.shared.store.write.rounding import NOISY_GUIDES
 
@@ -108,6 +110,14 @@ class AnalyticScene:
         points = np.tile(corners, (self.spec.points, 1))[: self.spec.points]
         index = np.zeros(self.spec.points)
         return geometry, BasePointCloud(points, points, points, points, index.astype(np.int16), index.astype(np.uint32))
+
+
+def render_missing(store: Store, scene_id: str, load: Callable[[SceneSpec], Any] = AnalyticScene) -> SceneStore:
+    """Render and commit every missing job of a scene in this process, by the formulas of `load`."""
+    renderer, scene = ShardRenderer(store, worker="test", load=load), store.scene(scene_id)
+    for job in scene.missing_jobs():
+        renderer.render(scene_id, job)
+    return scene
 
 
 def command(pause_s: float = 0.0, purpose: str = "") -> tuple[str, ...]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from store_samples import reader_of
 
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.jobs.repeat import repeat
@@ -13,26 +14,19 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.read.other_scenes import with_same_radiance
 
 REQUEST = Request(modifications=3, views_per_modification=2)
 
 
-def rendered(store: Store, spec: SceneSpec, analytic: ModuleType, **options: Any) -> SceneStore:
+def rendered(
+    store: Store, spec: SceneSpec, analytic: ModuleType, load: Any = None, halves_from: str | None = None
+) -> SceneStore:
     """The scene of a spec with all samples of a request rendered, in jobs of two."""
-    store.plan(spec, REQUEST, shard_rows=2, **options)
-    renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
-    scene = store.scene(spec.scene_id)
-    for job in scene.missing_jobs():
-        renderer.render(scene.scene_id, job)
+    store.plan(spec, REQUEST, shard_rows=2, halves_from=halves_from)
+    scene: SceneStore = analytic.render_missing(store, spec.scene_id, load or analytic.AnalyticScene)
     return scene
-
-
-def reader_of(scene: SceneStore) -> SceneReader:
-    reader = SceneReader(scene.storage.where, scene.scene_id)
-    reader.refresh()
-    return reader
 
 
 def with_strategy(spec: SceneSpec, **strategy: Any) -> SceneSpec:
@@ -104,9 +98,9 @@ def test_a_sample_is_repeated_by_the_strategy_that_it_was_rendered_by(
             return super().render_half(view, seed) + np.float32(self.spec.transport.connections)
 
     store = Store(tmp_path / "store", create=True)
-    scene = rendered(store, spec, type("m", (), {"AnalyticScene": Strategic}))
+    scene = rendered(store, spec, analytic, load=Strategic)
     other = analytic.small_spec(points=32)
-    taken = rendered(store, other, type("m", (), {"AnalyticScene": Strategic}), halves_from=scene.scene_id)
+    taken = rendered(store, other, analytic, load=Strategic, halves_from=scene.scene_id)
     for changed in (with_strategy(spec, connections=7), with_strategy(other, connections=7)):
         store.add(changed)
     for each in (scene, taken):
@@ -129,7 +123,7 @@ def test_a_scene_with_other_inputs_takes_halves_over_and_renders_inputs_alone(
         def render_half(self, *_: Any) -> Any:
             raise AssertionError("halves are not to be rendered")
 
-    taken = rendered(store, other, type("m", (), {"AnalyticScene": NoHalves}), halves_from=scene.scene_id)
+    taken = rendered(store, other, analytic, load=NoHalves, halves_from=scene.scene_id)
     there, here = reader_of(scene), reader_of(taken)
     assert there.rows_by_key() == here.rows_by_key()
     assert len(here.rows) == 6
@@ -192,10 +186,8 @@ def test_two_scenes_that_take_halves_from_each_other_are_repeated(
     for each, halves_from in ((spec, None), (other, spec.scene_id), (spec, other.scene_id)):
         request = REQUEST if halves_from is None else Request(modifications=4, views_per_modification=2)
         store.plan(each, request, shard_rows=None if store.has_scene(each.scene_id) else 2, halves_from=halves_from)
-    renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
     for each in (spec, other):
-        for job in store.scene(each.scene_id).missing_jobs():
-            renderer.render(each.scene_id, job)
+        analytic.render_missing(store, each.scene_id)
     for each in (spec, other):
         again = repeat(store.root, each.scene_id, 6, None, print, load=analytic.AnalyticScene)
         assert again.comparison is not None

@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from store_samples import reader_of
 
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.cli.store_verbs import join as verb
@@ -19,7 +20,7 @@ from photonfarm.shared.farm.join import join
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
 
 
@@ -27,16 +28,8 @@ def rendered(store: Store, spec: SceneSpec, analytic: ModuleType, *requests: Req
     scene = store.add(spec)
     for request in requests:
         scene.plan(request, shard_rows=None if scene.plans() else 3)
-    renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
-    for job in scene.missing_jobs():
-        renderer.render(spec.scene_id, job)
+    analytic.render_missing(store, spec.scene_id)
     return scene
-
-
-def reader_of(scene: SceneStore) -> SceneReader:
-    reader = SceneReader(scene.storage.where, scene.scene_id)
-    reader.refresh()
-    return reader
 
 
 def check_holds(scene: SceneStore, *others: SceneStore) -> None:

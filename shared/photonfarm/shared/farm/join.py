@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import Key
@@ -19,7 +18,6 @@ from photonfarm.shared.plan.joined import Joined, samples_to_join
 from photonfarm.shared.plan.request import PlannedContent, SamplesToPlan
 from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
 from photonfarm.shared.store.read.find import scene_named
-from photonfarm.shared.store.read.reader import StoredSample
 from photonfarm.shared.store.write import plans
 
 OnProgress = Callable[[str, int, int], object]
@@ -99,16 +97,12 @@ class _Copies:
                 if sample.modification_row in new_modifications and here.spec.photons.paths:
                     out.photons(sample.modification_row, self._reader.read_photons(row))
                 new_modifications.discard(sample.modification_row)
-                with_view = sample.view_row in new_views
-                read = self._reader.read(row, guides=True) if with_view else None
-                if read is not None:
-                    self._view(out, sample.view_row, read)
+                read = self._reader.read(row, guides=True) if sample.view_row in new_views else None
+                if read is not None and read.guides is not None:
+                    out.view(sample.view_row, read.buffers, read.guides, read.visibility)
                     new_views.discard(sample.view_row)
                 out.radiance(sample.row, self._reader.read_radiance(row) if read is None else read.radiance)
             return out.commit(self._figures([self._rows[sample.key] for sample in rows.samples]))
-
-    def _view(self, out: Any, row: int, read: StoredSample) -> None:
-        out.view(row, read.buffers, read.guides, read.visibility)
 
     def _figures(self, rows: list[int]) -> Figures:
         """The time that the other store's jobs took for these rows, and how the first of them was rendered."""

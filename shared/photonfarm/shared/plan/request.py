@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
@@ -115,6 +115,15 @@ class PlannedRows:
             np.full(rows, np.nan, np.float32),
             np.full(rows, np.nan, np.float32),
         )
+
+    def without(self, spans: Iterable[range]) -> PlannedRows:
+        """The same rows, but for some spans, which hold nothing."""
+        left = PlannedRows(*(getattr(self, each.name).copy() for each in fields(self)))
+        for span in spans:
+            nothing = PlannedRows.empty(len(span), self.modification.shape[1])
+            for each in fields(self):
+                getattr(left, each.name)[span.start : span.stop] = getattr(nothing, each.name)
+        return left
 
 
 class PlannedContent:
@@ -222,9 +231,8 @@ def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_jo
     the job of its first sample; so everything that a job must render lies in its own rows.
     """
     candidates, named = _candidates(spec, request, known)
-    rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
-    new = len(candidates.sample_pass)
-    return Expansion(rows, new, named - new, candidates.extent())
+    planned = named - len(candidates.sample_pass)
+    return expand_samples(candidates, first_job=first_job, shard_rows=shard_rows, known=planned)
 
 
 def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tuple[SamplesToPlan, int]:
@@ -300,6 +308,12 @@ def pack(candidates: SamplesToPlan, *, first_row: int, shard_rows: int) -> Plann
     rows.sample_pass[:count] = candidates.sample_pass
     rows.sample_key[:count] = candidates.sample_key
     return rows
+
+
+def expand_samples(samples: SamplesToPlan, *, first_job: int, shard_rows: int, known: int = 0) -> Expansion:
+    """The rows of new samples in jobs from number `first_job` on; `known` others are planned already."""
+    rows = pack(samples, first_row=first_job * shard_rows, shard_rows=shard_rows)
+    return Expansion(rows, len(samples.sample_pass), known, samples.extent())
 
 
 def _place(

@@ -15,7 +15,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.format import markers
+from photonfarm.shared.store.format import markers, withdrawn
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.status import scene_status
 from photonfarm.shared.store.write.withdrawal import withdraw
@@ -143,7 +143,7 @@ def test_processes_that_follow_see_each_withdrawal_of_a_plan(scene: SceneStore) 
     reader, other = samples.reader_of(scene), fresh(scene)
     other.plans()
     for jobs in ({1}, {1, 3}, {3}):
-        plans.withdraw(scene.storage, scene.name, 0, jobs)
+        withdrawn.write(scene.storage, f"{scene.name}/plans/000000", jobs)
         reader.refresh()
         assert reader.planned == 8 - 2 * len(jobs)
         assert other.missing_jobs() == sorted({1, 3} - jobs)

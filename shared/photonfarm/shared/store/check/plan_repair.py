@@ -71,13 +71,10 @@ class PlanRepair:
             shutil.rmtree(built, ignore_errors=True)
 
     def _about(self, folder: str) -> PlanAttributes:
-        import zarr
-
         try:
-            group = zarr.open_group(self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
-            return plans.about_plan(dict(group.attrs))
-        except (ValueError, KeyError, TypeError, RuntimeError, FileNotFoundError) as error:
-            raise self._hopeless(folder, f"its zarr.json cannot be read: {error}") from error
+            return plans.read_about(self._storage, folder)
+        except CorruptError as error:
+            raise self._hopeless(folder, f"its zarr.json cannot be read: {error.__cause__}") from error
 
     def _rows(self, folder: str, about: PlanAttributes, before: list[StoredPlan]) -> PlannedRows:
         """The rows that the request gives after the earlier plans."""

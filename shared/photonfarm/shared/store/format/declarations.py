@@ -21,6 +21,9 @@ from photonfarm.shared.core.keys import KEY_BYTES
 FORMAT = "photonfarm store"
 VERSION = 5
 
+PARTS = 2
+"""The independent parts of a sample: the halves A and B."""
+
 
 def stamp() -> dict[str, Any]:
     """The format and its version, as the store and every Zarr group in it state them."""
@@ -355,24 +358,6 @@ PLAN_INPUTS = (
     ),
 )
 """The arrays of a plan's inputs."""
-
-FIELDS = {
-    "modification": (
-        {"name": "x", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
-        {"name": "y", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
-        {"name": "z", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
-        {"name": "present", "unit": "1", "rest": 1.0, "zero": "removed"},
-    ),
-    "view": tuple(
-        {"name": f"{point}_{axis}", "unit": "scene units", "rest": 0.0, "zero": "the origin of world coordinates"}
-        for point in ("origin", "look_at")
-        for axis in "xyz"
-    ),
-}
-"""What the columns of `modification`, for each group, and of `view` hold. More may follow; a plan names those it has.
-
-A field that a plan lacks is at `rest` in all of its rows. `zero` says what 0 means.
-"""
 
 BASE = {
     "geometry": (

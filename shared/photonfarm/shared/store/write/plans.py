@@ -6,8 +6,7 @@ Shape letters: R rows of a plan, J `shard_rows`. Row r of a scene belongs to job
 from __future__ import annotations
 
 import contextlib
-import json
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,16 +26,14 @@ from photonfarm.shared.plan.request import (
     PlannedContent,
     PlannedRows,
     Request,
-    SamplesToPlan,
     expand,
-    pack,
 )
 from photonfarm.shared.plan.top_up import TopUp, expand_top_up
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.format import declarations, schema
-from photonfarm.shared.store.io.storage import Storage, put_json
+from photonfarm.shared.store.format import declarations, schema, vectors, withdrawn
+from photonfarm.shared.store.io.storage import Storage
 
 PLANS = "plans"
 NAME_DIGITS = 6
@@ -52,9 +49,6 @@ RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a co
 
 REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
 """The remedy for most damage of a plan."""
-
-PARTS = 2
-"""The independent parts of a sample: the halves A and B."""
 
 INPUTS = [field.name for field in fields(PlannedRows)]
 """The names of a plan's arrays of inputs."""
@@ -117,7 +111,8 @@ class PlanAttributes:
     first_job: int
     jobs: int
     shard_rows: int
-    halves_from: str | None = None
+    radiance_exponent: int  # the power of two by which radiance is stored
+    halves_from: str | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,9 +136,6 @@ class JobRows:
     views: dict[int, View]  # by row: all that the samples refer to
     new_modifications: frozenset[int]  # rows whose photons this job produces
     new_views: frozenset[int]  # rows whose buffers this job produces
-
-
-# ---------------------------------------------------------------------------------------------------------------------
 
 
 def folder(scene: str, number: int) -> str:
@@ -171,12 +163,6 @@ def expanded(
     return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
 
 
-def packed(samples: SamplesToPlan, *, first_job: int, shard_rows: int) -> Expansion:
-    """The rows of samples, in jobs from number `first_job` on."""
-    rows = pack(samples, first_row=first_job * shard_rows, shard_rows=shard_rows)
-    return Expansion(rows, len(samples.sample_pass), 0, samples.extent())
-
-
 def build(
     part: Path,
     spec: SceneSpec,
@@ -199,7 +185,7 @@ def build(
         "radiance_id": spec.radiance_id,
         "inputs_id": spec.inputs_id,
         "inputs": spec.inputs(),
-        "parts": PARTS,
+        "parts": declarations.PARTS,
         "radiance_exponent": spec.radiance_exponent,
         "request": request.model_dump(mode="json"),
         "first_job": first_job,
@@ -210,33 +196,9 @@ def build(
     with group_in(part) as store:
         group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
         for declared in declarations.PLAN_INPUTS:
-            more: dict[str, Any] = {}
-            if declared.name in declarations.FIELDS:
-                more["fields"] = list(declarations.FIELDS[declared.name])
-            if declared.name == "modification":
-                more["groups"] = [each.name for each in spec.groups]
+            more = vectors.attributes(declared.name, [each.name for each in spec.groups])
             schema.create_input(group, declared, getattr(rows, declared.name), more)
         schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
-
-
-def radiance_exponent(storage: Storage, scene: str) -> int | None:
-    """The power of two by which a scene's plans store radiance; None without plans.
-
-    Raises CorruptError if there are plans and none can be read.
-    """
-    import zarr
-
-    error: Exception | None = None
-    for number in range(count(storage, scene)):
-        name = folder(scene, number)
-        try:
-            group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
-            return int(str(group.attrs["radiance_exponent"]))
-        except (FileNotFoundError, ValueError, KeyError, TypeError, RuntimeError) as failed:
-            error = failed
-    if error is not None:
-        raise CorruptError(f"{storage.where}/{scene}/{PLANS}: no plan can be read, and the spec is lost; {RESTORE}")
-    return None
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
@@ -250,9 +212,20 @@ def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: i
         end = _counted(storage, scene, names, len(loaded)) if until is None else until
         found = loaded + [_load(storage, scene, number) for number in range(len(loaded), end)]
         for number, plan in enumerate(found):
-            if withdrawal(scene, number).rpartition("/")[2] in names:
-                found[number] = _without_withdrawn(storage, scene, plan)
+            if withdrawn.name_of(plan.folder).rpartition("/")[2] in names:
+                found[number] = _without(storage, scene, plan, withdrawn.read(storage, plan.folder))
         return found
+
+
+def _without(storage: Storage, scene: str, plan: StoredPlan, jobs: frozenset[int]) -> StoredPlan:
+    """The plan with the rows of jobs as unused ones."""
+    if plan.withdrawn == jobs:
+        return plan
+    if plan.withdrawn:  # others than now
+        plan = _load(storage, scene, plan.number)
+    first_rows = ((job - plan.first_job) * plan.shard_rows for job in jobs)
+    rows = plan.rows.without(range(first, first + plan.shard_rows) for first in first_rows)
+    return replace(plan, rows=rows, withdrawn=jobs)
 
 
 def count(storage: Storage, scene: str) -> int:
@@ -277,73 +250,33 @@ def _counted(storage: Storage, scene: str, names: list[str], loaded: int) -> int
 
 def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     """A plan; raises CorruptError if it is missing or not as it was written."""
-    import zarr
-
     name = folder(scene, number)
+    group, about = _opened(storage, name)
     with _unreadable(storage, name):
-        group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
-        check_version(group.attrs, f"{storage.where}/{name}")
-        about = about_plan(dict(group.attrs))
         rows = PlannedRows(*(_input(storage, name, group, each) for each in INPUTS))
-    numbers = about.first_job, about.jobs, about.shard_rows
     named = int(np.count_nonzero(rows.sample_modification != UNUSED))
+    numbers = about.first_job, about.jobs, about.shard_rows
     return StoredPlan(number, name, about.request, *numbers, rows, about.halves_from, named=named)
 
 
-def withdrawal(scene: str, number: int) -> str:
-    """The file that names the withdrawn jobs of a plan."""
-    return f"{folder(scene, number)}.withdrawn.json"
+def read_about(storage: Storage, name: str) -> PlanAttributes:
+    """The attributes of the plan in a folder; raises CorruptError if they are missing or not as they were written."""
+    return _opened(storage, name)[1]
 
 
-def withdraw(storage: Storage, scene: str, number: int, jobs: Set[int]) -> None:
-    """Name the jobs of a plan whose rows no longer count, in place of those named before."""
-    put_json(storage, {"jobs": sorted(jobs)}, withdrawal(scene, number), replace=True)
+def _opened(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
+    import zarr
 
-
-def _without_withdrawn(storage: Storage, scene: str, plan: StoredPlan) -> StoredPlan:
-    """The plan with the rows of its withdrawn jobs as unused ones; itself if it has them so already."""
-    name = withdrawal(scene, plan.number)
-    try:
-        jobs = [int(job) for job in json.loads(storage.read(name))["jobs"]]
-    except (ValueError, KeyError, TypeError) as error:
-        raise CorruptError(f"{storage.where}/{name}: names no jobs: {error}; put it back from a copy") from error
-    if plan.withdrawn == frozenset(jobs):
-        return plan
-    if plan.withdrawn:  # others than now: what was masked is read anew
-        plan = _load(storage, scene, plan.number)
-    rows = PlannedRows(*(getattr(plan.rows, each).copy() for each in INPUTS))
-    unused = PlannedRows.empty(plan.shard_rows, rows.modification.shape[1])
-    for job in jobs:
-        first = (job - plan.first_job) * plan.shard_rows
-        for each in INPUTS:
-            getattr(rows, each)[first : first + plan.shard_rows] = getattr(unused, each)
-    return replace(plan, rows=rows, withdrawn=frozenset(jobs))
+    with _unreadable(storage, name):
+        group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
+        check_version(group.attrs, f"{storage.where}/{name}")
+        return group, about_plan(dict(group.attrs))
 
 
 def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]:
     """An array of inputs; one of vectors has the columns that this program knows, in their order."""
     values = schema.read_input(storage, f"{folder}/{name}", group[name])
-    if name not in declarations.FIELDS:
-        return values
-    stored = [str(field["name"]) for field in group[name].attrs["fields"]]
-    return by_name(values, stored, declarations.FIELDS[name])
-
-
-def by_name(values: F32, stored: Sequence[str], known: Sequence[Mapping[str, Any]]) -> F32:
-    """Vectors (…, F) whose columns have the names `stored`, with the `known` fields; those not stored are at rest.
-
-    Unused rows stay NaN. Raises ValueError for a field that is not known.
-    """
-    names = [field["name"] for field in known]
-    if list(stored) == names:
-        return values
-    if unknown := [name for name in stored if name not in names]:
-        raise ValueError(f"has the field {unknown[0]}, which this program does not know: install a newer photonfarm")
-    found = np.empty((*values.shape[:-1], len(names)), np.float32)
-    for place, field in enumerate(known):
-        at_rest = np.where(np.isnan(values[..., 0]), np.float32(np.nan), np.float32(field["rest"]))
-        found[..., place] = values[..., stored.index(field["name"])] if field["name"] in stored else at_rest
-    return found
+    return vectors.known(name, values, group[name].attrs) if name in vectors.FIELDS else values
 
 
 @contextlib.contextmanager
@@ -372,8 +305,10 @@ def check_version(attributes: Mapping[str, Any], where: str) -> None:
 def about_plan(attributes: dict[str, Any]) -> PlanAttributes:
     """Read the attributes of a plan's group; raises ValueError or KeyError."""
     request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
-    first_job, jobs, shard_rows = (int(attributes[name]) for name in ("first_job", "jobs", "shard_rows"))
-    return PlanAttributes(request, first_job, jobs, shard_rows, attributes.get("halves_from"))
+    first_job, jobs, shard_rows, exponent = (
+        int(attributes[name]) for name in ("first_job", "jobs", "shard_rows", "radiance_exponent")
+    )
+    return PlanAttributes(request, first_job, jobs, shard_rows, exponent, attributes.get("halves_from"))
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

@@ -29,10 +29,11 @@ from photonfarm.shared.plan.request import (
     PlannedContent,
     Request,
     SamplesToPlan,
+    expand_samples,
 )
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format import declarations, markers, schema
+from photonfarm.shared.store.format import declarations, markers, schema, withdrawn
 from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.io.storage import Storage, put_json
 from photonfarm.shared.store.write import plans
@@ -124,7 +125,7 @@ class SceneStore:
             if samples is None:
                 expansion = plans.expanded(self.spec, request, found, **numbers)
             else:
-                expansion = plans.packed(samples(plans.content(found)), **numbers)
+                expansion = expand_samples(samples(plans.content(found)), **numbers)
             if expansion.rows is None or dry_run:
                 return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
             with store_errors("write a plan", self.storage.where):
@@ -149,7 +150,7 @@ class SceneStore:
         jobs = np.unique(references[references != UNUSED]) // plan.shard_rows
         if not gone.intersection(jobs.tolist()):
             return False
-        plans.withdraw(self.storage, self.name, number, set(range(plan.first_job, plan.end_job)))
+        withdrawn.write(self.storage, plan.folder, set(range(plan.first_job, plan.end_job)))
         return True
 
     def _shard_rows(self, found: list[StoredPlan], wanted: int | None, usual: int) -> int:
@@ -328,10 +329,24 @@ def write_spec(storage: Storage, spec: SceneSpec) -> None:
     folder = f"{SCENES}/{spec.scene_id}"
     name = f"{folder}/spec.json"
     there = read_spec(storage, spec.scene_id) if storage.exists(name) else None
-    exponent = plans.radiance_exponent(storage, folder) if there is None else there.radiance_exponent
+    exponent = _exponent_of_plans(storage, folder) if there is None else there.radiance_exponent
     stored = spec.model_copy(update={"stored_exponent": spec.radiance_exponent if exponent is None else exponent})
     if stored != there:
         put_json(storage, stored.model_dump(mode="json"), name, replace=there is not None)
+
+
+def _exponent_of_plans(storage: Storage, scene: str) -> int | None:
+    """The power of two by which plans whose spec is lost store radiance; None without plans.
+
+    Raises CorruptError if there are plans and none can be read.
+    """
+    numbers = range(plans.count(storage, scene))
+    for number in numbers:
+        with contextlib.suppress(CorruptError):
+            return plans.read_about(storage, plans.folder(scene, number)).radiance_exponent
+    if numbers:
+        raise CorruptError(f"{storage.where}/{scene}: the spec is lost, and no plan can be read; {plans.RESTORE}")
+    return None
 
 
 def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import SpecError, store_errors
 from photonfarm.shared.plan.request import UNUSED
-from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.format import withdrawn
 from photonfarm.shared.store.write.plans import StoredPlan
 from photonfarm.shared.store.write.scene_store import SceneStore
 
@@ -46,10 +46,10 @@ def withdraw(scene: SceneStore, number: int | None = None) -> Withdrawal:
     jobs = _withdrawable(scene, found, plan, committed)
     with store_errors("withdraw a plan", scene.storage.where):
         if jobs:
-            plans.withdraw(scene.storage, scene.name, plan.number, plan.withdrawn | jobs)
+            withdrawn.write(scene.storage, plan.folder, plan.withdrawn | jobs)
             if late := jobs & scene.committed_jobs():  # committed while this was decided: they stay
                 jobs = _withdrawable(scene, found, plan, committed | late)
-                plans.withdraw(scene.storage, scene.name, plan.number, plan.withdrawn | jobs)
+                withdrawn.write(scene.storage, plan.folder, plan.withdrawn | jobs)
     samples = {job: plan.samples_in(job) for job in range(plan.first_job, plan.end_job)}
     rendered = sum(count for job, count in samples.items() if job in scene.committed_jobs())
     forgotten = sum(samples[job] for job in jobs)

@@ -11,6 +11,10 @@ import mitsuba as mi
 import numpy as np
 
 from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.importing.loading import load
+from photonfarm.renderer.importing.proposal.proposed import Proposal, propose
+from photonfarm.renderer.importing.proposal.surfaces import Frame
+from photonfarm.renderer.importing.readers import reader_of
 
 Read = Callable[[Path], ImportedScene]
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
@@ -33,3 +37,11 @@ def of_type(root: Element, kind: str) -> Element:
 def losses(scene: ImportedScene) -> list[tuple[Any, str]]:
     """What of the picture differs: the effects and the names."""
     return [(change.effect, change.name) for change in scene.changes if change.effect is not None]
+
+
+def proposed(file: Path, scratch: Path) -> tuple[Proposal, Any]:
+    """The proposal for a file, and its Mitsuba scene."""
+    scene = reader_of(file)(file, scratch, lambda _: None)
+    made, frame = load(scene, scratch, lambda _: None), Frame((0, 1, 0))
+    camera = None if scene.camera is None else frame.inward(np.array(scene.camera))
+    return propose(made, frame, camera, scene.objects, lambda _: None), made

@@ -9,13 +9,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from obj_scenes import SQUARE
 from PIL import Image
 
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.loading import load
+from photonfarm.renderer.importing.proposal import surfaces
 from photonfarm.renderer.importing.readers import reader_of
 
+STRENGTH = "KHR_materials_emissive_strength"
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
 FACES = np.array([[0, 1, 2], [0, 2, 3]], "<u4")
 SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -206,3 +209,33 @@ def write_xml(tmp_path: Path) -> Callable[..., Path]:
         return tmp_path / "scene.xml"
 
     return make
+
+
+@pytest.fixture
+def few_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A third of the points on surfaces, which is quicker."""
+    monkeypatch.setattr(surfaces, "SAMPLES_PER_CELL", 1.3)
+
+
+@pytest.fixture
+def put(gltf: Any) -> Callable[..., None]:
+    """Function (name, low, high, light, inwards) → adds a box, or a panel that faces down if it is flat."""
+
+    def add(name: str, low: Any, high: Any, *, light: float = 0, inwards: bool = False) -> None:
+        mesh = trimesh.creation.box(bounds=[low, np.add(high, (0, low[1] == high[1], 0))])
+        if low[1] == high[1]:
+            mesh.update_faces(mesh.face_normals[:, 1] < -0.5)
+        if inwards:
+            mesh.invert()
+        look = {"emissiveFactor": [1, 1, 1], "extensions": {STRENGTH: {"emissiveStrength": light}}} if light else {}
+        material = gltf.material(name, doubleSided=True, **look)
+        gltf.node(name, gltf.mesh(mesh.vertices.astype("<f4"), mesh.faces.astype("<u4"), material))
+
+    return add
+
+
+@pytest.fixture
+def room(put: Callable[..., None]) -> None:
+    """A closed room of 5 × 4 × 2.6 with a table."""
+    put("Shell", (0, 0, 0), (5, 2.6, 4), inwards=True)
+    put("Table", (2, 0, 1.5), (3.2, 0.75, 2.2))

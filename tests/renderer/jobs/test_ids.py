@@ -12,8 +12,10 @@ from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.jobs.repeat import repeat
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import arrays_of
+from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.read.other_scenes import with_same_radiance
 
@@ -192,3 +194,11 @@ def test_two_scenes_that_take_halves_from_each_other_are_repeated(
         again = repeat(store.root, each.scene_id, 6, None, print, load=analytic.AnalyticScene)
         assert again.comparison is not None
         assert again.comparison.is_equal
+
+
+def test_a_submission_says_what_it_has_replaced_of_the_stored_spec(tmp_path: Path, analytic: ModuleType) -> None:
+    store, replaced = tmp_path / "store", []
+    for changes in ({}, {}, {"exposure": 2.0}, {"exposure": 2.0, "transport": {"connections": 0}}):
+        named = NamedSpec("room.toml", analytic.small_spec(**changes), None)
+        replaced.append(submit(named, store, None, REQUEST).replaced)
+    assert replaced == [None, None, "exposure (1.0 before, 2.0 now)", "transport.connections (1 before, 0 now)"]

@@ -127,6 +127,9 @@ def _lead(
         source, waited = StoreSource(store, scene_id, exposure), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
             log(f"waiting for scene {scene_id}, {_lacks(Store(store), scene_id, spec)}")
+        elif spec is not None and source.ready() and spec.exposure != source.spec.exposure:
+            of = "the run began with" if exposure else "the store has"
+            log(f"exposure is {source.spec.exposure:g}, which {of}, and not {spec.exposure:g} as the spec says")
         progress, begun = RunProgress(settings.max_steps, settings.batch), False
 
         def drawn(draws: int, samples: int) -> None:

@@ -128,6 +128,8 @@ def submission(result: Submission, as_json: bool) -> None:
     )
     if result.note:
         click.echo(result.note, err=True)
+    if result.replaced:
+        click.echo(f"the store's spec is replaced, and no sample changes: {result.replaced}", err=True)
     if result.halves_from:
         click.echo(f"jobs take over the halves that scene {result.halves_from} has, and render the rest", err=True)
     if result.scenes:

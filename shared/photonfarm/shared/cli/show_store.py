@@ -231,5 +231,6 @@ def withdrawn(result: Withdrawal, as_json: bool) -> None:
         return
     kept = f", {result.kept} stay planned, as rendered ones show their views or configurations" if result.kept else ""
     jobs = "1 job" if result.jobs == 1 else f"{result.jobs} jobs"
-    said = f"{result.samples} samples in {jobs} are forgotten; {result.rendered} are rendered and stay{kept}"
+    forgotten = f"{result.samples} samples in {jobs} are forgotten" if result.jobs else "nothing is left to withdraw"
+    said = f"{forgotten}; {result.rendered} are rendered and stay{kept}"
     click.echo(f"plan {result.plan} of scene {result.scene_id} ({result.name}): {said}")

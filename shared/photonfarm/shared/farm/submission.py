@@ -9,9 +9,11 @@ from pathlib import Path
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError, SpecError, store_errors
+from photonfarm.shared.core.models import differing
 from photonfarm.shared.farm.job_size import WORKERS, rows_per_job
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
+from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import scene_named
@@ -30,6 +32,7 @@ class Submission:
     dry_run: bool = False  # nothing was written
     note: str | None = None  # that the store has another scene of this name, and how it differs
     halves_from: str | None = None  # the scene whose halves jobs take over
+    replaced: str | None = None  # what of the stored spec this one has replaced, in words
     scenes: str | None = None  # folder that workers must have in PHOTONFARM_SCENES to find the scene file, if any must
 
 
@@ -63,13 +66,23 @@ def submit(
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
     other = scene_named(opened, halves_from) if halves_from else with_same_radiance(opened, named.spec)
+    before = opened.scene(named.spec.scene_id).spec if opened.has_scene(named.spec.scene_id) else None
     planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     queued = _queued(opened, redis_url, retry=retry)
     return Submission(
         planned.scene_id, planned.plan, planned.new, planned.known, queued,
         note=first_plan_note(opened, named.spec) if planned.plan == 0 else None,
-        halves_from=other if planned.new else None, scenes=named.scenes,
+        halves_from=other if planned.new else None,
+        replaced=None if before is None else _replaced(before, named.spec),
+        scenes=named.scenes,
     )  # fmt: skip
+
+
+def _replaced(there: SceneSpec, here: SceneSpec) -> str | None:
+    """What a stored spec has lost to a submitted one of the same ids, in words; None if they agree."""
+    then, now = (spec.model_dump(mode="json", exclude={"scene", "stored_exponent"}) for spec in (there, here))
+    changes = differing(then, now)
+    return ", ".join(f"{key} ({was} before, {is_} now)" for key, (was, is_) in changes.items()) or None
 
 
 def top_up(

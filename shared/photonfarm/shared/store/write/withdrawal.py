@@ -39,7 +39,7 @@ def withdraw(scene: SceneStore, number: int | None = None) -> Withdrawal:
     """
     found = scene.plans()
     if not found or (number is not None and number >= len(found)):
-        there = f"it has {len(found)} plans, numbered from 0" if found else "nothing is planned"
+        there = f"the last one is {len(found) - 1}" if found else "nothing is planned"
         raise SpecError(f"scene {scene.scene_id} ({scene.spec.name}): has no plan {number or 0}; {there}")
     plan = found[-1 if number is None else number]
     committed = scene.committed_jobs()

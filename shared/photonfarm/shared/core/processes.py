@@ -126,6 +126,17 @@ class Stop:
         return self._is_set
 
 
+def is_gone(process: int) -> bool:
+    """Whether no process of this machine, or container, has that number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        return False
+    return False
+
+
 @cache
 def process_space() -> str:
     """The scope in which process numbers are unique: containers may share a host's name, but not its processes."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.core.processes import process_space
+from photonfarm.shared.core.processes import is_gone, process_space
 from photonfarm.shared.store.io.storage import FOREIGN_AGE_S, STRAY_AGE_S, TMP
 
 if TYPE_CHECKING:
@@ -128,6 +128,19 @@ class LocalStorage:
         """Rename a folder, at once; raises FileNotFoundError."""
         self.move(folder, new_folder)
 
+    def delete(self, name: str) -> None:
+        """Remove a file, if it is there."""
+        (self.root / name).unlink(missing_ok=True)
+
+    def delete_folder(self, folder: str) -> None:
+        """Remove a folder, if it is there: first its name, at once, then what is in it."""
+        self.require()
+        part = self.part()
+        with contextlib.suppress(FileNotFoundError):
+            (self.root / folder).rename(part)
+            sync((self.root / folder).parent)
+            shutil.rmtree(part)
+
     def settle(self, names: Iterable[str]) -> None:
         """Sync the folders that the names are in."""
         for folder in sorted({(self.root / name).parent for name in names}):
@@ -188,13 +201,7 @@ def _is_of_the_dead(name: str) -> bool:
     owner, *numbers = name.rsplit("-", 3)  # from the right: a host's name may hold any number of -
     if owner != process_space():
         return False  # of another machine or container
-    try:
-        os.kill(int(numbers[0]), 0)
-    except ProcessLookupError:
-        return True
-    except (PermissionError, ValueError):
-        return False
-    return False
+    return numbers[0].isdecimal() and is_gone(int(numbers[0]))
 
 
 def _remove(path: Path) -> None:

@@ -227,14 +227,27 @@ class ObjectStorage:
         were moved after they had seen them.
         """
         self.move(f"{folder}/{ROOT}", f"{new_folder}/{ROOT}")
-        with os_errors(folder):
-            found = patiently(
-                lambda: [about["path"] for batch in obstore.list(self._objects, folder) for about in batch]
-            )
-        for name in found:
+        for name in self._below(folder):
             self.move(name, new_folder + name.removeprefix(folder))
         if self.exists(claim_of(folder)):
             self.move(claim_of(folder), claim_of(new_folder))
+
+    def delete(self, name: str) -> None:
+        """Delete an object, if it is there."""
+        with contextlib.suppress(FileNotFoundError), os_errors(name):
+            patiently(lambda: obstore.delete(self._objects, name))
+
+    def delete_folder(self, folder: str) -> None:
+        """Delete all objects below a folder, its claim included."""
+        for name in self._below(folder):
+            self.delete(name)
+
+    def _below(self, folder: str) -> list[str]:
+        """The names of all objects below a folder."""
+        with os_errors(folder):
+            return patiently(
+                lambda: [about["path"] for batch in obstore.list(self._objects, folder) for about in batch]
+            )
 
     def settle(self, names: Iterable[str]) -> None:
         """Return at once: what has been put is durable."""

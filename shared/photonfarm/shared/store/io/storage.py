@@ -80,6 +80,12 @@ class Storage(Protocol):
         The group's own zarr.json goes first, if not all go at once. Raises FileNotFoundError if there is none.
         """
 
+    def delete(self, name: str) -> None:
+        """Remove a name, if it is there."""
+
+    def delete_folder(self, folder: str) -> None:
+        """Remove all names below a folder, if there are any; not at once in a bucket."""
+
     def settle(self, names: Iterable[str]) -> None:
         """Return once these names are as durable as their bytes."""
 

@@ -164,7 +164,7 @@ class Pool:
 def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
     """Give a job its contents in the order that a worker has, as fast as they are taken."""
     rows = scene.job_rows(job)
-    with scene.job_writer(job) as out:
+    with scene.job_writer(scene.job_rows(job)) as out:
         for kind, row, sample in in_order(rows):
             modification, view = rows.modifications[sample.modification_row], rows.views[sample.view_row]
             if kind == "modification" and scene.spec.photons.paths:
@@ -249,8 +249,7 @@ class EncodedWriter(JobWriter):
 def commit_encoded(scene: SceneStore, job: int, contents: EncodedPool) -> None:
     """What `commit` does, with rows encoded before."""
     rows = scene.job_rows(job)
-    plan = next(plan for plan in scene.plans() if plan.first_job <= job < plan.end_job)
-    with EncodedWriter(scene, rows, plan) as out:
+    with EncodedWriter(scene, rows) as out:
         for kind, row, _ in in_order(rows):
             if kind != "modification" or scene.spec.photons.paths:
                 out.give(kind, row, contents.next(kind))

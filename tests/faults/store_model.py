@@ -116,7 +116,7 @@ class Writer:
 
     def __init__(self, number: int, scene: SceneStore, job: int) -> None:
         self.number, self.job, self.spec = number, job, scene.spec
-        self.out = scene.job_writer(job)
+        self.out = scene.job_writer(scene.job_rows(job))
         rows = scene.job_rows(job)
         vectors = {row: modification.vector.tobytes() for row, modification in rows.modifications.items()}
         views = {

@@ -106,7 +106,7 @@ def base() -> tuple[Geometry, BasePointCloud]:
 
 def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGURES, **options: Any) -> bool:
     """Hand a job's outputs to the store, and commit them."""
-    with scene.job_writer(job) as out:
+    with scene.job_writer(scene.job_rows(job)) as out:
         for row, photons_ in given.photons.items():
             out.photons(row, photons_)
         for row, buffers in given.buffers.items():

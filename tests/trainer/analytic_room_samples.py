@@ -130,7 +130,7 @@ def commit_job(scene: SceneStore, job: int) -> bool:
     photons = {}
     if scene.spec.photons.paths:
         photons = {row: trace(scene.spec, modification, row) for row, modification in rows.modifications.items()}
-    with scene.job_writer(job) as out:
+    with scene.job_writer(scene.job_rows(job)) as out:
         for sample in rows.samples:
             shown = rows.modifications[sample.modification_row], rows.views[sample.view_row]
             clean, buffers = render(scene.spec, *shown)

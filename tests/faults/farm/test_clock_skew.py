@@ -51,7 +51,7 @@ def test_a_sweep_by_a_machine_with_a_wrong_clock_leaves_what_living_writers_need
     folder = mine.with_name("another-machine-1a2b3c4d5e-17-1-0.partial")  # a plan, on its way
     foreign.write_bytes(b"half a file")
     folder.mkdir()
-    with scene.job_writer(0) as out:
+    with scene.job_writer(scene.job_rows(0)) as out:
         for row, photons in given.photons.items():
             out.photons(row, photons)
         for row, buffers in given.buffers.items():
@@ -104,7 +104,7 @@ def test_a_part_whose_stamp_lies_in_the_future_is_left_until_that_is_past(scene:
 def test_a_part_stamped_by_a_machine_that_is_hours_behind_is_left_to_its_writer(scene: SceneStore, hours: int) -> None:
     """This holds up to a day, the documented age: clocks of one farm differ by less, or its stamps are the server's."""
     given = samples.outputs(scene, 0)
-    with scene.job_writer(0) as out:
+    with scene.job_writer(scene.job_rows(0)) as out:
         for row, photons in given.photons.items():
             out.photons(row, photons)
         for row, buffers in given.buffers.items():

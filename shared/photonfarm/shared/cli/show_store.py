@@ -18,10 +18,12 @@ from photonfarm.shared.cli.show import print_json
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.waiting import SILENCE_S
 from photonfarm.shared.farm.join import JoinedScene, OnProgress
+from photonfarm.shared.store import Store
 from photonfarm.shared.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import WrittenView
 from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
+from photonfarm.shared.store.write.forgetting import Forgotten
 from photonfarm.shared.store.write.withdrawal import Withdrawal
 
 
@@ -221,7 +223,32 @@ def joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
         click.echo(f"{scene.name} {scene.scene_id}: {said}")
 
 
-# ------------------------------------------------------------------------------------------------------------- withdraw
+# ------------------------------------------------------------------------------------------- withdraw, forget, waiting
+
+
+def waiting(sentence: str) -> None:
+    """Print whom a verb waits for."""
+    click.echo(sentence, err=True)
+
+
+def contents(store: Store, scene_id: str) -> str:
+    """What there is of a scene, in words."""
+    try:
+        scene = store.scene(scene_id)
+        progress = scene.progress()
+    except StoreError:
+        return f"the damaged scene {scene_id}"
+    rendered = f"{progress.committed_samples} of {progress.planned_samples} planned samples are rendered"
+    return f"scene {scene_id} ({scene.spec.name}), of which {rendered},"
+
+
+def forgotten(result: Forgotten, as_json: bool) -> None:
+    """Print that a scene is forgotten."""
+    if as_json:
+        print_json(asdict(result))
+        return
+    jobs = "1 rendered job" if result.jobs == 1 else f"{result.jobs} rendered jobs"
+    click.echo(f"scene {result.scene_id} is forgotten, with {jobs}")
 
 
 def withdrawn(result: Withdrawal, as_json: bool) -> None:

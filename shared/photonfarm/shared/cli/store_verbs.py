@@ -26,11 +26,12 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
     """Read everything that is stored, and say what is wrong with it; without --repair nothing is written.
 
     Every checksum, every file that a marker names, every number: NaN, infinite, black, repeated seeds, halves A and B
-    that differ by more than chance, views that see only back faces. Safe while workers and trainers are at work.
+    that differ by more than chance, views that see only back faces. It reads at any time.
 
     --repair moves damaged jobs to the store's folder `quarantine`, each with a record of why, so that workers find them
     missing and render them again. Damaged inputs of a plan it copies there, and writes them again from the plan's
-    request. It only moves files; in a bucket, a move is a copy and then a delete.
+    request. It only moves files; in a bucket, a move is a copy and then a delete. For that it has the scene for itself:
+    it waits for the jobs in hand, and workers and trainers of the scene wait for it.
 
     Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside, and is written again or will be by the workers,
     4 something is wrong (also where --repair does not help, which the text says).
@@ -49,6 +50,7 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
             when=datetime.now(UTC).isoformat(timespec="seconds"),
             repair=repair,
             on_progress=on_progress,
+            on_wait=show_store.waiting,
         )
     show_store.check(report, as_json)
     sys.exit(report.exit_code)
@@ -153,8 +155,9 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
     """Copy the complete samples of the store OTHER, a folder or bucket, into this one, which may be new.
 
     Scenes are joined by their ids: samples that are here already are left out, and those that are planned here and not
-    rendered yet are filled in. Every byte is checked on the way. It may be stopped and repeated at any time, and
-    workers may be at work; OTHER is only read.
+    rendered yet are filled in. Every byte is checked on the way. It may be stopped and repeated at any time. It has
+    each scene for itself meanwhile: it waits for the jobs in hand, and workers and trainers of the scene wait for it.
+    OTHER is only read.
 
     Exit codes: 0 all that OTHER has complete is here; 4 a store cannot be read or written, and what is copied stays.
     """
@@ -162,7 +165,7 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
     from photonfarm.shared.farm.join import join as joined
 
     with show_store.copying() as on_progress:
-        result = joined(store, other, scene, on_progress=on_progress)
+        result = joined(store, other, scene, on_progress=on_progress, on_wait=show_store.waiting)
     show_store.joined(result, as_json)
 
 
@@ -174,8 +177,8 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
 def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> None:
     """Forget what a plan holds and nobody has rendered; what is rendered stays.
 
-    The jobs leave the queue as workers meet them. The same samples may be planned again later. Refused where a later
-    plan has passes of the plan's views: withdraw that one first.
+    It waits for the jobs in hand; the others leave the queue as workers meet them. The same samples may be planned
+    again later. Refused where a later plan has passes of the plan's views: withdraw that one first.
     """
     from photonfarm.shared.cli import show_store
     from photonfarm.shared.store import Store
@@ -183,4 +186,31 @@ def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> 
     from photonfarm.shared.store.write.withdrawal import withdraw as withdrawn
 
     opened = Store(store)
-    show_store.withdrawn(withdrawn(opened.scene(scene_named(opened, scene)), plan), as_json)
+    stored = opened.scene(scene_named(opened, scene))
+    show_store.withdrawn(withdrawn(stored, plan, on_wait=show_store.waiting), as_json)
+
+
+@click.command()
+@store_option
+@click.option("--scene", metavar="ID", required=True, help="The scene: its id, how it begins, or its name.")
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@json_option
+def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
+    """Delete a scene with all that is planned and rendered of it. This cannot be undone.
+
+    It says what there is, and asks; without a terminal it wants --yes. It waits for the jobs in hand; others leave the
+    queue as workers meet them. A trainer of the scene ends.
+    """
+    from photonfarm.shared.cli import show_store
+    from photonfarm.shared.store import Store
+    from photonfarm.shared.store.read.find import scene_named
+    from photonfarm.shared.store.write.forgetting import forget as forgotten
+
+    opened = Store(store)
+    scene_id = scene_named(opened, scene)
+    if not yes:
+        question = f"Delete {show_store.contents(opened, scene_id)} of {store}?"
+        if not sys.stdin.isatty():
+            raise click.UsageError(f"{question} Without a terminal to ask, --yes is required.")
+        click.confirm(question, abort=True, err=True)
+    show_store.forgotten(forgotten(opened, scene_id, on_wait=show_store.waiting), as_json)

@@ -2,8 +2,7 @@
 
 A join plans what the other store has complete and this one does not know, and then commits the jobs of these samples
 itself, as a worker would, with what it reads from the other store. So whatever holds for plans, jobs and markers holds
-for it: it may be killed at any point and repeated, workers may be at work meanwhile, and what it does not come to is
-a missing job, which they render.
+for it: it may be killed at any point and repeated, and what it does not come to is a missing job, which workers render.
 """
 
 from __future__ import annotations
@@ -16,9 +15,10 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.plan.joined import Joined, samples_to_join
 from photonfarm.shared.plan.request import PlannedContent, SamplesToPlan
-from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
+from photonfarm.shared.store import Figures, JobRows, SceneReader, SceneStore, Store
 from photonfarm.shared.store.read.find import scene_named
 from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write.lease import OnWait, lease
 
 OnProgress = Callable[[str, int, int], object]
 """Called with a scene's name, and how many of how many jobs are copied."""
@@ -36,10 +36,16 @@ class JoinedScene:
 
 
 def join(
-    store: str | Path, other: str | Path, scene: str | None = None, *, on_progress: OnProgress = lambda *_: None
+    store: str | Path,
+    other: str | Path,
+    scene: str | None = None,
+    *,
+    on_progress: OnProgress = lambda *_: None,
+    on_wait: OnWait = lambda _: None,
 ) -> list[JoinedScene]:
     """Copy the complete samples of every scene of another store, or of one, into a store, which may be new.
 
+    Scenes are joined one after the other, each under its lease, for which this waits with `on_wait`.
     Raises SpecError for a store joined with itself, StoreError for one that is not there or a scene that it does not
     hold, CorruptError for bytes that are not what was committed.
     """
@@ -48,7 +54,11 @@ def join(
     if source.storage.where == target.storage.where:
         raise SpecError(f"{other}: is the store that it is to be joined with; name another one")
     only = None if scene is None else scene_named(source, scene)
-    return [_join_scene(target, source, each, on_progress) for each in source.scenes(only)]
+    joined = []
+    for there in source.scenes(only):
+        with lease(target.storage, there.scene_id, "store join", on_wait):
+            joined.append(_join_scene(target, source, there, on_progress))
+    return joined
 
 
 def _join_scene(target: Store, source: Store, there: SceneStore, on_progress: OnProgress) -> JoinedScene:
@@ -67,10 +77,10 @@ def _join_scene(target: Store, source: Store, there: SceneStore, on_progress: On
     joined = Joined(store=source.store_id, samples=len(reader.rows))
     planned = here.plan(joined, usual_rows=found[0].shard_rows, samples=wanted)
     copies = _Copies(reader, there)
-    missing = [job for job in here.missing_jobs() if copies.have(here, job)]
-    for done, job in enumerate(missing):
+    missing = [rows for job in here.missing_jobs() if copies.have(rows := here.job_rows(job))]
+    for done, rows in enumerate(missing):
         on_progress(here.spec.name, done, len(missing))
-        copies.commit(here, job)
+        copies.commit(here, rows)
     on_progress(here.spec.name, len(missing), len(missing))
     return JoinedScene(there.scene_id, there.spec.name, len(reader.rows), planned.new, len(missing))
 
@@ -83,15 +93,14 @@ class _Copies:
         self._rows: dict[Key, int] = reader.rows_by_key()
         self._shard_rows = there.plans()[0].shard_rows
 
-    def have(self, here: SceneStore, job: int) -> bool:
+    def have(self, rows: JobRows) -> bool:
         """Whether the other store has all samples of a job."""
-        return all(sample.key in self._rows for sample in here.job_rows(job).samples)
+        return all(sample.key in self._rows for sample in rows.samples)
 
-    def commit(self, here: SceneStore, job: int) -> bool:
-        """Commit a job; False if a worker was faster."""
-        rows = here.job_rows(job)
+    def commit(self, here: SceneStore, rows: JobRows) -> None:
+        """Commit a job."""
         new_views, new_modifications = set(rows.new_views), set(rows.new_modifications)
-        with here.job_writer(job) as out:
+        with here.job_writer(rows) as out:
             for sample in rows.samples:
                 row = self._rows[sample.key]
                 if sample.modification_row in new_modifications and here.spec.photons.paths:
@@ -102,7 +111,7 @@ class _Copies:
                     out.view(sample.view_row, read.buffers, read.guides, read.visibility)
                     new_views.discard(sample.view_row)
                 out.radiance(sample.row, self._reader.read_radiance(row) if read is None else read.radiance)
-            return out.commit(self._figures([self._rows[sample.key] for sample in rows.samples]))
+            out.commit(self._figures([self._rows[sample.key] for sample in rows.samples]))
 
     def _figures(self, rows: list[int]) -> Figures:
         """The time that the other store's jobs took for these rows, and how the first of them was rendered."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,9 @@ from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.read.find import scene_named
 from photonfarm.shared.store.read.other_scenes import first_plan_note, other_scenes, with_same_radiance
+from photonfarm.shared.store.write.lease import at_work
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,14 +64,16 @@ def submit(
     Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
     `halves_from` is a scene of the store by its id or how it begins: jobs take over the halves it has. Without it, that
     is the scene of the same radiance with most of them, if there is one.
-    Failed jobs are queued again; with `retry` also those that were set aside. Raises SpecError, StoreError, or
-    QueueError; in the last case the plan is kept, and idle workers queue it later.
+    Failed jobs are queued again; with `retry` also those that were set aside. While somebody has the scene for itself,
+    this waits and says so. Raises SpecError, StoreError, or QueueError; in the last case the plan is kept, and idle
+    workers queue it later.
     """
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
     other = scene_named(opened, halves_from) if halves_from else with_same_radiance(opened, named.spec)
     before = opened.scene(named.spec.scene_id).spec if opened.has_scene(named.spec.scene_id) else None
-    planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
+    with at_work(opened.storage, named.spec.scene_id, "submit", log.warning):
+        planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     queued = _queued(opened, redis_url, retry=retry)
     return Submission(
         planned.scene_id, planned.plan, planned.new, planned.known, queued,
@@ -106,7 +112,8 @@ def top_up(
             f"{named.name}: {store} has no samples of scene {scene_id} that could be topped up; "
             f"{other_scenes(opened, named.spec)}; `photonfarm submit` plans the first ones"
         )
-    planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
+    with at_work(opened.storage, scene_id, "top-up", log.warning):
+        planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
     queued = None if dry_run else _queued(opened, redis_url, retry=retry)
     return TopUpSubmission(
         planned.scene_id,

@@ -65,10 +65,10 @@ def test_a_lease_waits_for_who_is_at_work_and_says_whom(storage: LocalStorage, w
 
 
 def test_nobody_begins_to_work_under_a_lease_and_other_scenes_are_free(storage: LocalStorage) -> None:
+    refused = pytest.raises(LeasedError, match=r"store forget .* has it for itself")
     with lease(storage, SCENE, "store forget", pytest.fail):
-        with pytest.raises(LeasedError, match="store forget .* has it for itself"):
-            with at_work(storage, SCENE, "worker w1 renders job 3"):
-                pytest.fail("worked under a lease")
+        with refused, at_work(storage, SCENE, "worker w1 renders job 3"):
+            pytest.fail("worked under a lease")
         with at_work(storage, SCENE[::-1], "worker w1 renders job 3"):
             pass
     with at_work(storage, SCENE, "worker w1 renders job 3"):

@@ -178,7 +178,7 @@ def test_a_store_that_goes_under_a_worker_is_told_and_not_begun_anew(
     given = samples.outputs(scene, 1)
 
     def work() -> None:
-        with scene.job_writer(1) as out:
+        with scene.job_writer(scene.job_rows(1)) as out:
             if when == "before a row":
                 go(store.root)
             for row, photons in given.photons.items():

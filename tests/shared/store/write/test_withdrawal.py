@@ -73,7 +73,7 @@ def test_what_was_forgotten_is_planned_again_and_nothing_is_there_twice(scene: S
 
 def test_a_worker_that_was_at_a_withdrawn_job_throws_it_away(scene: SceneStore) -> None:
     given = samples.outputs(scene, 1)
-    with scene.job_writer(1) as out:
+    with scene.job_writer(scene.job_rows(1)) as out:
         for row, photons in given.photons.items():
             out.photons(row, photons)
         for row, buffers in given.buffers.items():

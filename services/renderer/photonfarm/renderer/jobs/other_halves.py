@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
-from photonfarm.shared.core.errors import CorruptError
+from photonfarm.shared.core.errors import CorruptError, IncompleteError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.store import SceneReader
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 class OtherHalves:
     """The complete samples of a scene with the same radiance id, by their content keys.
 
-    What is damaged there is not found, and so it is rendered.
+    What is damaged there, or gone meanwhile, is not found, and so it is rendered.
     """
 
     def __init__(self, store: str | Path, scene_id: str) -> None:
@@ -27,7 +27,7 @@ class OtherHalves:
     def refresh(self) -> None:
         """Look what is complete now."""
         try:
-            if len(self._reader.refresh()) or len(self._reader.taken_back):
+            if len(self._reader.refresh()):
                 self._rows = self._reader.rows_by_key()
         except CorruptError as error:
             self._rows = {}
@@ -40,6 +40,6 @@ class OtherHalves:
             return None
         try:
             return self._reader.read_radiance(row)
-        except CorruptError as error:
+        except (CorruptError, IncompleteError) as error:
             log.warning("halves of sample %s are rendered: %s", key.hex(), error)
             return None

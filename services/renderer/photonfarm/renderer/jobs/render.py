@@ -40,6 +40,7 @@ from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
+from photonfarm.shared.store.write.lease import at_work
 
 SCENES_KEPT = 2
 """The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""
@@ -147,38 +148,38 @@ class ShardRenderer:
         self._others: dict[str, OtherHalves] = {}  # by the id of the scene whose halves they are
 
     def render(self, scene_id: str, job: int) -> bool:
-        """Render and commit a job; False if it was committed or withdrawn already, or is meanwhile.
+        """Render and commit a job; False if it was committed, withdrawn or forgotten already, or is meanwhile.
 
-        It also returns False if a repair removed the job's files meanwhile: the job is then missing, and queued again.
-
-        Raises QueueError for a job that is not planned in this store, SceneNotHereError if the scene file here is not
-        the planned one, IncompleteError if renders stay non-finite or buffers are.
+        Raises LeasedError while somebody has the scene for itself, QueueError for a job that is not planned,
+        SceneNotHereError if the scene file here is not the planned one, IncompleteError if renders stay non-finite or
+        buffers are.
         """
-        if not self._store.has_scene(scene_id) or job >= (stored := self._store.scene(scene_id)).jobs():
-            raise QueueError(f"store {self._store.root} has no job {job} of scene {scene_id}")
-        if not stored.is_to_do(job):
-            return False
-        stored.reread()
-        return self._render(self._scene(stored), job)
+        what = f"worker {self._worker} renders job {job}"
+        with at_work(self._store.storage, scene_id, what):
+            if not self._store.has_scene(scene_id):  # forgotten while its jobs were queued
+                return False
+            stored = self._store.scene(scene_id)
+            if job >= stored.jobs():
+                raise QueueError(f"store {self._store.root} has no job {job} of scene {scene_id}")
+            if not stored.is_to_do(job):
+                return False
+            stored.reread()
+            return self._render(self._scene(stored), stored.job_rows(job))
 
-    def _render(self, loaded: _Loaded, job: int) -> bool:
-        stored, scene_id, began = loaded.stored, loaded.stored.scene_id, self._now()
+    def _render(self, loaded: _Loaded, rows: JobRows) -> bool:
+        stored, began = loaded.stored, self._now()
         cloud = loaded.cloud()
-        with stored.job_writer(job) as out:
+        with stored.job_writer(rows) as out:
             report = self._on_progress if loaded.compiled else self._compiles_first
-            rows = stored.job_rows(job)
-            rendering = _Rendering(loaded.scene, cloud, stored.spec, out, report, self._other_halves(stored, job))
+            others = self._other_halves(rows.plan.halves_from)
+            rendering = _Rendering(loaded.scene, cloud, stored.spec, out, report, others)
             rendering.run(rows)
             loaded.compiled = True
             self._on_progress(COMMITS, len(rows.samples), len(rows.samples))
             committed = out.commit(self._figures(began, rendering, stored.spec))
         if not committed:
             what = "was committed by another worker while it was rendered here; that one stays"
-            if not stored.is_committed(job):
-                what = "its files were set aside by a repair while it was committed here; it will be rendered again"
-            if stored.is_withdrawn(job):
-                what = "was withdrawn while it was rendered here, and is thrown away"
-            log.warning("scene %s, job %d: %s", scene_id, job, what)
+            log.warning("scene %s, job %d: %s", stored.scene_id, rows.job, what)
         return committed
 
     def _compiles_first(self, phase: str, done: int, total: int) -> None:
@@ -188,8 +189,7 @@ class ShardRenderer:
     def _now(self) -> tuple[float, float]:
         return time.monotonic(), time.process_time()
 
-    def _other_halves(self, stored: SceneStore, job: int) -> OtherHalves | None:
-        other = stored.halves_from(job)
+    def _other_halves(self, other: str | None) -> OtherHalves | None:
         if other is None:
             return None
         if other not in self._others:

@@ -178,7 +178,7 @@ def _as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
         if not holder.is_committed(job):
             break
         figures = holder.marker(job)["figures"]
-        strategy, other = figures["strategy"], holder.halves_from(job)
+        strategy, other = figures["strategy"], holder.job_rows(job).plan.halves_from
         if other is None or not figures.get("taken_over"):
             break
         holder = opened.scene(other)

@@ -1,7 +1,8 @@
 """`photonfarm store check`: reads everything in a store, reports what is wrong with it, and sets that aside.
 
-Nothing is deleted and no value is changed. Scenes and rows are read one after the other: memory holds the plans, 32
-bytes a sample, and one row of each array for each thread.
+Nothing is deleted and no value is changed. A check reads at any time; a repair takes the scene's lease for what it sets
+aside, and leaves alone what was committed anew since it was read. Scenes and rows are read one after the other: memory
+holds the plans, 32 bytes a sample, and one row of each array for each thread.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Cause, Finding, FindingGroup, Findings, Remedy
+from photonfarm.shared.store.write.lease import OnWait, lease
 from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
 from photonfarm.shared.store.write.store import Store
@@ -77,11 +79,12 @@ def check_store(
     when: str,
     repair: bool = False,
     on_progress: CheckProgress | None = None,
+    on_wait: OnWait = lambda _: None,
 ) -> StoreReport:
     """Check every scene of a store, or one; `repair` sets what is damaged aside, at the time `when`.
 
-    Safe while workers, readers and other checks are at work. Raises StoreError if the scene is not there, or the store
-    cannot be read.
+    A repair waits with `on_wait` until it has a damaged scene alone. Raises StoreError if the scene is not there, or
+    the store cannot be read.
     """
     storage = store.storage
     with store_errors("check the store", storage.where):
@@ -91,7 +94,7 @@ def check_store(
         quarantine = Quarantine(storage, when)
         reports = []
         for each in ids:
-            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None))
+            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None), on_wait)
             reports.append(checking.run(quarantine if repair else None))
         return StoreReport(
             tuple(reports), sum(name.endswith(".partial") for name in storage.names(TMP)), repair, quarantine.folder
@@ -114,11 +117,14 @@ def halves_in_words(halves: HalvesResult) -> str:
 class _SceneChecking:
     """One scene on its way through the check."""
 
-    def __init__(self, storage: Storage, scene_id: str, scenes: int, on_progress: CheckProgress) -> None:
+    def __init__(
+        self, storage: Storage, scene_id: str, scenes: int, on_progress: CheckProgress, on_wait: OnWait
+    ) -> None:
         self._storage = storage
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
         self._on_progress = on_progress
+        self._on_wait = on_wait
         self._findings = Findings()
         self._markers: dict[int, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
@@ -132,7 +138,10 @@ class _SceneChecking:
         except StoreError as error:
             detail = str(error).partition(": ")[2]
             self._add([Finding(Cause.SPEC, detail, self._scene_id, file=f"{self._name}/spec.json")])
-            aside = ["spec"] if quarantine and quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
+            aside = []
+            if quarantine:
+                with self._alone():
+                    aside = ["spec"] if quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
             return self._report(None, aside)
         committed = markers.jobs(self._storage, self._name)
         inputs, done = self._plans(spec, quarantine)
@@ -143,7 +152,13 @@ class _SceneChecking:
                 self._storage, self._scene_id, self._name, spec, inputs.plans, inputs.shard_rows, frozenset(inputs.lost)
             )
             self._jobs(scene, sorted(committed))
-        return self._report(spec.name, [*done, *(self._repair(scene, quarantine) if quarantine else [])])
+        if quarantine and (self._findings.jobs or self._findings.of(Cause.BASE)):
+            with self._alone():
+                done += self._repair(scene, quarantine)
+        return self._report(spec.name, done)
+
+    def _alone(self) -> contextlib.AbstractContextManager[None]:
+        return lease(self._storage, self._scene_id, "store check --repair", self._on_wait)
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
         """Check the plans, before the jobs, which need them; also returns what was written again."""
@@ -155,14 +170,16 @@ class _SceneChecking:
             return check, []
         rewritten = []
         repair = PlanRepair(self._storage, spec, self._name, quarantine)
-        for number in range(plans.count(self._storage, self._name)):
-            folder = f"{plans.folder(self._name, number)}/"
-            if why := [finding for finding in damaged if str(finding.file).startswith(folder)]:
-                try:
-                    repair.run(number, why)
-                    rewritten.append(f"plan {number}, written again from its request")
-                except StoreError as error:
-                    self._add([Finding(Cause.PLAN, str(error).partition(": ")[2], self._scene_id, file=folder[:-1])])
+        with self._alone():
+            for number in range(plans.count(self._storage, self._name)):
+                folder = f"{plans.folder(self._name, number)}/"
+                if why := [finding for finding in damaged if str(finding.file).startswith(folder)]:
+                    try:
+                        repair.run(number, why)
+                        rewritten.append(f"plan {number}, written again from its request")
+                    except StoreError as error:
+                        what = str(error).partition(": ")[2]
+                        self._add([Finding(Cause.PLAN, what, self._scene_id, file=folder[:-1])])
         check = PlanCheck(self._storage, spec, self._name)
         self._add([finding for finding in check.check_plans() if finding not in found])
         return check, rewritten
@@ -247,7 +264,7 @@ class _SceneChecking:
         try:
             marker = self._marker(job)
             files.update(markers.files(marker, scene.name, job))
-        except FileNotFoundError:  # another repair has been here
+        except FileNotFoundError:  # it is missing by now
             return False
         except CorruptError:
             pass

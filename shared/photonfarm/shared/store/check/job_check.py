@@ -16,7 +16,7 @@ from photonfarm.shared.store.check.content_check import CheckTotals, ContentChec
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import Storage
-from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write import findings, plans
 from photonfarm.shared.store.write.findings import Cause, Finding
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
@@ -116,7 +116,7 @@ class JobCheck:
         with contextlib.suppress(CorruptError):
             named = {_plan_of(file) for file in markers.files(marker, scene.name, job)}
             if missing := named - {plan.folder for plan in scene.plans or []}:
-                return self._finding(Cause.PLAN, job, plans.MISSING, f"{min(missing)}/zarr.json")
+                return self._finding(Cause.PLAN, job, findings.MISSING, f"{min(missing)}/zarr.json")
         return self._finding(Cause.NO_PLAN, job, "no plan has this job", name)
 
     # ------------------------------------------------------------------------------------------------------------ files

@@ -18,7 +18,7 @@ from photonfarm.shared.plan.request import UNUSED, PlannedRows, sample_keys
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import schema
 from photonfarm.shared.store.io.storage import Storage
-from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write import findings, plans
 from photonfarm.shared.store.write.findings import Cause, Finding
 from photonfarm.shared.store.write.plans import StoredPlan
 from photonfarm.shared.store.write.scene_store import read_base
@@ -75,7 +75,7 @@ class PlanCheck:
 
         if not self._storage.exists(f"{folder}/zarr.json"):
             self.lost.add(folder)
-            yield Finding(Cause.PLAN, plans.MISSING, self._id, file=f"{folder}/zarr.json")
+            yield Finding(Cause.PLAN, findings.MISSING, self._id, file=f"{folder}/zarr.json")
             return
         try:
             group = zarr.open_group(self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
@@ -85,7 +85,7 @@ class PlanCheck:
             yield Finding(Cause.PLAN, str(error).partition(": ")[2], self._id, file=f"{folder}/zarr.json")
             return
         except UNREADABLE as error:
-            detail = f"cannot be read: {plans.reason(error)}; {plans.RESTORE}"
+            detail = f"cannot be read: {plans.reason(error)}; {findings.RESTORE}"
             yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/zarr.json")
             return
         self.shard_rows = self.shard_rows or shard_rows

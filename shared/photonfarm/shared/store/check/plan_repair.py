@@ -25,7 +25,7 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, schema
 from photonfarm.shared.store.format.declarations import ArrayDeclaration
 from photonfarm.shared.store.io.storage import Storage, read_or_none
-from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write import findings, plans
 from photonfarm.shared.store.write.findings import Finding
 from photonfarm.shared.store.write.plans import PlanAttributes, StoredPlan
 from photonfarm.shared.store.write.quarantine import Quarantine
@@ -130,7 +130,7 @@ class PlanRepair:
             yield number * length, stored
 
     def _hopeless(self, folder: str, why: str) -> CorruptError:
-        return CorruptError(f"{self._storage.where}/{folder}: cannot be written again: {why}; {plans.RESTORE}")
+        return CorruptError(f"{self._storage.where}/{folder}: cannot be written again: {why}; {findings.RESTORE}")
 
 
 def differs(storage: Storage, name: str, built: Path) -> bool:

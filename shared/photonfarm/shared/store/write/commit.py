@@ -9,7 +9,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
@@ -23,9 +23,9 @@ from photonfarm.shared.core.records import F32, Guides, Photons, ViewBuffers, Vi
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.shards import Shard, ShardWriter, encode
-from photonfarm.shared.store.io.storage import Storage, discard, read_or_none, renew_copy
+from photonfarm.shared.store.io.storage import Storage, discard, renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding
-from photonfarm.shared.store.write.plans import JobRows, StoredPlan
+from photonfarm.shared.store.write.plans import JobRows
 from photonfarm.shared.store.write.quarantine import Quarantine
 from photonfarm.shared.store.write.rounding import NOISY_GUIDES, as_array, rounded, stays_finite
 
@@ -86,9 +86,6 @@ class CommitTarget(Protocol):
     def is_to_do(self, job: int) -> bool:
         """Whether a job is planned, and neither committed nor withdrawn."""
 
-    def is_withdrawn(self, job: int) -> bool:
-        """Whether a job is withdrawn by now."""
-
 
 class JobWriter:
     """Takes a job's rows in any order, and commits them once all are there.
@@ -101,11 +98,11 @@ class JobWriter:
     StoreError once the disk has refused something.
     """
 
-    def __init__(self, scene: CommitTarget, rows: JobRows, plan: StoredPlan) -> None:
+    def __init__(self, scene: CommitTarget, rows: JobRows) -> None:
         """Begin; `SceneStore.job_writer` calls this."""
         self._scene = scene
         self._rows = rows
-        self._plan = plan
+        self._plan = rows.plan
         self._storage = scene.storage
         self._arrays = schema.output_arrays(scene.spec)
         self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
@@ -205,21 +202,15 @@ class JobWriter:
     # ----------------------------------------------------------------------------------------------------------- commit
 
     def commit(self, figures: Figures, clock: Clock = _utc_now) -> bool:
-        """Make the rows part of the store, all or nothing; False if another worker's commit came first.
-
-        It is also False if the job is withdrawn, and if a repair has set aside files that were already named here, with
-        another commit that relied on them, say; then the job is missing, and rendered again.
+        """Make the rows part of the store, all or nothing; False if the job is committed or withdrawn by now.
 
         Files that another writer left are kept if every row of the job can be read from them and from the new ones, and
         are replaced otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError if
-        other processes keep changing the files. `clock` gives the time at which a marker of other files is set aside.
+        other writers keep changing the files. `clock` gives the time at which a marker of other files is set aside.
 
-        Another writer's files may belong to a process still at work: a repair, which has removed the marker and is
-        about to move the files, or a writer that replaces what it cannot read. Each of them acts first and checks
-        afterwards, so that one of the two sees the other: a repair looks for a new marker after moving the files, and
-        this method compares marker and files after placing the marker. If it met no foreign file, it compares nothing,
-        and only checks that the files are still there: since they were named, another worker may have committed them,
-        and a repair may have moved them.
+        Another writer of the same job may still be at work, and replace what it cannot read. Each of the two acts first
+        and checks afterwards, so that one of them sees the other: whoever met a foreign file compares marker and files
+        after placing the marker.
         """
         self._check_complete()
         self._join()
@@ -237,21 +228,15 @@ class JobWriter:
                 if not alone and not (self._is_readable() and self._summaries() == described):
                     continue
                 placed = self._place(described, figures)
-                if self._scene.is_withdrawn(self._rows.job):
-                    self._set_marker_aside("withdrawn while it was committed", clock)
-                    return False
-                if (placed and alone and self._are_there(described)) or self._is_marker_right(clock):
+                if (placed and alone) or self._is_marker_right(clock):
                     return placed
             raise CorruptError(
                 f"{self._storage.where}/{self._scene.name}: the files of job {self._rows.job} change while it is "
-                "committed, by a repair or another worker; it is not committed"
+                "committed, by another worker; it is not committed"
             )
 
     def _adopt_all(self) -> bool | None:
-        """Give every row of the job its name; returns whether all files are new ones.
-
-        None if the job is committed, or if files named here were set aside.
-        """
+        """Give every row of the job its name; returns whether all files are new ones, None if the job is committed."""
         self._storage.require()  # a store that is gone has lost the parts too, which would look like a failed adoption
         left = [name for name, shard in self._shards.items() if shard.part.exists()]
         kept = [name for name in left if not self._adopt(name)]
@@ -259,8 +244,8 @@ class JobWriter:
         if not kept and not others and len(left) == len(self._shards):
             return True
         if not self._is_readable():
-            # of a writer that died, damaged, or split otherwise between float16 and float32; not committed yet
-            if self._scene.is_committed(self._rows.job) or self._is_set_aside():
+            # of a writer that died, damaged, or split otherwise between float16 and float32
+            if self._scene.is_committed(self._rows.job):
                 return None
             for name in kept:
                 self._adopt(name, replace=True)
@@ -270,21 +255,12 @@ class JobWriter:
     def _adopt(self, name: str, *, replace: bool = False) -> bool:
         return self._storage.adopt(self._shards[name].part, self._file(name), replace=replace)
 
-    def _is_set_aside(self) -> bool:
-        """Whether a file named here is gone: only a repair moves one."""
-        self._storage.require()
-        named = [name for name, shard in self._shards.items() if not shard.part.exists()]
-        return not self._are_there(named)
-
-    def _are_there(self, names: Iterable[str]) -> bool:
-        return all(self._storage.exists(self._file(name)) for name in names)
-
     def _summaries(self) -> dict[str, dict[str, Any]]:
         """The size and checksum of each file that is there, by array; unreadable ones are left out."""
         found = {}
         for name in self._arrays:
             if self._storage.exists(self._file(name)):
-                with contextlib.suppress(CorruptError):  # moved in the meantime
+                with contextlib.suppress(CorruptError):
                     found[name] = self._look(name, Shard.summary)
         return found
 
@@ -301,7 +277,7 @@ class JobWriter:
         name = markers.name_of(self._scene.name, self._rows.job)
         try:
             marker = self._storage.read(name)
-        except FileNotFoundError:  # a repair was faster
+        except FileNotFoundError:  # another writer has set it aside
             return False
         named = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
         wrong = self._mismatched(named)
@@ -310,18 +286,11 @@ class JobWriter:
             wrong = self._mismatched(named)
         if not wrong:
             return True
-        self._set_marker_aside(
-            "files were moved or replaced while the job was committed; those that are there stay", clock
-        )
+        detail = "files were replaced while the job was committed; those that are there stay"
+        why = Finding(Cause.CHECKSUM, detail, self._scene.scene_id, self._rows.job, file=name)
+        when = clock().isoformat(timespec="seconds")
+        Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
         return False
-
-    def _set_marker_aside(self, detail: str, clock: Clock) -> None:
-        name = markers.name_of(self._scene.name, self._rows.job)
-        marker = read_or_none(self._storage, name)
-        if marker is not None:
-            why = Finding(Cause.CHECKSUM, detail, self._scene.scene_id, self._rows.job, file=name)
-            when = clock().isoformat(timespec="seconds")
-            Quarantine(self._storage, when).job(self._scene.name, self._rows.job, marker, [], [why])
 
     def _mismatched(self, named: Mapping[str, Mapping[str, Any]]) -> list[str]:
         """The arrays whose files differ from the marker."""

@@ -13,6 +13,18 @@ NAMED = 5
 REASONS = 20
 """The findings of one job that its quarantine record lists."""
 
+MISSING = (
+    "the plan is missing, or its zarr.json is; it says what the rows of its jobs are, and cannot be made anew: put the "
+    "folder back from a copy of the store"
+)
+"""The message about a missing plan."""
+
+RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a copy of the store"
+"""The remedy for a plan whose request cannot be read."""
+
+REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
+"""The remedy for most damage of a plan."""
+
 
 class Remedy(Enum):
     """The remedies for causes."""

@@ -34,21 +34,13 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format import declarations, schema, vectors, withdrawn
 from photonfarm.shared.store.io.storage import Storage
+from photonfarm.shared.store.write import findings
 
 PLANS = "plans"
 NAME_DIGITS = 6
 
-MISSING = (
-    "the plan is missing, or its zarr.json is; it says what the rows of its jobs are, and cannot be made anew: put the "
-    "folder back from a copy of the store"
-)
-"""The message about a missing plan."""
-
-RESTORE = "put the plan's small files (zarr.json, and the inputs) back from a copy of the store"
-"""The remedy for a plan whose request cannot be read."""
-
-REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again from its request"
-"""The remedy for most damage of a plan."""
+FORGOTTEN = "forgotten."
+"""How the files begin that are left of a scene's plans each time when it is forgotten."""
 
 INPUTS = [field.name for field in fields(PlannedRows)]
 """The names of a plan's arrays of inputs."""
@@ -72,6 +64,7 @@ class StoredPlan:
     halves_from: str | None = None  # another scene, whose halves its jobs take over
     withdrawn: frozenset[int] = frozenset()  # jobs whose rows count as unused
     named: int = 0  # samples that it was made with, withdrawn or not
+    forgotten: int = 0  # how often the scene had been forgotten when it was made
 
     @property
     def end_job(self) -> int:
@@ -130,6 +123,7 @@ class SampleRow:
 class JobRows:
     """What one job must produce, and every input that it refers to, also in older plans."""
 
+    plan: StoredPlan
     job: int
     samples: tuple[SampleRow, ...]  # by modification, view and pass
     modifications: dict[int, Modification]  # by row: all that the samples refer to
@@ -204,13 +198,16 @@ def build(
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
     """The plans of a scene in order, keeping those already loaded; all, or those before `until`.
 
+    If the scene was forgotten since some were loaded, none is kept: others may have their numbers now.
     Raises CorruptError if one is missing or is not as it was written: later rows refer to its rows, and its samples
     would be planned again without end.
     """
     with store_errors("read the plans", f"{storage.where}/{scene}"):
         names = storage.names(f"{scene}/{PLANS}")
-        end = _counted(storage, scene, names, len(loaded)) if until is None else until
-        found = loaded + [_load(storage, scene, number) for number in range(len(loaded), end)]
+        times = sum(name.startswith(FORGOTTEN) for name in names)
+        kept = [plan for plan in loaded if plan.forgotten == times]
+        end = _counted(storage, scene, names, len(kept)) if until is None else until
+        found = kept + [replace(_load(storage, scene, n), forgotten=times) for n in range(len(kept), end)]
         for number, plan in enumerate(found):
             if withdrawn.name_of(plan.folder).rpartition("/")[2] in names:
                 found[number] = _without(storage, scene, plan, withdrawn.read(storage, plan.folder))
@@ -222,7 +219,7 @@ def _without(storage: Storage, scene: str, plan: StoredPlan, jobs: frozenset[int
     if plan.withdrawn == jobs:
         return plan
     if plan.withdrawn:  # others than now
-        plan = _load(storage, scene, plan.number)
+        plan = replace(_load(storage, scene, plan.number), forgotten=plan.forgotten)
     first_rows = ((job - plan.first_job) * plan.shard_rows for job in jobs)
     rows = plan.rows.without(range(first, first + plan.shard_rows) for first in first_rows)
     return replace(plan, rows=rows, withdrawn=jobs)
@@ -285,9 +282,11 @@ def _unreadable(storage: Storage, name: str) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise CorruptError(f"{storage.where}/{name}: {MISSING}") from error
+        raise CorruptError(f"{storage.where}/{name}: {findings.MISSING}") from error
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {REWRITE}") from error
+        raise CorruptError(
+            f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {findings.REWRITE}"
+        ) from error
 
 
 def reason(error: Exception) -> str:
@@ -368,6 +367,7 @@ def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
     modifications = {s.modification_row: modification_at(plans, s.modification_row) for s in samples}
     views = {s.view_row: view_at(plans, s.view_row) for s in samples}
     return JobRows(
+        plan,
         job,
         tuple(samples),
         modifications,

@@ -5,15 +5,15 @@ STORE/quarantine/000000/job-<scene id>-<job>.json    what was set aside of a job
 alike
 STORE/quarantine/000000/scenes/<scene id>/…          the files, under the names that they had
 
-The marker goes first: from then on readers do not see the job and workers find it missing, and what becomes of its
-files meanwhile does not matter. So a repair may be killed at any point: the record is there before anything moves;
-files not yet moved are data without a marker, which the next commit of the job keeps if they are whole and replaces
-otherwise; and the next check finds whatever is still wrong.
+A repair has the scene's lease. The marker goes first: from then on the job is missing. So a repair may be killed at any
+point: the record is there before anything moves; files not yet moved are data without a marker, which the next commit
+of the job keeps if they are whole and replaces otherwise; and the next check finds whatever is still wrong.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +38,7 @@ class Quarantine:
     def job(self, scene: str, job: int, marker: bytes, files: Iterable[str], why: Sequence[Finding]) -> bool:
         """Set a committed job aside: its marker, then its files; `scene` is the scene's folder.
 
-        False if its marker is not `marker` any more, as another repair was faster. Raises StoreError.
+        False if its marker is not `marker` any more: the job was committed anew since that was read. Raises StoreError.
         """
         with store_errors(f"set job {job} aside", self._storage.where):
             name = markers.name_of(scene, job)
@@ -46,13 +46,8 @@ class Quarantine:
                 return False
             there = [file for file in files if self._storage.exists(file)]
             self._record(f"job-{_id(scene)}-{job}", why, [name, *there], "workers find the job missing, and render it")
-            if not self._move([name]):
-                return False
+            self._move([name])
             self._move(there)
-        again = read_or_none(self._storage, name)
-        if again is not None and not self._has_files(again, scene, job):
-            # a worker that had found our files in its way has just announced them
-            return Quarantine(self._storage, self._when).job(scene, job, again, there, why)
         return True
 
     def base(self, scene: str, why: Sequence[Finding]) -> bool:
@@ -62,10 +57,7 @@ class Quarantine:
             if not self._storage.names(folder):
                 return False
             self._record(f"base-{_id(scene)}", why, [folder], "the next job that is rendered writes it")
-            try:
-                self._storage.move_folder(folder, f"{self._claimed()}/{folder}")
-            except FileNotFoundError:
-                return False
+            self._storage.move_folder(folder, f"{self._claimed()}/{folder}")
             self._storage.settle([folder, f"{self._claimed()}/{folder}"])
             return True
 
@@ -76,7 +68,8 @@ class Quarantine:
             if not self._storage.exists(name):
                 return False
             self._record(f"spec-{_id(scene)}", why, [name], "`photonfarm submit` of the same spec writes it")
-            return bool(self._move([name]))
+            self._move([name])
+            return True
 
     def rewrite(self, scene: str, plan: int, files: Mapping[str, Path], why: Sequence[Finding]) -> None:
         """Replace damaged files of a plan by new ones (parts); copies of the damaged ones are set aside first.
@@ -107,7 +100,7 @@ class Quarantine:
             discard(part)
 
     def _claimed(self) -> str:
-        """The folder of this repair; concurrent repairs get different ones."""
+        """The folder of this repair; repairs of other scenes at the same time get others."""
         number = 0
         while self.folder is None:
             number = max([number, *(int(name) + 1 for name in self._storage.names(QUARANTINE) if name.isdecimal())])
@@ -126,23 +119,12 @@ class Quarantine:
         }
         put_json(self._storage, document, f"{self._claimed()}/{name}.json")
 
-    def _move(self, names: Sequence[str]) -> list[str]:
-        """Move the files that are there, durably; returns their names."""
-        moved = []
+    def _move(self, names: Sequence[str]) -> None:
+        """Move files durably."""
         for name in names:
-            try:
+            with suppress(FileNotFoundError):  # two writers of a job may find the same marker wrong
                 self._storage.move(name, f"{self._claimed()}/{name}")
-            except FileNotFoundError:  # moved by another repair
-                continue
-            moved.append(name)
-        self._storage.settle([*moved, *(f"{self._claimed()}/{name}" for name in moved)])
-        return moved
-
-    def _has_files(self, marker: bytes, scene: str, job: int) -> bool:
-        try:
-            return all(self._storage.exists(file) for file in markers.files(marker, scene, job))
-        except CorruptError:
-            return True  # another worker's business, and the next check's
+        self._storage.settle([*names, *(f"{self._claimed()}/{name}" for name in names)])
 
 
 def was_set_aside(storage: Storage, scene: str, job: int, marker: bytes) -> bool:

@@ -24,7 +24,6 @@ from photonfarm.shared.plan.joined import Joined
 from photonfarm.shared.plan.request import (
     MAX_SHARD_ROWS,
     SHARD_ROWS,
-    UNUSED,
     Extent,
     PlannedContent,
     Request,
@@ -33,10 +32,10 @@ from photonfarm.shared.plan.request import (
 )
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format import declarations, markers, schema, withdrawn
+from photonfarm.shared.store.format import declarations, markers, schema
 from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.io.storage import Storage, put_json
-from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write import findings, plans
 from photonfarm.shared.store.write.commit import JobWriter
 from photonfarm.shared.store.write.plans import JobRows, StoredPlan
 
@@ -92,7 +91,9 @@ class SceneStore:
 
     def plans(self) -> list[StoredPlan]:
         """The plans that are there by now, in order."""
-        self._plans = plans.load_all(self.storage, self.name, self._plans)
+        known, self._plans = self._plans, plans.load_all(self.storage, self.name, self._plans)
+        if known[:1] != self._plans[:1]:
+            self._followed.doubt()  # the scene was forgotten since
         return self._plans
 
     def plan(
@@ -108,7 +109,8 @@ class SceneStore:
         """Plan the new samples of a request; concurrent submitters try again, each after the other's plan.
 
         `halves_from` is the id of a scene with the same radiance id, whose halves the jobs take over. `samples`
-        gives what is to be planned, instead of the request, from what is planned already. Raises SpecError for an
+        gives what is to be planned, instead of the request, from what is planned already. Callers are `at_work` in the
+        scene, or have its lease. Raises SpecError for an
         invalid request or number of rows, and CorruptError if a plan is missing.
         """
         while True:
@@ -133,25 +135,11 @@ class SceneStore:
                 try:
                     plans.build(built, self.spec, request, expansion.rows, **numbers, halves_from=halves_from)
                     if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
-                        if self._leans_on_withdrawn(len(found), found):
-                            continue
                         jobs = len(expansion.rows.sample_pass) // rows_per_job
                         new, known, extent = expansion.new, expansion.known, expansion.extent
                         return PlanResult(self.scene_id, len(found), new, known, jobs, extent)
                 finally:
                     shutil.rmtree(built, ignore_errors=True)
-
-    def _leans_on_withdrawn(self, number: int, before: list[StoredPlan]) -> bool:
-        """Whether a new plan refers to rows that were withdrawn while it was made; then it is withdrawn whole."""
-        now = self.plans()
-        gone = frozenset().union(*(new.withdrawn - old.withdrawn for new, old in zip(now, before, strict=False)))
-        plan = now[number]
-        references = np.concatenate([plan.rows.sample_view, plan.rows.sample_modification])
-        jobs = np.unique(references[references != UNUSED]) // plan.shard_rows
-        if not gone.intersection(jobs.tolist()):
-            return False
-        withdrawn.write(self.storage, plan.folder, set(range(plan.first_job, plan.end_job)))
-        return True
 
     def _shard_rows(self, found: list[StoredPlan], wanted: int | None, usual: int) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
@@ -173,15 +161,9 @@ class SceneStore:
             self.plans()
         return plans.job_rows(self._plans, job)
 
-    def halves_from(self, job: int) -> str | None:
-        """The other scene whose halves a job takes over, if any; raises IndexError for a job of no plan."""
-        rows = self.job_rows(job)
-        return plans.plan_of(self._plans, rows.job * self._plans[0].shard_rows).halves_from
-
-    def job_writer(self, job: int) -> JobWriter:
-        """A writer that takes a job's outputs and commits them; raises IndexError for a job of no plan."""
-        rows = self.job_rows(job)
-        return JobWriter(self, rows, plans.plan_of(self._plans, job * self._plans[0].shard_rows))
+    def job_writer(self, rows: JobRows) -> JobWriter:
+        """A writer that takes the outputs of a job with these rows, and commits them."""
+        return JobWriter(self, rows)
 
     def jobs(self) -> int:
         """The number of planned jobs; they are numbered from 0."""
@@ -206,11 +188,6 @@ class SceneStore:
     def withdrawn_jobs(self) -> frozenset[int]:
         """The jobs of the plans as they were last read that are not to be rendered any more."""
         return frozenset().union(*(plan.withdrawn for plan in self._plans))
-
-    def is_withdrawn(self, job: int) -> bool:
-        """Whether a job is withdrawn by now."""
-        self.plans()
-        return job in self.withdrawn_jobs()
 
     def is_to_do(self, job: int) -> bool:
         """Whether a job is planned, and neither committed nor withdrawn."""
@@ -275,8 +252,9 @@ def is_there(storage: Storage, scene_id: str) -> bool:
         return False
     name = f"{SCENES}/{scene_id}"
     with store_errors("look for a scene", storage.where), contextlib.suppress(NotADirectoryError):  # somebody's file
+        kept = (plans.PLANS, markers.COMMITTED)
         return storage.exists(f"{name}/spec.json") or any(
-            storage.names(f"{name}/{part}") for part in (plans.PLANS, markers.COMMITTED)
+            not each.startswith(plans.FORGOTTEN) for part in kept for each in storage.names(f"{name}/{part}")
         )
     return False
 
@@ -345,7 +323,7 @@ def _exponent_of_plans(storage: Storage, scene: str) -> int | None:
         with contextlib.suppress(CorruptError):
             return plans.read_about(storage, plans.folder(scene, number)).radiance_exponent
     if numbers:
-        raise CorruptError(f"{storage.where}/{scene}: the spec is lost, and no plan can be read; {plans.RESTORE}")
+        raise CorruptError(f"{storage.where}/{scene}: the spec is lost, and no plan can be read; {findings.RESTORE}")
     return None
 
 

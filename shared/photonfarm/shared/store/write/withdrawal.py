@@ -1,7 +1,6 @@
 """`photonfarm store withdraw`: what a plan holds and nobody has rendered is forgotten, and may be planned again.
 
-The plan stays as it is. A small file beside it names the jobs whose rows count as unused from now on. A worker that is
-at one of them finds it withdrawn when it commits, and throws it away.
+The plan stays as it is. A small file beside it names the jobs whose rows count as unused from now on.
 """
 
 from __future__ import annotations
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from photonfarm.shared.core.errors import SpecError, store_errors
 from photonfarm.shared.plan.request import UNUSED
 from photonfarm.shared.store.format import withdrawn
+from photonfarm.shared.store.write.lease import OnWait, lease
 from photonfarm.shared.store.write.plans import StoredPlan
 from photonfarm.shared.store.write.scene_store import SceneStore
 
@@ -31,12 +31,18 @@ class Withdrawal:
     kept: int  # samples that stay planned, as rendered ones show their views or configurations
 
 
-def withdraw(scene: SceneStore, number: int | None = None) -> Withdrawal:
+def withdraw(scene: SceneStore, number: int | None = None, *, on_wait: OnWait = lambda _: None) -> Withdrawal:
     """Withdraw the jobs of a plan, by default of the last one, that are not committed.
 
     Jobs that hold views or configurations of committed ones stay planned. Raises SpecError for a plan that is not
-    there, and where samples of a later plan refer to its rows.
+    there, and where samples of a later plan refer to its rows. It waits with `on_wait` for the scene's lease.
     """
+    storage = scene.storage
+    with lease(storage, scene.scene_id, "store withdraw", on_wait), store_errors("withdraw a plan", storage.where):
+        return _withdraw(scene, number)
+
+
+def _withdraw(scene: SceneStore, number: int | None) -> Withdrawal:
     found = scene.plans()
     if not found or (number is not None and number >= len(found)):
         there = f"the last one is {len(found) - 1}" if found else "nothing is planned"
@@ -44,14 +50,10 @@ def withdraw(scene: SceneStore, number: int | None = None) -> Withdrawal:
     plan = found[-1 if number is None else number]
     committed = scene.committed_jobs()
     jobs = _withdrawable(scene, found, plan, committed)
-    with store_errors("withdraw a plan", scene.storage.where):
-        if jobs:
-            withdrawn.write(scene.storage, plan.folder, plan.withdrawn | jobs)
-            if late := jobs & scene.committed_jobs():  # committed while this was decided: they stay
-                jobs = _withdrawable(scene, found, plan, committed | late)
-                withdrawn.write(scene.storage, plan.folder, plan.withdrawn | jobs)
+    if jobs:
+        withdrawn.write(scene.storage, plan.folder, plan.withdrawn | jobs)
     samples = {job: plan.samples_in(job) for job in range(plan.first_job, plan.end_job)}
-    rendered = sum(count for job, count in samples.items() if job in scene.committed_jobs())
+    rendered = sum(count for job, count in samples.items() if job in committed)
     forgotten = sum(samples[job] for job in jobs)
     return Withdrawal(
         scene.scene_id, scene.spec.name, plan.number, len(jobs), forgotten, rendered,

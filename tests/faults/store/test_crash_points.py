@@ -51,16 +51,17 @@ else:
     renderer.render(Store(sys.argv[2]).scene_ids()[0], 0)
 """
 
-# A commit of this job writes 23 arrays and the marker: a link each, once what it links is synced.
+# A commit of this job writes 23 arrays and the marker: a link each, once what it links is synced. Before it comes the
+# announcement that the worker is at the job: a link, a sync of its bytes, and three of folders.
 POINTS = {
     "after render, before the commit": ("commit", "commit", 1, "before"),
-    "after the temporary files, before the first is synced": ("commit", "fdatasync", 1, "before"),
-    "after the first temporary file is synced": ("commit", "fdatasync", 1, "after"),
-    "in the middle, before a link": ("commit", "link", 5, "before"),
-    "in the middle, after a link": ("commit", "link", 5, "after"),
-    "after all files, before the folders are synced": ("commit", "fsync", 1, "before"),
-    "before the marker": ("commit", "link", 24, "before"),
-    "after the marker": ("commit", "link", 24, "after"),
+    "after the temporary files, before the first is synced": ("commit", "fdatasync", 2, "before"),
+    "after the first temporary file is synced": ("commit", "fdatasync", 2, "after"),
+    "in the middle, before a link": ("commit", "link", 6, "before"),
+    "in the middle, after a link": ("commit", "link", 6, "after"),
+    "after all files, before the folders are synced": ("commit", "fsync", 4, "before"),
+    "before the marker": ("commit", "link", 25, "before"),
+    "after the marker": ("commit", "link", 25, "after"),
     "while the base is written": ("base", "fsync", 3, "before"),
     "before the base gets its name": ("base", "rename", 1, "before"),
     "after the base has got its name": ("base", "rename", 1, "after"),

@@ -100,26 +100,6 @@ def test_a_job_that_was_rendered_again_since_the_check_is_left_alone(store: Stor
     assert scene.missing_jobs() == []
 
 
-def test_a_marker_that_a_worker_places_in_the_middle_of_a_repair_is_set_aside_with_its_files(
-    store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The worker found our files in its way, kept them, and announces them just before they are moved."""
-    content, move = marker(scene, 1).read_bytes(), store.storage.move
-    places = iter([True])
-
-    def moved(name: str, new_name: str) -> None:
-        move(name, new_name)
-        if name.endswith("000000000001.json") and next(places, False):
-            marker(scene, 1).write_bytes(content)
-
-    monkeypatch.setattr(store.storage, "move", moved)
-    files = [f"{scene.name}/{name}" for name in scene.marker(1)["files"]]
-    assert Quarantine(store.storage, "now").job(scene.name, 1, content, files, [])
-    assert scene.missing_jobs() == [1]
-    commit_all(scene)
-    assert found(checked(store)) == {}
-
-
 # A repair of this job places two records by a link each, and renames the marker and 23 files.
 POINTS = [("link", 1, "before"), ("link", 2, "before"), ("link", 2, "after"), ("fsync", 3, "before")]
 POINTS += [("rename", n, when) for n in (1, 2, 12, 24) for when in ("before", "after")]

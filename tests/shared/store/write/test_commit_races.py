@@ -1,7 +1,6 @@
 """A commit among others that change the job's files meanwhile: what is announced is what is there."""
 
 import json
-import threading
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -16,8 +15,6 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
 from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.write.quarantine import Quarantine
 
 
 @pytest.fixture
@@ -38,33 +35,6 @@ def whole(scene: SceneStore) -> None:
     assert [g for g in report.groups if g.cause.remedy.name != "LOOK" and g.cause.label != "equal-samples"] == []
 
 
-class SlowRepair:
-    """A repair of job 0 in a thread, which waits once it has moved the marker."""
-
-    def __init__(self, scene: SceneStore) -> None:
-        self._moved, self._go_on = threading.Event(), threading.Event()
-        storage = LocalStorage(scene.storage.root)
-        move = storage.move
-
-        def slow(name: str, new_name: str) -> None:
-            if "/plans/" in name:
-                self._moved.set()
-                assert self._go_on.wait(20)
-            move(name, new_name)
-
-        storage.move = slow
-        files = [f"{scene.name}/{name}" for name in scene.marker(0)["files"]]
-        content = storage.read(markers.name_of(scene.name, 0))
-        work = lambda: Quarantine(storage, "now").job(scene.name, 0, content, files, [])  # noqa: E731
-        self._thread = threading.Thread(target=work)
-        self._thread.start()
-        assert self._moved.wait(20)
-
-    def end(self) -> None:
-        self._go_on.set()
-        self._thread.join()
-
-
 def before(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, work: Callable[[], None]) -> None:
     """Do some work before the first call of a function."""
     plain, left = getattr(owner, name), iter([work])
@@ -75,17 +45,6 @@ def before(monkeypatch: pytest.MonkeyPatch, owner: Any, name: str, work: Callabl
         return plain(*args, **kwargs)
 
     monkeypatch.setattr(owner, name, changed)
-
-
-@pytest.mark.parametrize("when", ["settle", "place"])
-def test_a_commit_that_kept_files_which_a_repair_then_moves_places_its_own(
-    scene: SceneStore, monkeypatch: pytest.MonkeyPatch, when: str
-) -> None:
-    """The repair comes before the writer has looked again, or after that, just before its marker is placed."""
-    repair = SlowRepair(scene)
-    before(monkeypatch, *((scene.storage, "settle") if when == "settle" else (markers, "place")), repair.end)
-    assert samples.commit(scene, 0, samples.outputs(scene, 0))
-    whole(scene)
 
 
 @pytest.mark.parametrize("theirs", ["before", "after"])
@@ -139,29 +98,11 @@ def values_of(scene: SceneStore) -> dict[int, np.ndarray]:
     return {row: reader.read(row).radiance for row in reader.refresh().tolist()}
 
 
-def test_a_writer_that_slept_before_its_marker_announces_no_files_that_a_repair_has_moved(
-    scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All files were its own; then another committed them, one rotted, and a repair set the job aside."""
-
-    def meanwhile() -> None:
-        assert samples.commit(another, 1, samples.outputs(another, 1))
-        rotten = next((scene.folder / "plans/000001/radiance").glob("c.0.*"))
-        rotten.write_bytes(rotten.read_bytes()[:5] + b"?" + rotten.read_bytes()[6:])
-        assert check_store(Store(scene.storage.root), when="now", repair=True).scenes[0].set_aside == ("job 1",)
-
-    before(monkeypatch, markers, "place", meanwhile)
-    assert not samples.commit(scene, 1, samples.outputs(scene, 1))
-    assert scene.missing_jobs() == [1]
-    samples.commit_all(scene)
-    whole(scene)
-
-
 def test_a_writer_whose_files_are_all_its_own_compares_them_with_a_marker_that_came_first(
     scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def meanwhile() -> None:
-        """Commit as another writer that slept as well, and whose files a repair had moved before ours were named."""
+        """Place the marker of another writer, whose files are not there."""
         rows = next(plan for plan in another.plans() if plan.number == 1)
         file = f"{rows.folder}/depth/c.0.0.0"
         about = {"size": 1, "crc32c": "00000000"}

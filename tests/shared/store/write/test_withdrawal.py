@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from typing import Any
+import threading
 
 import numpy as np
 import pytest
@@ -15,8 +15,8 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.format import markers, withdrawn
-from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.format import withdrawn
+from photonfarm.shared.store.write.lease import at_work
 from photonfarm.shared.store.write.status import scene_status
 from photonfarm.shared.store.write.withdrawal import withdraw
 
@@ -86,14 +86,23 @@ def test_a_worker_that_was_at_a_withdrawn_job_throws_it_away(scene: SceneStore) 
     assert not scene.is_to_do(1)
 
 
-def test_a_job_that_is_committed_meanwhile_stays(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen = scene.committed_jobs()
-    answers = iter([seen])
-    real = SceneStore.committed_jobs
-    assert samples.commit(scene, 1, samples.outputs(scene, 1))
-    monkeypatch.setattr(SceneStore, "committed_jobs", lambda self: next(answers, None) or real(self))
-    done = withdraw(scene)
+def test_the_job_in_hand_is_waited_for_and_stays(scene: SceneStore) -> None:
+    taken, waited = threading.Event(), threading.Event()
+
+    def work() -> None:
+        with at_work(scene.storage, scene.scene_id, "worker w1 renders job 1"):
+            taken.set()
+            assert waited.wait(20)
+            assert samples.commit(scene, 1, samples.outputs(scene, 1))
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    assert taken.wait(20)
+    said: list[str] = []
+    done = withdraw(fresh(scene), on_wait=lambda sentence: (said.append(sentence), waited.set()))
+    worker.join()
     assert (done.jobs, done.rendered) == (1, 6)
+    assert "store withdraw waits for worker w1 renders job 1" in said[0]
     assert fresh(scene).progress().committed_samples == 6
 
 
@@ -151,40 +160,6 @@ def test_processes_that_follow_see_each_withdrawal_of_a_plan(scene: SceneStore) 
         assert other.missing_jobs() == sorted({1, 3} - jobs)
     assert samples.commit(other, 1, samples.outputs(other, 1))
     assert reader.refresh().tolist() == [2, 3]
-
-
-def test_a_top_up_that_was_made_before_a_withdrawal_is_made_anew(
-    scene: SceneStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    build = plans.build
-
-    def slowly(*args: Any, **options: Any) -> None:
-        monkeypatch.undo()
-        build(*args, **options)
-        withdraw(fresh(scene))
-
-    monkeypatch.setattr(plans, "build", slowly)
-    planned = scene.plan(TopUp.of("+8"))
-    assert (planned.plan, planned.new) == (2, 4), "passes of the views that are left"
-    found = fresh(scene).plans()
-    assert len(found[1].withdrawn) == found[1].jobs
-    assert fresh(scene).progress().planned_samples == 8
-    assert check_store(Store(scene.storage.where), when="now").exit_code == 0
-
-
-def test_a_marker_placed_after_a_withdrawal_is_set_aside(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    place = markers.place
-
-    def late(*args: Any) -> bool:
-        monkeypatch.undo()
-        withdraw(fresh(scene))
-        return place(*args)
-
-    monkeypatch.setattr(markers, "place", late)
-    assert not samples.commit(scene, 1, samples.outputs(scene, 1))
-    assert scene.committed_jobs() == {0, 2}
-    status = scene_status(fresh(scene))
-    assert (status.jobs_planned, status.jobs_committed, status.markers_without_plan) == (2, 2, 0)
 
 
 def test_a_base_that_is_lost_is_written_by_a_job_that_is_left(scene: SceneStore) -> None:

@@ -1,0 +1,116 @@
+"""`store forget`: the scene is gone, whoever follows it sees that, and it can be made anew under the same names."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import store_samples as samples
+from click.testing import CliRunner
+
+from photonfarm.shared.cli.store_verbs import forget as verb
+from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.write.forgetting import forget
+
+FORGET = """
+import os, signal, sys
+from photonfarm.shared.store import Store
+from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.shared.store.write.forgetting import forget
+left = int(sys.argv[3])
+for name in ("delete", "delete_folder", "adopt"):
+    def dying(*args, plain=getattr(LocalStorage, name), **options):
+        global left
+        left -= 1
+        if left == 0:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return plain(*args, **options)
+    setattr(LocalStorage, name, dying)
+forget(Store(sys.argv[1]), sys.argv[2])
+"""
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    """Two scenes, of 4 samples each, in two plans."""
+    store = Store(tmp_path / "store", create=True)
+    for spec in (samples.small_spec(), samples.small_spec(name="other", points=5)):
+        scene = store.scene(store.plan(spec, Request(modifications=2), shard_rows=2).scene_id)
+        scene.plan(Request(modifications=4))
+        scene.write_base(*samples.base())
+        samples.commit_all(scene)
+    return store
+
+
+@pytest.fixture
+def scene(store: Store) -> SceneStore:
+    return next(scene for scene in store.scenes() if scene.spec.name == "small")
+
+
+def test_it_is_gone_and_other_scenes_are_not(store: Store, scene: SceneStore) -> None:
+    assert forget(Store(store.root), scene.scene_id).jobs == 2
+    opened = Store(store.root)
+    assert [each.spec.name for each in opened.scenes()] == ["other"]
+    assert not opened.has_scene(scene.scene_id)
+    assert check_store(opened, when="now").exit_code == 0
+    assert samples.reader_of(opened.scenes()[0]).rows.size == 4
+    with pytest.raises(StoreError, match=f"holds no scene {scene.scene_id}"):
+        forget(opened, scene.scene_id)
+
+
+def test_who_knew_its_plans_takes_no_others_for_them(store: Store, scene: SceneStore) -> None:
+    before = scene.plans()
+    forget(Store(store.root), scene.scene_id)
+    assert scene.plans() == []
+    assert scene.missing_jobs() == []
+    other = Request(modifications=3, seed=7)
+    assert Store(store.root).plan(scene.spec, other, shard_rows=3).scene_id == scene.scene_id
+    (plan,) = scene.plans()
+    assert plan.shard_rows == 3
+    assert not np.array_equal(plan.rows.modification[:2], before[0].rows.modification)
+    assert scene.missing_jobs() == [0]
+    scene.write_base(*samples.base())
+    samples.commit_all(scene)
+    assert samples.reader_of(scene).rows.tolist() == [0, 1, 2]
+    assert check_store(Store(store.root), when="now").exit_code == 0
+
+
+@pytest.mark.parametrize("point", range(1, 12))
+def test_killed_at_any_point_nothing_half_is_taken_for_a_sample(store: Store, scene: SceneStore, point: int) -> None:
+    clean = {row: samples.reader_of(scene).read(row).radiance for row in range(4)}
+    command = [sys.executable, "-c", FORGET, str(store.root), scene.scene_id, str(point)]
+    killed = subprocess.run(command, timeout=60).returncode
+    assert killed in (-signal.SIGKILL, 0)
+    opened = Store(store.root)
+    if opened.has_scene(scene.scene_id):
+        try:
+            reader = samples.reader_of(opened.scene(scene.scene_id))
+        except StoreError:  # its spec is deleted last
+            reader = None
+        for row in reader.rows.tolist() if reader else ():
+            np.testing.assert_array_equal(reader.read(row).radiance, clean[row])
+        forget(opened, scene.scene_id)
+    opened = Store(store.root)
+    assert not opened.has_scene(scene.scene_id)
+    again = opened.scene(opened.plan(scene.spec, Request(modifications=2), shard_rows=2).scene_id)
+    again.write_base(*samples.base())
+    samples.commit_all(again)
+    assert samples.reader_of(again).rows.tolist() == [0, 1]
+    assert check_store(opened, when="now").exit_code == 0
+
+
+def test_the_verb_asks_and_without_a_terminal_wants_yes(store: Store, scene: SceneStore) -> None:
+    arguments = ["--store", str(store.root), "--scene", "small"]
+    refused = CliRunner().invoke(verb, arguments)
+    assert refused.exit_code == 2
+    assert "of which 4 of 4 planned samples are rendered" in refused.output
+    assert "--yes is required" in refused.output
+    assert Store(store.root).has_scene(scene.scene_id)
+    done = CliRunner().invoke(verb, [*arguments, "--yes"])
+    assert done.exit_code == 0, done.output
+    assert f"scene {scene.scene_id} is forgotten, with 2 rendered jobs" in done.output

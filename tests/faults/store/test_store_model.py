@@ -91,9 +91,12 @@ class StoreMachine(WritingMachine):
         harm=st.sampled_from(["flip", "flip", "cut", "cut", "delete", "cut marker", "delete marker"]),
     )  # fmt: skip
     def damage_and_repair(self, number: int, process: int, which: int, file: int, at: float, harm: str) -> None:
-        """One file of a committed job; the repair takes back this job alone, and loses nothing that is left."""
+        """One file of a committed job; the repair takes back this job alone, and loses nothing that is left.
+
+        It has the scene for itself: nobody is in the middle of a job of it.
+        """
         model = self.models[number]
-        if not model.committed:
+        if not model.committed or any(writer.number == number for writer in self.writers):
             return
         scene = self.scene(number, process)
         job = sorted(model.committed)[which % len(model.committed)]

@@ -49,11 +49,11 @@ class LeasedError(IncompleteError):
 
 
 def leases(storage: Storage) -> dict[str, str]:
-    """Who has a scene for itself, in words, by scene id; costs one listing. Raises StoreError."""
+    """Sentences that somebody has a scene for itself, by scene id; costs one listing. Raises StoreError."""
     with store_errors("look for leases", storage.where):
         ids = [name.removesuffix(".json") for name in storage.names(LEASES) if name.endswith(".json")]
         found = {scene_id: _holder(storage, scene_id) for scene_id in sorted(ids)}
-    return {scene_id: holder for scene_id, holder in found.items() if holder is not None}
+    return {scene_id: f"{holder} has it for itself" for scene_id, holder in found.items() if holder is not None}
 
 
 @contextmanager

@@ -39,13 +39,10 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.read.merge import merge_view
-from photonfarm.shared.store.read.reader import SceneReader
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
-from photonfarm.trainer.data.dataset import SampleSource
-from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.predict.evaluation import batches
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -128,7 +125,7 @@ def _end_with_parent() -> None:
 # ----------------------------------------------------------------------------------------------------------- training
 
 
-class ChosenSamples(StoreSource):
+class ChosenSamples(SceneReader):
     """Samples of a store that are chosen once, to be trained on, and one that is held out.
 
     A trainer wants one to look at. Whoever derives from it sets `chosen`.
@@ -280,7 +277,7 @@ class ReferenceViews:
     @classmethod
     def of(cls, store: Store, spec: SceneSpec, spp: int, share: float = HELD_OUT) -> ReferenceViews:
         """Those of held-out configurations that have `spp` at least; `share` of all are held out."""
-        reader, source = SceneReader(store.root, spec.scene_id), StoreSource(store.root, spec.scene_id)
+        reader, source = SceneReader(store.root, spec.scene_id), SceneReader(store.root, spec.scene_id)
         reader.refresh()
         first = {reader.view_row(row): row for row in reversed(HeldOutSamples.of(source, share, sys.maxsize).rows)}
         passes = {view: len(reader.rows_of_view(view)) for view in sorted(first)}

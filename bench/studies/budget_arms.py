@@ -9,15 +9,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from bench.harness.room_study import HELD_OUT, ChosenSamples
-from photonfarm.shared.core.records import Guides, ViewBuffers, arrays_of
+from photonfarm.shared.core.records import Guides, ViewBuffers
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store.read.batch import Batch, Sample
 from photonfarm.shared.store.read.reader import SceneReader
-from photonfarm.trainer.data.dataset import RawSample
 
 HALF_SPP = 1  # of what is rendered
 PASS_SPP = 2 * HALF_SPP
@@ -80,21 +80,14 @@ class ArmSamples(ChosenSamples):
         }
         self.chosen = list(self._passes)
 
-    def read_samples(self, rows: Sequence[int]) -> list[RawSample]:
+    def read_samples(self, rows: Sequence[int], out: Batch | None = None) -> list[Sample]:  # noqa: ARG002
         """The chosen samples of these rows, and the one that is held out as it is."""
         return [self._mean(row) for row in rows]
 
-    def _mean(self, row: int) -> RawSample:
-        read = super().read_samples(self._passes.get(row, [row]))
-        halves = np.mean([sample.radiance.astype(np.float32) * sample.scale for sample in read], axis=0)
-        buffers, guides = _copied(read[0].buffers), read[0].guides and _copied(read[0].guides)
-        return replace(read[0], radiance=halves, scale=1.0, buffers=buffers, guides=guides)
-
-
-def _copied(record: Images) -> Images:
-    """The record in memory of its own, as the next read reuses that of a sample."""
-    copies: dict[str, Any] = {name: values.copy() for name, values in arrays_of(record).items()}
-    return replace(record, **copies)
+    def _mean(self, row: int) -> Sample:
+        passes = Batch.empty(self.spec, len(self._passes.get(row, [row])), guides=True)
+        read = [sample.decoded() for sample in super().read_samples(self._passes.get(row, [row]), passes)]
+        return replace(read[0], radiance=np.mean([sample.radiance for sample in read], axis=0))
 
 
 def _enough(reader: SceneReader, rows: Sequence[int], share: Share) -> list[list[list[int]]]:

@@ -38,8 +38,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader, Store
 
 ROOMS = ["movable-living-room-2", "movable-dining-room"]
 HELD_OUT_VIEWS = 48
@@ -148,7 +147,7 @@ def runs(share: Share, plan: Planned, arguments: argparse.Namespace) -> list[Run
 def measure(share: Share, plan: Planned, networks: Sequence[Run], references: ReferenceViews) -> MeasuredShare:
     """Look at the held-out views with networks that are trained on one share of the budget."""
     where = plan.folder / "store", plan.spec.scene_id
-    made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
+    made = [room_study.images(run.trained(), SceneReader(*where), references.rows) for run in networks]
     shown = Errors(np.stack([references.shown_errors(images) for images in made]), references.units)
     linear = Errors(np.stack([references.linear_errors(images) for images in made]), references.units)
     room_study.tell(f"{share}: {each_seed(shown)}")

@@ -35,7 +35,7 @@ from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader
 
 BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}
 HELD_OUT = 1 / 4  # of configurations: with a sixteenth as elsewhere few would be held out from so few samples
@@ -96,7 +96,7 @@ def runs(arm: Arm, made: Rendered, where: tuple[Path, str], arguments: argparse.
 
 def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], references: ReferenceViews) -> MeasuredArm:
     """Look at held-out views with an arm's networks, one from each seed; `where` is bdpt's store and the scene."""
-    made = [room_study.images(run.trained(), StoreSource(*where), references.rows) for run in networks]
+    made = [room_study.images(run.trained(), SceneReader(*where), references.rows) for run in networks]
 
     def each(error: Callable[[F32], NDArray[np.float64]]) -> Errors:
         return Errors(np.stack([error(images) for images in made]), references.units)
@@ -118,7 +118,7 @@ def measure(arm: Arm, networks: Sequence[Run], where: tuple[Path, str], referenc
 
 def targets(made: dict[str, Rendered], spec: SceneSpec, references: ReferenceViews) -> Targets:
     """What both kinds of samples show of the views that both stores have, as they are before training."""
-    sources = {kind: StoreSource(one.root, spec.scene_id) for kind, one in made.items()}
+    sources = {kind: SceneReader(one.root, spec.scene_id) for kind, one in made.items()}
     first = {kind: _first_rows(source) for kind, source in sources.items()}
     held_out = sources["bdpt"].view_keys(list(references.rows))
     common = [view for view in first["bdpt"] if view in first["path"]]
@@ -129,16 +129,15 @@ def targets(made: dict[str, Rendered], spec: SceneSpec, references: ReferenceVie
     return Targets(halves["bdpt"], halves["path"], tuple(keys), tuple(place[view] for view in held_out))
 
 
-def _first_rows(source: StoreSource) -> dict[bytes, int]:
+def _first_rows(source: SceneReader) -> dict[bytes, int]:
     """The first sample of each view, by the view's key."""
     rows = source.refresh().tolist()
     return dict(zip(reversed(source.view_keys(rows)), reversed(rows), strict=True))
 
 
-def _halves(source: StoreSource, rows: Sequence[int], exposure: float) -> F32:
+def _halves(source: SceneReader, rows: Sequence[int], exposure: float) -> F32:
     """(N, 2, H, W, 3) exposed linear radiance."""
-    read = (source.read_samples([row])[0] for row in rows)
-    return np.stack([sample.radiance.astype(np.float32) * np.float32(exposure * sample.scale) for sample in read])
+    return np.stack([source.read(row).radiance * np.float32(exposure) for row in rows])
 
 
 def options() -> argparse.ArgumentParser:

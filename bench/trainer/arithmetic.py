@@ -31,12 +31,10 @@ from photonfarm.shared.core.estimate import Estimate, clean_error
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.resident import ResidentSamples
 from photonfarm.trainer.data.sampler import RoundSampler
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.dry_run.made_up import MadeUpScene
 from photonfarm.trainer.metrics.intervals import confidence_interval
 from photonfarm.trainer.networks import image_of
@@ -231,7 +229,7 @@ def bias(seeds: int, steps: int) -> list[Trained]:
         for seed in range(seeds):
             settings = preset("small", seed=seed, max_steps=steps, hold_out=0.25, device="cpu")
             resident = ResidentSamples(torch.device("cpu"), 1.0)
-            with Feed(StoreSource(folder, scene.scene_id), settings, resident=resident) as feed:
+            with Feed(SceneReader(folder, scene.scene_id), settings, resident=resident) as feed:
                 arrived = feed.arrivals()[0]
                 rows, held_out = ([row for row, held in arrived if held is side] for side in (False, True))
                 found.append(trained(feed, settings, rows, held_out))

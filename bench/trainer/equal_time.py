@@ -24,9 +24,8 @@ from bench.harness.network_errors import Errors, of_intervals
 from bench.harness.scenes import in_passes, square
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import SceneReader, Store
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import mssim
 from photonfarm.trainer.metrics.metric_space import metric_space
 from photonfarm.trainer.predict.evaluation import by_turns
@@ -142,7 +141,7 @@ def measured(
     store = Store(options.work / room / "store", create=True)
     passes = TopUp.of(str(options.reference_spp), [f"held-out={HOLD_OUT}", f"views=first:{options.references}"])
     room_study.render(spec, store, [Request(modifications=options.modifications), passes], options.processes)
-    source = functools.partial(StoreSource, store.root, spec.scene_id)
+    source = functools.partial(SceneReader, store.root, spec.scene_id)
     step_s = step_seconds(source, candidates)
     steps = {name: max(1, round(options.seconds / seconds)) for name, seconds in step_s.items()}
     runs = {
@@ -175,7 +174,7 @@ def settings_of(changes: PresetChanges, seed: int, steps: int) -> TrainSettings:
     return settings.settings_of("small", {**changes, **run, "validation_samples": 24})
 
 
-def step_seconds(source: Callable[[], StoreSource], candidates: Mapping[str, PresetChanges]) -> dict[str, float]:
+def step_seconds(source: Callable[[], SceneReader], candidates: Mapping[str, PresetChanges]) -> dict[str, float]:
     """Processor seconds of a step of each on one thread, the median of some, on samples that are there.
 
     They take turns, so that the machine's moods reach all alike. The first step of a turn, for which another network
@@ -192,7 +191,7 @@ def step_seconds(source: Callable[[], StoreSource], candidates: Mapping[str, Pre
 
 
 @contextmanager
-def _stepping(source: StoreSource, changes: PresetChanges) -> Iterator[Callable[[], float]]:
+def _stepping(source: SceneReader, changes: PresetChanges) -> Iterator[Callable[[], float]]:
     """What takes a step and returns its processor seconds."""
     chosen = settings_of(changes, 0, 1000)
     with Feed(source, chosen) as feed:

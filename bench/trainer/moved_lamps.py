@@ -29,21 +29,21 @@ from bench.harness.network_errors import F64, Errors
 from bench.harness.scenes import in_passes
 from bench.trainer.explained import Change, Explained
 from bench.trainer.moved_lamps_page import KNOWN, ExplainedChange, LampStudy, document, page, stated
+from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.renderer.jobs.path_buffers import frames_of
 from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
 from photonfarm.shared.core.keys import Key, seed_of, view_key
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photons, ViewBuffers
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, ViewBuffers
 from photonfarm.shared.plan.hold_out import units_of
 from photonfarm.shared.scene.files import BUILTIN_EMITTING, SceneFile
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.spec import Light, Movable, SceneSpec, shape_ids
 from photonfarm.shared.scene.spec_loading import find_scene, load_spec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import Sample, SceneReader, Store
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
-from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Needs, given
@@ -101,14 +101,6 @@ def stays(a: ViewBuffers, b: ViewBuffers) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Look:
-    """A view of one configuration, and all that a network may be given of it."""
-
-    sample: RawSample  # its halves are the reference's
-    photons: Photons | None  # None: the scene has none
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class PredictorGroup:
     """What predicts images: networks that differ in their seeds alone, or the light of the guides without a network."""
 
@@ -125,31 +117,29 @@ class Views:
 
     spec: SceneSpec
     base: Base
-    pairs: tuple[tuple[Look, Look], ...]
+    pairs: tuple[tuple[Sample, Sample], ...]
     units: tuple[Key, ...]  # the configuration of each
 
     @cached_property
     def change(self) -> Change:
         """What the lamps change."""
-        radiance = np.array([[look.sample.radiance for look in pair] for pair in self.pairs])  # (N, 2, 2, H, W, 3)
+        radiance = np.array([[look.radiance for look in pair] for pair in self.pairs])  # (N, 2, 2, H, W, 3)
         shown = _shown(np.float32(self.spec.exposure) * radiance)
-        same = [stays(first.sample.buffers, second.sample.buffers) for first, second in self.pairs]
+        same = [stays(first.buffers, second.buffers) for first, second in self.pairs]
         return Change(shown[:, 1] - shown[:, 0], np.stack(same), self.units)
 
     def predicted(self, predict: Predictor, candidate: PredictorGroup) -> F64:
         """What a predictor says that the lamps change, (N, H, W, 3) in the metric space."""
-        total = len(self.base[1].position)
-        memory = TrainingBatch.empty(1, min(candidate.points or total, total), self.spec, candidate.needs)
-        made = [[predict(self._filled(memory, look))[0].copy() for look in pair] for pair in self.pairs]
+        tensors = SampleTensors(self.spec, candidate.needs.fields, exposure=self.spec.exposure, points=candidate.points)
+        memory = tensors.empty(1)
+
+        def filled(look: Sample) -> TrainingBatch:
+            tensors.fill(memory, 0, look)
+            return TrainingBatch.of((0,), (b"",), memory)
+
+        made = [[predict(filled(look))[0].copy() for look in pair] for pair in self.pairs]
         shown = _shown(np.array(made, np.float32))
         return shown[:, 1] - shown[:, 0]
-
-    def _filled(self, memory: TrainingBatch, look: Look) -> TrainingBatch:
-        """A look as a batch of one, in memory that is used again."""
-        fill(memory, 0, look.sample, self.spec, self.base[1])
-        if memory.inputs.photons is not None:
-            fill_photons(memory.inputs.photons, 0, given(look.photons))
-        return memory.filled((0,), (b"",))
 
     def row(self, candidate: PredictorGroup) -> ExplainedChange:
         """How much of the change a candidate explains."""
@@ -229,28 +219,29 @@ class Stage:
         spec = located(stored.spec)
         return cls(spec, stored.base(), load_scene(in_passes(spec, half_spp)))
 
-    def look(self, modification: Modification, view: View) -> Look:
-        """Render a view, and what a network is given of it, which is what `photonfarm infer` gives.
+    def look(self, modification: Modification, view: View) -> Sample:
+        """Render a view as a sample with the reference's halves, and with what `photonfarm infer` gives a network.
 
         The seeds of the halves are of this benchmark alone, so that no guide and no sample has their noise.
         """
         frames = frames_of(self.spec, modification, [view], self.base[1], lambda _: self.scene)
         key = view_key(modification.key(self.spec.radiance_id), view.vector)
         halves = self.scene.render_halves(view, [seed_of(key, f"{NAME}, half {half}") for half in "AB"])
-        known = frames.buffers(0), frames.visibility(0), 0, frames.guides_of(0)
-        return Look(RawSample(modification, view, halves, 1.0, *known), frames.photons)
+        known = frames.buffers(0), frames.visibility(0), frames.guides_of(0)
+        shared = (lambda: self.base[1]), (lambda: given(frames.photons))
+        return Sample(0, b"", modification, view, 0, halves, *known, 1.0, *shared)
 
-    def views(self, source: StoreSource, rows: Sequence[int]) -> Views:
+    def views(self, source: SceneReader, rows: Sequence[int]) -> Views:
         """The views of some samples, rendered anew."""
         shines, pairs = lamps(self.spec), []
         for index, row in enumerate(rows):
-            (sample,) = source.read_samples([row])
+            sample = source.read(row)
             moved = relit(sample.modification, sample_modification(self.spec, SEED, index), shines)
             pairs.append((self.look(sample.modification, sample.view), self.look(moved, sample.view)))
         return Views(self.spec, self.base, tuple(pairs), tuple(units_of(source, rows)))
 
 
-def held_out(source: StoreSource, share: float, views: int) -> list[int]:
+def held_out(source: SceneReader, share: float, views: int) -> list[int]:
     """The first sample of each of so many held-out configurations; IncompleteError where they are fewer than two."""
     rows = HeldOutSamples.of(source, share, sys.maxsize).rows
     first = dict(zip(reversed(units_of(source, rows)), reversed(rows), strict=True))
@@ -264,7 +255,7 @@ def measured(name: str, arguments: argparse.Namespace) -> LampStudy:
     folder = arguments.work / name
     runs = trained_runs(folder)
     store, scene_id = Store(folder / "store"), runs[0][0].scene_id
-    source = StoreSource(store.root, scene_id)
+    source = SceneReader(store.root, scene_id)
     share = min(run.settings.hold_out for group in runs for run in group)  # shares are nested: no run has seen these
     rows = held_out(source, share, arguments.views)
     stage = Stage.of(store, scene_id, arguments.half_spp)

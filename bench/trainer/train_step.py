@@ -28,10 +28,10 @@ from bench.harness.scenes import square
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.store.read.batch import Batch
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.networks.light_transport import LightTransportPhotons
@@ -127,7 +127,7 @@ def filled(spec: SceneSpec, root: Path) -> str:
 
 def measure(where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer, steps: int) -> ArchitectureTimes:
     """One architecture on a complete store."""
-    with Feed(StoreSource(*where), settings) as feed:
+    with Feed(SceneReader(*where), settings) as feed:
         rows = [row for row, _ in feed.arrivals()[0]]
         learner = Learner(feed, settings)
         feed.ask(rows[: settings.batch])
@@ -194,7 +194,7 @@ def projections(network: Network, inputs: Inputs) -> list[tuple[Any, ...]]:
 
 def fed_ms(where: tuple[Path, str], settings: TrainSettings, rounds: int = 5) -> float:
     """Milliseconds for a sample to come through the feed."""
-    with Feed(StoreSource(*where), settings) as feed:
+    with Feed(SceneReader(*where), settings) as feed:
         rows = [row for row, _ in feed.arrivals()[0]]
         asked = [rows[i : i + settings.batch] for i in range(0, len(rows), settings.batch)]
 
@@ -213,7 +213,7 @@ def wait_share(where: tuple[Path, str], settings: TrainSettings, steps: int) -> 
     """Share of the time of a run's steps for which it waited for data."""
     with tempfile.TemporaryDirectory() as folder:
         changes = {"max_steps": steps, "validate_every": 10 * steps, "validation_samples": 1}
-        train(StoreSource(*where), settings.model_copy(update=changes), Path(folder))
+        train(SceneReader(*where), settings.model_copy(update=changes), Path(folder))
         seconds = metrics_log.read(Path(folder) / METRICS)[-1]["seconds"]
     waited = seconds["wait_data"] + seconds["wait_read"]
     return waited / (waited + seconds["train"])
@@ -221,13 +221,14 @@ def wait_share(where: tuple[Path, str], settings: TrainSettings, steps: int) -> 
 
 def reading(where: tuple[Path, str], settings: TrainSettings, size: int) -> Reading:
     """Samples of one size, from the page cache."""
-    source = StoreSource(*where)
+    source = SceneReader(*where)
     rows = source.refresh().tolist()
+    memory = Batch.empty(source.spec, settings.batch)
 
     def one_round() -> float:
         began = time.perf_counter()
         for i in range(0, len(rows), settings.batch):
-            source.read_samples(rows[i : i + settings.batch])
+            source.read_samples(rows[i : i + settings.batch], memory)
         return (time.perf_counter() - began) * 1e3 / len(rows)
 
     one_round()

@@ -7,6 +7,7 @@ import pickle
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import fields
 from inspect import Signature, signature
 from pathlib import Path
 from types import ModuleType
@@ -80,11 +81,13 @@ def test_public_parameters(function: Callable[..., object], parameters: str) -> 
 
 def test_public_members() -> None:
     assert {name for name in dir(Scene) if not name.startswith("_")} == {
-        "geometry", "has_guides", "id", "name", "refresh", "row", "rows", "snapshot", "spec", "split", "torch",
+        "geometry", "has_guides", "id", "name", "read_samples", "refresh", "row", "rows", "snapshot", "spec", "split",
+        "torch",
     }  # fmt: skip
-    assert {name for name in dir(photonfarm.data.Sample) if not name.startswith("_")} == {
-        "albedo", "depth", "guides", "key", "modification", "normal", "pass_number", "photons", "point_cloud",
-        "radiance", "row", "seeds", "seen_photons", "view",
+    members = {*dir(photonfarm.data.Sample), *(field.name for field in fields(photonfarm.data.Sample))}
+    assert {name for name in members if not name.startswith("_")} == {
+        "buffers", "decoded", "guides", "images", "key", "modification", "pass_number", "photons", "point_cloud",
+        "radiance", "read_cloud", "read_photons", "row", "scale", "seeds", "seen_photons", "view", "visibility",
     }  # fmt: skip
 
 
@@ -184,10 +187,10 @@ def test_guides_come_with_samples_unless_the_scene_is_opened_without(tmp_path: P
     for row in (4, 5):
         sample = scene[row]
         for name, values in arrays_of(samples.guides(written.spec, row)).items():
-            np.testing.assert_array_equal(sample.guides[name], rounded(values) if name in NOISY_GUIDES else values)
-            np.testing.assert_array_equal(getattr(sample, name), sample.guides[name])
+            np.testing.assert_array_equal(getattr(sample, name), rounded(values) if name in NOISY_GUIDES else values)
+            np.testing.assert_array_equal(getattr(sample, name), getattr(sample.guides, name))
     assert scene.torch()[5]["direct"].shape == (8, 8, 3)
-    assert without[5].guides == {}
+    assert without[5].guides is None
     assert (scene.has_guides, without.has_guides) == (True, False)
     assert "direct" not in without.torch()[5]
     with pytest.raises(AttributeError):

@@ -20,8 +20,7 @@ from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader, Store
 
 Ended = subprocess.CompletedProcess[str]
 
@@ -210,7 +209,7 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
     renderer = ShardRenderer(Store(root), worker="test", load=analytic.AnalyticScene.load)
     for job in scene.missing_jobs():
         renderer.render(scene.scene_id, job)
-    source = StoreSource(root, scene.scene_id)
+    source = SceneReader(root, scene.scene_id)
     rows = source.refresh()
     assert len(rows) == 6
     found = set()

@@ -14,7 +14,7 @@ from photonfarm.shared.core.records import Geometry, Photons, ViewBuffers, Visib
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.view import Camera, View, sample_view
-from photonfarm.shared.store import Store, StoredSample
+from photonfarm.shared.store import Sample, Store
 
 
 def test_a_dot_is_where_a_photon_is_seen_and_nowhere_else() -> None:
@@ -25,10 +25,8 @@ def test_a_dot_is_where_a_photon_is_seen_and_nowhere_else() -> None:
     position = (camera.origin + 2 * camera.rays().reshape(-1, 3)).astype(np.float32)
     seen = np.arange(len(pixels)) % 3 == 0
     flat = np.zeros((camera.height, camera.width, 3), np.float32)
-    sample = StoredSample(
-        0, rest(spec), view, np.stack([flat, flat]), ViewBuffers(flat[..., 0], flat, flat),
-        Visibility(np.zeros(0, np.bool_), seen), 0,
-    )  # fmt: skip
+    seen_by_view = ViewBuffers(flat[..., 0], flat, flat), Visibility(np.zeros(0, np.bool_), seen)
+    sample = Sample(0, b"", rest(spec), view, 0, np.stack([flat, flat]), *seen_by_view)
     bounce = np.zeros(len(seen), np.int8)
     picture = photon_picture(sample, Photons(position, position, position, np.ones_like(position), bounce), spec)
     assert (picture.max(axis=-1).ravel() > 0).tolist() == seen.tolist()

@@ -1,6 +1,8 @@
 """Samples of the analytic room: as a source that grows, and as jobs of a store."""
 
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,12 +19,13 @@ from photonfarm.shared.core.records import (
     Photons,
     ViewBuffers,
 )
+from photonfarm.shared.plan.request import sample_key
 from photonfarm.shared.scene.modification import Modification, sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
-from photonfarm.shared.store import Figures, SceneStore
-from photonfarm.trainer.data.dataset import RawSample
+from photonfarm.shared.store import Figures, Sample, SceneStore
+from photonfarm.shared.store.read.batch import Batch
 
 
 class AnalyticSource:
@@ -40,7 +43,16 @@ class AnalyticSource:
     def base(self) -> tuple[Geometry, BasePointCloud]:
         return self._base
 
-    def read_guides(self) -> None: ...
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        return np.arange(self._released)
+
+    def doubt(self) -> None: ...
+
+    def lease(self) -> None: ...
+
+    def at_work(self, _what: str) -> AbstractContextManager[None]:
+        return nullcontext()
 
     @property
     def planned(self) -> int:
@@ -54,10 +66,6 @@ class AnalyticSource:
         before = self._released
         self._released = min(self._samples, before + self._per_look)
         return np.arange(before, self._released)
-
-    @property
-    def taken_back(self) -> NDArray[np.int64]:
-        return np.zeros(0, np.int64)
 
     def modification(self, row: int) -> Modification:
         return sample_modification(self.spec, 0, row // self._views)
@@ -77,6 +85,9 @@ class AnalyticSource:
     def view_keys(self, rows: Sequence[int]) -> list[Key]:
         return [self.view_key(row) for row in rows]
 
+    def sample_keys(self, rows: Sequence[int]) -> list[Key]:
+        return [sample_key(self.spec.radiance_id, self.modification(row), self.view(row).vector, 0) for row in rows]
+
     def cloud_at(self, row: int) -> tuple[F32, NDArray[np.bool_]]:
         """The cloud of a row's configuration: positions, and which points are present."""
         return rebuild(self._base[1], self.modification(row))
@@ -88,16 +99,18 @@ class AnalyticSource:
     def clean(self, row: int) -> F32:
         return render(self.spec, self.modification(row), self.view(row))[0]
 
-    def read(self, row: int) -> RawSample:
+    def read(self, row: int) -> Sample:
         self.reads.append(row)
         modification, view = self.modification(row), self.view(row)
         clean, buffers = render(self.spec, modification, view)
         photons = self.read_photons(row) if self.spec.photons.paths else None
         seen = visibility(self.spec, self._base[1], modification, view, photons)
         guides = known(clean, buffers, min(LIT_POINTS, self.spec.points))
-        return RawSample(modification, view, noisy(clean, row, self._noise), 1.0, buffers, seen, 0, guides)
+        halves, (key,) = noisy(clean, row, self._noise), self.sample_keys([row])
+        shared = (lambda: self._base[1]), partial(self.read_photons, row)
+        return Sample(row, key, modification, view, 0, halves, buffers, seen, guides, 1.0, *shared)
 
-    def read_samples(self, rows: Sequence[int]) -> list[RawSample]:
+    def read_samples(self, rows: Sequence[int], _out: Batch | None = None) -> list[Sample]:
         return [self.read(row) for row in rows]
 
     def read_photons(self, row: int) -> Photons:

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm.trainer.data.dataset import SampleSource
+from photonfarm.trainer.data.batch import SampleSource
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predict.evaluation import batches, measure, network_predictor
 from photonfarm.trainer.predict.trained import TrainedRun

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.data.sample import Sample
-from photonfarm.shared.core.records import BasePointCloud, Geometry
+from photonfarm.shared.core.records import Geometry
 from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneReader, Store
+from photonfarm.shared.store.read.batch import Batch, Sample
 from photonfarm.shared.store.read.find import scene_named
 
 if TYPE_CHECKING:
@@ -50,7 +50,6 @@ class Scene:
         self._reader.refresh()
         self._frozen = rows is not None
         self._rows = self._reader.rows if rows is None else np.asarray(rows, np.int64)
-        self._base: tuple[Geometry, BasePointCloud] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _opened, (self._store, self._id, self._guides, self._rows.tolist() if self._frozen else None)
@@ -83,7 +82,7 @@ class Scene:
     @property
     def geometry(self) -> Geometry:
         """The scene's triangles at rest; StoreError while no job has been committed."""
-        return self._read_base()[0]
+        return self._reader.base()[0]
 
     @property
     def rows(self) -> NDArray[np.int64]:
@@ -122,12 +121,11 @@ class Scene:
         return self._sample(int(number))
 
     def _sample(self, row: int) -> Sample:
-        return Sample(self._reader.read(row, guides=self._guides), self._reader, self._id, self._read_base()[1])
+        return self._reader.read(row, guides=self._guides)
 
-    def _read_base(self) -> tuple[Geometry, BasePointCloud]:
-        if self._base is None:
-            self._base = self._reader.base()
-        return self._base
+    def read_samples(self, rows: Sequence[int], out: Batch) -> list[Sample]:
+        """Samples by their rows, as they are stored, in the memory of a batch; see `SceneReader.read_samples`."""
+        return self._reader.read_samples(rows, out)
 
     # ------------------------------------------------------------------------------------------------ while it grows
 
@@ -164,18 +162,25 @@ class Scene:
         return self._of(self._rows[held_out if split == "held-out" else ~held_out])
 
     def torch(
-        self, split: Split = "all", *, hold_out: float = HOLD_OUT, fields: Sequence[str] | None = None
+        self,
+        split: Split = "all",
+        *,
+        hold_out: float = HOLD_OUT,
+        fields: Sequence[str] | None = None,
+        exposure: float = 1.0,
+        points: int | None = None,
     ) -> SceneDataset:
         """The samples of a split as a torch dataset of dictionaries; it pickles, so any DataLoader works.
 
         Without a split it has all samples of this scene, those to be held out among them: to train, name "train", or
-        take the dataset of a scene that is split already. `fields` are names of images and of `modification` and
-        `view`; None takes all that there are. Raises ValueError as `split` does, SpecError for another field, and
-        ImportError without torch.
+        take the dataset of a scene that is split already. `fields` are the names of tensors, by default all images,
+        `modification` and `view`; `SceneDataset` has all. Light is multiplied by `exposure`, such as the one of the
+        spec; of the scene's points the first `points` are given. Raises ValueError as `split` does, SpecError for
+        another field, and ImportError without torch.
         """
         from photonfarm.data.torch_dataset import SceneDataset
 
-        return SceneDataset(self.split(split, hold_out=hold_out), fields)
+        return SceneDataset(self.split(split, hold_out=hold_out), fields, exposure=exposure, points=points)
 
     def _of(self, rows: NDArray[np.int64]) -> Self:
         return type(self)(self._store, self._id, guides=self._guides, rows=rows.tolist())

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.data import Sample, Scene
-from photonfarm.export.columns import GUIDES, HALVES, Column
+from photonfarm.export.columns import HALVES, Column
 from photonfarm.shared.core.keys import seed_of, view_key
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
@@ -154,7 +154,7 @@ def _of(sample: Sample, column: Column, found: Values) -> Any:
     elif column.name == "photon_seen":
         value = sample.seen_photons
     else:
-        value = sample.guides[column.name] if column.name in GUIDES else getattr(sample, column.name)
+        value = getattr(sample, column.name)
     return np.ascontiguousarray(value, column.dtype) if column.shape else value
 
 

@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from photonfarm.shared.core import pictures
-from photonfarm.shared.core.records import F32, BasePointCloud, arrays_of
-from photonfarm.shared.plan.request import sample_key
+from photonfarm.shared.core.records import F32, BasePointCloud
 from photonfarm.shared.plan.sample_costs import relative_variance
 from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.store import SceneReader, StoredSample
+from photonfarm.shared.store import Sample, SceneReader
 from photonfarm.web import images
 from photonfarm.web.server import NotThereError
 
@@ -45,15 +44,14 @@ class SceneSamples:
         self._reader = SceneReader(place, scene_id)
         self._wall: deque[int] = deque(maxlen=WALL)
         self._noise: OrderedDict[int, float] = OrderedDict()  # by row, of those whose pictures were made
-        self._opened: OrderedDict[int, StoredSample] = OrderedDict()
+        self._opened: OrderedDict[int, Sample] = OrderedDict()
         self._base: BasePointCloud | None = None
 
     def look(self) -> list[int]:
         """Look for new samples; returns the rows on the wall, the latest first."""
         with self._lock:
             new = self._reader.refresh()
-            gone = set(self._reader.taken_back.tolist())
-            kept = [row for row in self._wall if row not in gone]
+            kept = [row for row in self._wall if self._is_complete(row)]
             at_once = AT_ONCE if kept else WALL
             if len(new) > at_once:
                 new = new[np.linspace(0, len(new) - 1, at_once).astype(np.int64)]
@@ -129,8 +127,8 @@ class SceneSamples:
         return {
             "row": row,
             "scene": spec.name,
-            "key": sample_key(self._reader.spec.radiance_id, modification, sample.view.vector, sample.pass_).hex(),
-            "pass": sample.pass_,
+            "key": sample.key.hex(),
+            "pass": sample.pass_number,
             "passes": self._merged(row)[1],
             "previous": int(rows[place - 1]) if place else None,
             "next": int(rows[place + 1]) if place + 1 < len(rows) else None,
@@ -176,7 +174,7 @@ class SceneSamples:
         if not self._is_complete(row):
             raise NotThereError(f"scene {self._scene_id} has no complete sample in row {row}")
 
-    def _read(self, row: int) -> StoredSample:
+    def _read(self, row: int) -> Sample:
         """A sample without its guides, its noise noted."""
         with self._lock:
             self._check(row)
@@ -184,7 +182,7 @@ class SceneSamples:
         self._noted_noise(sample)
         return sample
 
-    def _open(self, row: int) -> StoredSample:
+    def _open(self, row: int) -> Sample:
         """A sample with its guides."""
         with self._lock:
             self._check(row)
@@ -201,7 +199,7 @@ class SceneSamples:
                 self._base = self._reader.base()[1]
             return self._base
 
-    def _noted_noise(self, sample: StoredSample) -> float | None:
+    def _noted_noise(self, sample: Sample) -> float | None:
         """The relative noise of a sample's mean, a standard deviation; None for a black image."""
         variance = relative_variance(sample.radiance[0], sample.radiance[1], 1.0)
         if variance is None:
@@ -213,8 +211,6 @@ class SceneSamples:
             return self._noise[sample.row]
 
 
-def _images_of(sample: StoredSample) -> dict[str, F32]:
+def _images_of(sample: Sample) -> dict[str, F32]:
     """The buffers and guides of a sample that are images, by name."""
-    arrays = arrays_of(sample.buffers) | ({} if sample.guides is None else arrays_of(sample.guides))
-    images = {name: np.asarray(array, np.float32) for name, array in arrays.items()}
-    return {name: array for name, array in images.items() if array.shape[:2] == sample.radiance.shape[1:3]}
+    return {name: array for name, array in sample.images.items() if array.shape[:2] == sample.radiance.shape[1:3]}

@@ -24,8 +24,7 @@ from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader, Store
 from photonfarm.trainer.metrics.intervals import t_975
 from photonfarm.trainer.runs.settings import preset
 
@@ -68,16 +67,16 @@ def configurations(arm: ArmSamples) -> set[bytes]:
 
 @pytest.mark.parametrize("spp", [2, 4, 16])
 def test_halves_of_a_cleaner_sample_are_means_over_its_views_first_passes(root: Root, spp: int) -> None:
-    arm, source = ArmSamples(*root, Share(spp, 1, 1), 4), StoreSource(*root)
+    arm, source = ArmSamples(*root, Share(spp, 1, 1), 4), SceneReader(*root)
     complete = source.refresh().tolist()
     (key,) = arm.view_keys(arm.chosen[:1])
     passes = [row for row, of in zip(complete, source.view_keys(complete), strict=True) if of == key][: spp // 2]
     (sample,) = arm.read_samples(arm.chosen[:1])
 
-    read = source.read_samples(passes)
-    expected = np.mean([one.radiance.astype(np.float64) * one.scale for one in read], axis=0)
+    read = [source.read(row) for row in passes]
+    expected = np.mean([one.radiance.astype(np.float64) for one in read], axis=0)
     assert len(read) == spp // 2
-    np.testing.assert_allclose(sample.radiance.astype(np.float64) * sample.scale, expected, rtol=1e-6)
+    np.testing.assert_allclose(sample.radiance.astype(np.float64), expected, rtol=1e-6)
 
 
 def test_a_share_is_so_many_views_of_each_configuration_and_samples_of_each_view(root: Root) -> None:
@@ -101,13 +100,11 @@ def test_no_sample_of_an_arm_is_of_a_configuration_that_is_held_out(root: Root) 
 
 def test_samples_that_were_chosen_can_be_read_with_their_guides(root: Root) -> None:
     """What is read together of a sample is what another source reads of it alone."""
-    arm, source = ArmSamples(*root, Share(2, 1, 1), 4), StoreSource(*root)
-    for each in (arm, source):
-        each.read_guides()
+    arm, source = ArmSamples(*root, Share(2, 1, 1), 4), SceneReader(*root)
     rows, _ = arm.refresh().tolist(), source.refresh()
     assert rows_held_out(arm, rows, HELD_OUT) == [False] * 4 + [True]
     for row, sample in zip(rows, arm.read_samples(rows), strict=True):
-        (alone,) = source.read_samples([row])
+        alone = source.read(row, guides=True)
         for part in ("guides", "buffers", "visibility"):
             read = arrays_of(getattr(sample, part))
             for name, values in arrays_of(getattr(alone, part)).items():

@@ -246,9 +246,8 @@ def test_none_is_trained_on_what_is_held_out(roots: dict[str, tuple[Path, str]])
 
 def test_networks_with_guides_can_be_trained_on_chosen_samples(roots: dict[str, tuple[Path, str]]) -> None:
     source = FirstSamples(*roots["path"], SAMPLES)
-    source.read_guides()
     rows = source.refresh().tolist()
-    assert all(sample.guides is not None for sample in source.read_samples(rows[:2]))
+    assert all(sample.guides is not None for sample in (source.read(row, guides=True) for row in rows[:2]))
     assert sum(are_held_out(source.modification_keys(rows), HELD_OUT)) == 1
 
 

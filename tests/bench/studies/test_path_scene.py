@@ -18,8 +18,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import sample_view
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.read.reader import StoredSample
+from photonfarm.shared.store import Sample, SceneReader, Store
 
 SIZE, SPP = 16, 72
 
@@ -33,7 +32,7 @@ def tiny_room() -> SceneSpec:
 
 
 @pytest.fixture(scope="module")
-def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[StoredSample]]:
+def samples(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Sample]]:
     """Two samples of each kind, rendered into a store of its own."""
     spec, found = tiny_room(), {}
     for kind, load in (("bdpt", None), ("path", partial(path_scene.load_path, spp=SPP))):
@@ -54,7 +53,7 @@ def standard_error(halves: F32) -> float:
     return math.sqrt(float(np.sum(apart**2))) / apart.size
 
 
-def test_both_kinds_have_the_same_mean(samples: dict[str, list[StoredSample]]) -> None:
+def test_both_kinds_have_the_same_mean(samples: dict[str, list[Sample]]) -> None:
     for ours, theirs in zip(samples["bdpt"], samples["path"], strict=True):
         off = float(theirs.radiance.mean(dtype=np.float64) - ours.radiance.mean(dtype=np.float64))
         error = math.hypot(standard_error(ours.radiance), standard_error(theirs.radiance))
@@ -62,7 +61,7 @@ def test_both_kinds_have_the_same_mean(samples: dict[str, list[StoredSample]]) -
         assert abs(off) < 4 * error
 
 
-def test_all_but_the_noise_is_the_same(samples: dict[str, list[StoredSample]]) -> None:
+def test_all_but_the_noise_is_the_same(samples: dict[str, list[Sample]]) -> None:
     for ours, theirs in zip(samples["bdpt"], samples["path"], strict=True):
         np.testing.assert_array_equal(ours.view.vector, theirs.view.vector)
         np.testing.assert_array_equal(ours.modification.vector, theirs.modification.vector)

@@ -6,11 +6,11 @@ import pytest
 import torch
 from analytic_room import analytic_spec
 from analytic_room_samples import AnalyticSource
+from read_batches import batch_of
 from torch import Tensor
 
 from bench.trainer import candidates
 from bench.trainer.guided_networks import CANDIDATES, INSTEAD
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, Needs
@@ -34,8 +34,7 @@ def made(name: str) -> Network:
 
 def inputs(needs: Needs = Needs(guides=True)) -> Inputs:  # noqa: B008
     """Two samples."""
-    batch = TrainingBatch.empty(2, 256, SOURCE.spec, needs)
-    return read_into(batch, SOURCE, (0, 1), needs, SOURCE.base()[1]).inputs
+    return batch_of(SOURCE, (0, 1), needs).inputs
 
 
 def image(network: Network) -> Tensor:

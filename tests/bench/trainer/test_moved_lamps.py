@@ -29,9 +29,8 @@ from photonfarm.shared.core.records import F32, ViewBuffers
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import Emitters, SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import TrainingBatch
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks.inputs import POINTS_ONLY
 from photonfarm.trainer.predict.evaluation import Predictor, constant_predictor
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -73,7 +72,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
         stop = Stop()
         if name == "cut":
             stop.set()
-        train(StoreSource(store.root, spec.scene_id), settings, folder / "runs" / name, Hooks(stop=stop))
+        train(SceneReader(store.root, spec.scene_id), settings, folder / "runs" / name, Hooks(stop=stop))
     return folder.parent
 
 
@@ -81,7 +80,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def views(work: Path) -> Views:
     """Two views of it."""
     store, scene_id = Store(work / "tiny/store"), tiny().scene_id
-    source = StoreSource(store.root, scene_id)
+    source = SceneReader(store.root, scene_id)
     rows = held_out(source, HOLD_OUT, 2)
     return Stage.of(store, scene_id, half_spp=8).views(source, rows)
 
@@ -121,7 +120,7 @@ def test_objects_stay_and_lamps_move(views: Views) -> None:
 @pytest.mark.slow
 def test_a_network_is_told_of_a_view_as_it_is_what_the_store_holds_of_it(work: Path, views: Views) -> None:
     run = TrainedRun.load(work / "tiny/runs/guided")
-    looked, source = (StoreSource(work / "tiny/store", run.scene_id) for _ in range(2))
+    looked, source = (SceneReader(work / "tiny/store", run.scene_id) for _ in range(2))
     stored = room_study.images(run, source, held_out(looked, HOLD_OUT, 2))
     made: list[F32] = []
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from read_batches import batch_of
 
 from bench.trainer.projection_oracle import in_camera, sees, triangles
 from photonfarm.renderer.jobs.render import ShardRenderer
@@ -15,9 +16,8 @@ from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import PhotonInputs, PointInputs
@@ -59,11 +59,11 @@ def read(tmp_path_factory: pytest.TempPathFactory) -> Read:
     for job in range(scene.jobs()):
         assert renderer.render(scene.scene_id, job)
 
-    source, needs = StoreSource(root, scene.scene_id), ARCHITECTURES[SETTINGS.architecture].needs
+    source, needs = SceneReader(root, scene.scene_id), ARCHITECTURES[SETTINGS.architecture].needs
     assert source.refresh().tolist() == [*range(6)]
     base = source.base()
-    batch = read_into(TrainingBatch.empty(len(ROWS), POINTS, spec, needs), source, ROWS, needs, base[1])
-    samples = source.read_samples(ROWS)
+    batch = batch_of(source, ROWS, needs)
+    samples = [source.read(row) for row in ROWS]
     cameras = [Camera.of(sample.view, spec) for sample in samples]
     points, photons = [], []
     for row, sample, camera in zip(ROWS, samples, cameras, strict=True):

@@ -25,10 +25,9 @@ from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import PlannedRows, Request
 from photonfarm.shared.queue import connect, reconcile
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.io import object_requests
 from photonfarm.shared.store.io.objects import ObjectStorage
-from photonfarm.trainer.data.store_source import StoreSource
 
 
 def stored(url: str) -> dict[str, bytes]:
@@ -264,7 +263,7 @@ def test_workers_behind_a_lossy_way_and_under_kills_lose_and_double_nothing(
     assert {name: content for name, content in data.items() if not name.endswith(".claim")} == clean
     assert len([name for name in found if name.startswith("committed/")]) == scene.jobs() == 6
 
-    source = StoreSource(url, scene.scene_id)  # as the trainer reads
+    source = SceneReader(url, scene.scene_id)  # as the trainer reads
     assert source.ready()
     rows = source.refresh()
     assert rows.size == 12

@@ -1,8 +1,6 @@
 """What is read, held out and kept in memory."""
 
 import time
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,18 +8,14 @@ import pytest
 import torch
 from analytic_room_samples import known
 
-from photonfarm.shared.core.errors import CorruptError
+from photonfarm.shared.core.errors import CorruptError, IncompleteError
 from photonfarm.shared.core.records import LIT_POINTS, ViewBuffers, Visibility
 from photonfarm.shared.plan.hold_out import are_held_out, rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store import Figures, Store
+from photonfarm.shared.store import Figures, SceneReader, Store
 from photonfarm.shared.store.check.check import check_store
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
-from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.run_folder import CHECKPOINT
-from photonfarm.trainer.training.loop import train
 
 
 def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
@@ -93,7 +87,7 @@ def test_a_batch_holds_what_was_committed_exactly_also_where_float16_cannot(scen
             out.radiance(sample.row, bright if sample.row == 1 else 0 * bright + 0.5)
             out.view(sample.view_row, buffers, guides, Visibility(seen, np.zeros(0, bool)))
         out.commit(Figures(core_s=1, wall_s=1, redrawn=0, worker="test", versions={"test": "1"}))
-    with Feed(StoreSource(scene.storage.root, scene.scene_id), tiny()) as feed:
+    with Feed(SceneReader(scene.storage.root, scene.scene_id), tiny()) as feed:
         feed.ask([1, 0])
         batch = feed.take()
         np.testing.assert_array_equal(batch.target[0], bright * np.float32(scene.spec.exposure))
@@ -152,45 +146,34 @@ def repaired(scene, commit):
     return scene, repair
 
 
-def until(feed: Feed, rows: list[int], wanted: tuple[int, ...]) -> None:
-    """Ask until the feed has noticed what has become of the store."""
-    deadline = time.monotonic() + 20
-    while True:
-        feed.ask(rows)
-        if (found := feed.take().rows) == wanted:
-            return
-        assert time.monotonic() < deadline, found
-
-
-def test_rows_that_a_repair_takes_back_are_left_out_until_they_are_rendered_again(repaired, commit, tiny) -> None:
-    scene, repair = repaired
-    source = StoreSource(scene.storage.root, scene.scene_id)
-    with Feed(source, tiny()) as feed:
-        told = feed.arrivals()
-        until(feed, [0, 1, 4], (0, 1, 4))
-        repair(0)
-        until(feed, [0, 1, 4], (4,))
-        until(feed, [0, 1], ())
-        commit(scene, 0)
-        until(feed, [0, 1, 4], (0, 1, 4))
-        again, complete = feed.arrivals()
-    assert len(told[0]) == 16
-    assert [row for row, _ in again] == [0, 1, 2, 3][: len(again)]  # rows 2 and 3 show their modification
-    assert complete
-
-
-def test_a_row_taken_back_between_two_looks_at_the_store_is_left_out_as_well(repaired, tiny) -> None:
+def test_a_reader_without_a_presence_ends_where_what_it_reads_was_set_aside(repaired, tiny) -> None:
     """The reader still believes that it is complete, and its file is gone."""
     scene, repair = repaired
-    with Feed(StoreSource(scene.storage.root, scene.scene_id), tiny(poll_seconds=600)) as feed:
+    with Feed(SceneReader(scene.storage.root, scene.scene_id), tiny(poll_seconds=600)) as feed:
         repair(7)
         feed.ask([14, 0, 15])
-        assert feed.take().rows == (0,)
+        with pytest.raises(IncompleteError, match=r"row 14 .* is not complete"):
+            feed.take()
+
+
+def test_quiet_begins_when_all_is_read_and_ends_with_what_is_missing(repaired, commit, tiny) -> None:
+    scene, repair = repaired
+    with Feed(SceneReader(scene.storage.root, scene.scene_id), tiny(poll_seconds=0.01)) as feed:
+        feed.ask([0, 1])
+        with feed.quiet():
+            repair(0)
+            feed.ask([0, 1])
+            time.sleep(0.2)
+            assert feed.missing == 0, "nothing is looked at"
+        assert feed.take().rows == (0, 1), "was read before"
+        commit(scene, 0)
+        assert feed.take().rows == (0, 1), "waited for"
+        assert feed.missing == 0
 
 
 def test_where_a_look_at_the_store_takes_long_looks_are_rare(repaired, tiny, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, _ = repaired
-    source, looks = StoreSource(scene.storage.root, scene.scene_id), []
+    source, looks = SceneReader(scene.storage.root, scene.scene_id), []
     plain = source.refresh
 
     def slow() -> Any:
@@ -204,28 +187,3 @@ def test_where_a_look_at_the_store_takes_long_looks_are_rare(repaired, tiny, mon
         feed.ask([0])
         assert feed.take().rows == (0,), "batches do not wait for the next look"
     assert len(looks) == 1, "the next one is due 4 s after the first"
-
-
-def test_training_goes_on_through_a_repair_and_counts_no_draw_that_came_to_nothing(
-    repaired, commit, tiny, run: Path
-) -> None:
-    scene, repair = repaired
-    source = StoreSource(scene.storage.root, scene.scene_id)
-    settings = tiny(max_steps=60, hold_out=0.3, replay_ratio=1000.0, checkpoint_every=10)
-    read = [0]
-    plain = source.read_samples
-
-    def counted(rows: Sequence[int]) -> Any:
-        read[0] += 1
-        if read[0] == 10:
-            repair(0)
-        if read[0] == 30:
-            commit(scene, 0)
-        return plain(rows)
-
-    source.read_samples = counted
-    assert train(source, settings, run).reason == "steps"
-    state = checkpoint.load(run / CHECKPOINT)["following"]
-    visits = state["sampler"]["visits"]
-    assert sorted(state["arrived"]) == [*range(16)]
-    assert visits.max() - visits.min() <= 1 + 2

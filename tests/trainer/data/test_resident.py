@@ -2,17 +2,12 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-from analytic_room import analytic_spec
-from analytic_room_samples import AnalyticSource
-from numpy.typing import NDArray
 
-from photonfarm.trainer.data import resident
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.data import batch as resident
+from photonfarm.trainer.data.batch import FREE_SHARE, ResidentSamples, TrainingBatch, size_bytes
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.resident import FREE_SHARE, ResidentSamples, size_bytes
 from photonfarm.trainer.networks.inputs import Needs, map_tensors
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
@@ -79,30 +74,6 @@ def test_a_run_ends_in_the_same_weights_to_the_bit_with_fewer_reads(
     assert states[0]["last_error"] == states[1]["last_error"]
     assert sorted(sources[1].reads) == sorted(set(sources[0].reads))
     assert len(sources[0].reads) > len(sources[1].reads)
-
-
-class Repaired(AnalyticSource):
-    """A source of which row 4 is set aside at its second look, and complete again at the third."""
-
-    looks = 0
-
-    def refresh(self) -> NDArray[np.int64]:
-        self.looks += 1
-        return np.array([4]) if self.looks == 3 else super().refresh()
-
-    @property
-    def taken_back(self) -> NDArray[np.int64]:
-        return np.array([4] if self.looks == 2 else [], np.int64)
-
-
-def test_a_row_that_is_set_aside_is_read_again(tiny) -> None:
-    source, kept = Repaired(analytic_spec(16, 256), 6), ResidentSamples(CPU, 1.0)
-    with Feed(source, tiny(poll_seconds=600), resident=kept) as feed:
-        for rows in ((4, 1), (1,), (4, 1)):
-            feed.ask((4, 1))
-            assert feed.take().rows == rows
-            feed._poll()
-    assert source.reads == [4, 1, 4]
 
 
 def test_by_default_a_cpu_keeps_none_and_a_card_leaves_a_quarter_free(monkeypatch: pytest.MonkeyPatch) -> None:

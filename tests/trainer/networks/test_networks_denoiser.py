@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 import torch
+from read_batches import batch_of
 
 from photonfarm.shared.core.estimate import Estimate, clean_error, clean_error_having_seen_a
-from photonfarm.trainer.data.dataset import TrainingBatch, kept_pixels, read_into
+from photonfarm.trainer.data.batch import TrainingBatch, kept_pixels
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
@@ -16,16 +17,10 @@ from photonfarm.trainer.runs.settings import NetworkSettings
 DENOISERS = {"denoise_1": 1, "denoise_4": 4, "denoise_16": 16, "denoise_32": 32, "denoise_64": 64}
 
 
-def batch_of(source, rows: tuple[int, ...], architecture: str) -> TrainingBatch:
-    needs, (_, cloud) = ARCHITECTURES[architecture].needs, source.base()
-    batch = TrainingBatch.empty(len(rows), len(cloud.position), source.spec, needs)
-    return read_into(batch, source, rows, needs, cloud)
-
-
 @pytest.mark.parametrize(("architecture", "of"), DENOISERS.items())
 def test_exactly_so_many_pixels_are_kept_and_the_rest_is_zero(make_source, architecture: str, of: int) -> None:
     source = make_source(4)
-    batch = batch_of(source, (0, 1, 2, 3), architecture)
+    batch = batch_of(source, (0, 1, 2, 3), ARCHITECTURES[architecture].needs)
     noisy = batch.inputs.noisy
     assert noisy.kept.sum(dim=(1, 2)).tolist() == [256 // of] * 4
     assert torch.equal(noisy.colour, batch.target[:, 0] * noisy.kept[..., None])
@@ -39,11 +34,11 @@ def test_a_denoiser_sees_the_kept_pixels_of_half_a_and_nothing_else_of_the_image
     settings = NetworkSettings(width=4, architecture=architecture)
     network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
     sample = source.read(0)
-    kept = kept_pixels(sample, source.spec, DENOISERS[architecture])
+    kept = kept_pixels(sample.key, source.spec, DENOISERS[architecture])
 
     def image() -> torch.Tensor:
         with torch.no_grad():
-            return network(batch_of(source, (0,), architecture).inputs)
+            return network(batch_of(source, (0,), ARCHITECTURES[architecture].needs).inputs)
 
     source.read = lambda _: sample
     before = image()
@@ -56,23 +51,23 @@ def test_a_denoiser_sees_the_kept_pixels_of_half_a_and_nothing_else_of_the_image
 
 def test_the_pixels_kept_follow_from_what_the_sample_is(make_source) -> None:
     source, again = make_source(3), make_source(3)
-    kept = [kept_pixels(source.read(row), source.spec, 4) for row in range(3)]
-    assert all(np.array_equal(kept[row], kept_pixels(again.read(row), again.spec, 4)) for row in range(3))
+    kept = [kept_pixels(source.read(row).key, source.spec, 4) for row in range(3)]
+    assert all(np.array_equal(kept[row], kept_pixels(again.read(row).key, again.spec, 4)) for row in range(3))
     assert not np.array_equal(kept[0], kept[1])
-    fewer = kept_pixels(source.read(0), source.spec, 16)
+    fewer = kept_pixels(source.read(0).key, source.spec, 16)
     assert not (fewer & ~kept[0]).any()
 
 
 def test_pixels_are_kept_uniformly(make_source) -> None:
     """Binomial over 400 samples, the largest of 256 pixels: |z| < 4.5 has a chance of 0.998."""
     source = make_source(400)
-    times = sum(kept_pixels(source.read(row), source.spec, 4).astype(int) for row in range(400))
+    times = sum(kept_pixels(source.read(row).key, source.spec, 4).astype(int) for row in range(400))
     assert np.abs(times - 100).max() < 4.5 * np.sqrt(400 * 3 / 16)
 
 
 def test_a_denoiser_is_trained_from_a_to_b_and_from_b_to_a(make_source) -> None:
     source = make_source(2)
-    plain = batch_of(source, (0, 1), "denoise_4")
+    plain = batch_of(source, (0, 1), ARCHITECTURES["denoise_4"].needs)
     pairs = plain.for_training()
     assert pairs.rows == (0, 1, 0, 1)
     assert pairs.target.shape == (4, 1, 16, 16, 3)
@@ -81,7 +76,7 @@ def test_a_denoiser_is_trained_from_a_to_b_and_from_b_to_a(make_source) -> None:
         assert torch.equal(pairs.inputs.noisy.colour[places], plain.target[:, inputs] * kept)
         assert torch.equal(pairs.target[places, 0], plain.target[:, target])
         assert torch.equal(pairs.inputs.albedo[places], plain.inputs.albedo)
-    assert batch_of(source, (0, 1), "cnn").for_training().target.shape == (2, 2, 16, 16, 3)
+    assert batch_of(source, (0, 1), ARCHITECTURES["cnn"].needs).for_training().target.shape == (2, 2, 16, 16, 3)
 
 
 def test_the_error_of_a_prediction_made_from_a_has_the_noise_removed() -> None:

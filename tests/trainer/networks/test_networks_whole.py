@@ -6,15 +6,15 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
+import read_batches
 import torch
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import Photons, arrays_of
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import Store
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
@@ -35,9 +35,7 @@ def named(kind: str) -> dict[str, str]:
 
 
 def batch_of(source, rows: tuple[int, ...], kind: str = "light_transport") -> TrainingBatch:
-    needs, (_, cloud) = ARCHITECTURES[named(kind)["architecture"]].needs, source.base()
-    batch = TrainingBatch.empty(len(rows), len(cloud.position), source.spec, needs)
-    return read_into(batch, source, rows, needs, cloud)
+    return read_batches.batch_of(source, rows, ARCHITECTURES[named(kind)["architecture"]].needs)
 
 
 def network(source, kind: str = "light_transport", seed: int = 0, **settings: object) -> Network:
@@ -358,14 +356,14 @@ def test_photons_are_fed_as_the_store_has_them(make_source, commit, tiny, tmp_pa
     scene.plan(Request(modifications=2, views_per_modification=2), shard_rows=2)
     for job in range(scene.jobs()):
         commit(scene, job)
-    source = StoreSource(scene.storage.root, scene.scene_id)
+    source = SceneReader(scene.storage.root, scene.scene_id)
     with Feed(source, tiny(network=NetworkSettings(width=4, architecture=PHOTONS[0]))) as feed:
         feed.ask([3, 0])
         batch = feed.take()
         for place, row in enumerate((3, 0)):
             for name, wanted in arrays_of(source.read_photons(row)).items():
                 np.testing.assert_array_equal(getattr(batch.inputs.photons, name)[place].numpy(), wanted)
-            seen = source.read_samples([row])[0].visibility.photons
+            seen = source.read(row).visibility.photons
             np.testing.assert_array_equal(batch.inputs.photons.seen[place].numpy(), seen)
             assert 0 < seen.sum() < 32
         assert batch.inputs.photons.present.sum(dim=1).tolist() == [32, 32]  # the second hits of each are empty

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from read_batches import batch_of
 
 from photonfarm.shared.scene.view import Camera
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
@@ -16,14 +16,8 @@ from photonfarm.trainer.networks.projection import Footprint, Optics
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 ARCHITECTURE = "light_transport_photons"
+NEEDS = ARCHITECTURES[ARCHITECTURE].needs
 B, H, W, K = 2, 24, 32, 40
-
-
-def batch_of(source, rows: tuple[int, ...]) -> TrainingBatch:
-    needs, (_, cloud) = ARCHITECTURES[ARCHITECTURE].needs, source.base()
-    return read_into(
-        TrainingBatch.empty(len(rows), len(cloud.position), source.spec, needs), source, rows, needs, cloud
-    )
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.6, 1.2])
@@ -74,7 +68,7 @@ def test_photons_of_longer_paths_than_the_images_have_are_left_out(make_source, 
     source = make_source(1, photons=256)
     settings = NetworkSettings(width=4, architecture=ARCHITECTURE)
     frame = replace(SceneFrame.of(source.spec, *source.base(), settings), max_depth=max_depth)
-    network, inputs = build(settings, frame, 0), batch_of(source, (0,)).inputs
+    network, inputs = build(settings, frame, 0), batch_of(source, (0,), NEEDS).inputs
     inputs.photons.bounce.masked_fill_(inputs.photons.present, 2)
     with torch.no_grad():
         assert any(found.any() for found in network.gathered(inputs)) == counts
@@ -121,7 +115,7 @@ def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_
     network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
     found, wanted = [], []
     for row in range(12):
-        inputs = batch_of(source, (row,)).inputs
+        inputs = batch_of(source, (row,), NEEDS).inputs
         with torch.no_grad():
             known = network.known(inputs, network.further(inputs))
             torch.testing.assert_close(known, inputs.albedo * network.gathered(inputs)[1])
@@ -138,7 +132,7 @@ def test_demodulation_is_of_what_is_learned_and_not_of_the_photon_map(make_sourc
     source = make_source(2, photons=256)
     settings = NetworkSettings(width=4, architecture=ARCHITECTURE, photons=photons, demodulation=0.2)
     network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
-    inputs = batch_of(source, (0, 1)).inputs
+    inputs = batch_of(source, (0, 1), NEEDS).inputs
     with torch.no_grad():
         further = network.further(inputs)
         learned = network.synthesise(torch.cat([*further, network.image_space(inputs)], dim=-1))

@@ -7,9 +7,9 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
+from read_batches import batch_of
 
 from photonfarm.shared.scene.view import Camera, View
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs
@@ -257,8 +257,7 @@ def test_a_network_projects_by_the_rule_that_is_set(make_source, occlusion: str)
     source = make_source(1, size=64, points=4096)
     settings = NetworkSettings(width=4, occlusion=occlusion, architecture="feature_projection")
     network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
-    batch = TrainingBatch.empty(1, 4096, source.spec, Needs())
-    inputs = read_into(batch, source, (0,), Needs(), source.base()[1]).inputs
+    inputs = batch_of(source, (0,), Needs()).inputs
     (found,) = network.further(inputs)
     points = inputs.points
     view = inputs.world_to_camera, inputs.depth, inputs.normal

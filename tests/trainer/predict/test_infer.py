@@ -23,7 +23,6 @@ from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.predict import animation, infer
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.training.loop import train
@@ -50,7 +49,7 @@ def trained(store: Path, scene: SceneStore, tiny, run: Path):
 
     def make(architecture: str = "light_transport") -> TrainedRun:
         settings = tiny(max_steps=2, hold_out=0.3, network={"width": 4, "architecture": architecture})
-        train(StoreSource(store, scene.scene_id), settings, run)
+        train(SceneReader(store, scene.scene_id), settings, run)
         return TrainedRun.load(run)
 
     return make
@@ -108,7 +107,7 @@ def test_a_frame_of_a_path_is_the_image_of_the_stored_sample_of_the_same_view(
 def test_a_sample_is_shown_beside_its_target(store: Path, scene: SceneStore, trained, tmp_path: Path) -> None:
     """An error is told only of what is held out: what was trained on may be known with its noise."""
     run, reader = trained("denoise_4"), SceneReader(store, scene.scene_id)
-    source = StoreSource(store, scene.scene_id)
+    source = SceneReader(store, scene.scene_id)
     rows = source.refresh().tolist()
     sides = dict(zip(rows, rows_held_out(source, rows, 0.3), strict=True))
     assert 0 < sum(sides.values()) < len(rows)

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.predict.evaluation import BLOCK, constant_predictor, mean_colours, measure
 

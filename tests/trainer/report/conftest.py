@@ -3,9 +3,9 @@
 import pytest
 
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.store import SceneReader
 from photonfarm.shared.store.read.find import Query
 from photonfarm.shared.store.read.merge import merge_views
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.training.loop import train
 
 
@@ -22,6 +22,6 @@ def measured(scene, commit, tiny, tmp_path):
     runs = []
     for architecture in ("light_transport", "denoise_4"):
         settings = tiny(max_steps=4, hold_out=0.4, network={"width": 4, "architecture": architecture})
-        train(StoreSource(store, scene.scene_id), settings, tmp_path / architecture)
+        train(SceneReader(store, scene.scene_id), settings, tmp_path / architecture)
         runs.append(tmp_path / architecture)
     return store, runs, references

@@ -24,9 +24,8 @@ from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import EVALUATION, compare
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.compare.evaluation_table import evaluation_text, notes
-from photonfarm.trainer.data.dataset import kept_count, kept_pixels
+from photonfarm.trainer.data.batch import kept_count, kept_pixels
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import find_weights, metric_space, mse
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS, WARM_ROUNDS, DevicePredictor, batches, by_turns
@@ -48,7 +47,7 @@ def trained(scene: SceneStore, store: Path, tiny, tmp_path: Path):
     """Function (name, changes of the settings) → a run of three steps."""
 
     def make(name: str, **changes) -> TrainedRun:
-        source = StoreSource(store, scene.scene_id)
+        source = SceneReader(store, scene.scene_id)
         train(source, tiny(**{"max_steps": 3, "hold_out": 0.4, **changes}), tmp_path / name)
         return TrainedRun.load(tmp_path / name)
 
@@ -66,7 +65,7 @@ def references(scene: SceneStore, store: Path, tmp_path: Path) -> Path:
 
 
 def held_out(store: Path, scene: SceneStore, share: float) -> list[int]:
-    source = StoreSource(store, scene.scene_id)
+    source = SceneReader(store, scene.scene_id)
     rows = source.refresh().tolist()
     return [row for row, held in zip(rows, rows_held_out(source, rows, share), strict=True) if held]
 
@@ -205,9 +204,9 @@ def test_a_chosen_row_is_shown_once_and_the_document_says_which_row_each_picture
 def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
     """One of 256 is one pixel of 256, and one of 257 is none."""
     source = make_source(3)
-    assert kept_pixels(source.read(0), source.spec, 256).sum() == kept_count(source.spec, 256) == 1
+    assert kept_pixels(source.read(0).key, source.spec, 256).sum() == kept_count(source.spec, 256) == 1
     with pytest.raises(SpecError):
-        kept_pixels(source.read(0), source.spec, 257)
+        kept_pixels(source.read(0).key, source.spec, 257)
 
 
 @pytest.mark.parametrize(

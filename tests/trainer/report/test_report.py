@@ -16,6 +16,7 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
+from read_batches import batch_of
 
 from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.frame_costs import Seconds
@@ -23,11 +24,9 @@ from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.store import Store, store_status
+from photonfarm.shared.store import SceneReader, Store, store_status
 from photonfarm.shared.store.read.merge import MergedView
 from photonfarm.trainer.compare.evaluate import PredictorRow
-from photonfarm.trainer.data.dataset import TrainingBatch, read_into
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report as report_of
@@ -64,7 +63,7 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     worker = threading.Thread(target=fill)
     worker.start()
     settings = tiny(max_steps=40, replay_ratio=1.0, replay_buffer=0)
-    outcome = train(StoreSource(store, scene.scene_id), settings, run, Hooks(on_draws=lambda *_: begun.set()))
+    outcome = train(SceneReader(store, scene.scene_id), settings, run, Hooks(on_draws=lambda *_: begun.set()))
     worker.join()
     figures = write_report(store, run, tmp_path / "out")
 
@@ -99,14 +98,14 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
 
 
 def test_the_samples_of_a_store_reach_the_trainer(scene, commit) -> None:
-    source = StoreSource(scene.folder.parent.parent, scene.scene_id)
+    source = SceneReader(scene.folder.parent.parent, scene.scene_id)
     assert source.ready()
     assert len(source.refresh()) == source.planned == 0
     scene.plan(Request(modifications=4, views_per_modification=2, passes=2), shard_rows=8)
     assert commit(scene, 0)
     rows = source.refresh()
     assert (len(rows), source.planned) == (8, 16)
-    one, other = source.read_samples(rows[:2].tolist())
+    one, other = (source.read(row) for row in rows[:2].tolist())
     assert one.radiance.shape == (2, 16, 16, 3)
     assert not np.array_equal(one.radiance[0], one.radiance[1])
     keys = source.view_keys(rows.tolist())
@@ -117,7 +116,7 @@ def test_the_samples_of_a_store_reach_the_trainer(scene, commit) -> None:
 
 
 def test_a_store_without_the_scene_is_not_ready(tmp_path) -> None:
-    assert not StoreSource(tmp_path / "nothing", "0" * 32).ready()
+    assert not SceneReader(tmp_path / "nothing", "0" * 32).ready()
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path) -> None:
@@ -144,12 +143,12 @@ def test_a_report_without_held_out_samples_is_incomplete(scene, commit, make_sou
 def test_one_held_out_configuration_of_a_cuda_run_is_reported_without_nan(scene, commit, tiny, run, tmp_path) -> None:
     scene.plan(Request(modifications=8, views_per_modification=2), shard_rows=16)
     commit(scene, 0)
-    source = StoreSource(scene.folder.parent.parent, scene.scene_id)
+    source = SceneReader(scene.folder.parent.parent, scene.scene_id)
     shares = np.linspace(0.01, 0.9, 90)
     rows = source.refresh()
     share = next(s for s in shares if sum(rows_held_out(source, rows.tolist(), s)) == 2)
     store = scene.folder.parent.parent
-    train(StoreSource(store, scene.scene_id), tiny(max_steps=1, hold_out=share, minimum_samples=1), run)
+    train(SceneReader(store, scene.scene_id), tiny(max_steps=1, hold_out=share, minimum_samples=1), run)
     settings = json.loads((run / SETTINGS).read_text())
     (run / SETTINGS).write_text(json.dumps({**settings, "device": "cuda"}))
     write_report(store, run, tmp_path / "out")
@@ -198,7 +197,7 @@ def test_several_runs_and_denoisers_stand_beside_the_published_figures(measured,
 def assert_figures_in_front(figures, store: Path, scene_id: str, run: Path, references: Path) -> None:
     """The first network's on the held-out views, in the metric space: MSE less the references' noise, and MSSIM."""
     assert list(figures)[:2] == ["val_mse_metric", "val_mssim"], "for programs that compare reports"
-    source = StoreSource(store, scene_id)
+    source = SceneReader(store, scene_id)
     complete = source.refresh().tolist()
     held_out = [row for row, held in zip(complete, rows_held_out(source, complete, 0.4), strict=True) if held]
     rows = held_out[::2]  # the two passes of a view follow each other
@@ -211,12 +210,9 @@ def assert_figures_in_front(figures, store: Path, scene_id: str, run: Path, refe
     assert figures["val_mssim"] == pytest.approx(mssim(shown, mean).mean(), rel=1e-5)
 
 
-def images_of(run: TrainedRun, source: StoreSource, rows: list[int]) -> F32:
+def images_of(run: TrainedRun, source: SceneReader, rows: list[int]) -> F32:
     """A run's images of some rows, exposed."""
-    geometry, cloud = source.base()
-    batch = TrainingBatch.empty(len(rows), len(cloud.position), source.spec, run.needs)
-    read_into(batch, source, rows, run.needs, cloud)
-    return run.predictor(source.spec, (geometry, cloud), "cpu")(batch)
+    return run.predictor(source.spec, source.base(), "cpu")(batch_of(source, rows, run.needs))
 
 
 def uncertain(row: PredictorRow) -> PredictorRow:
@@ -297,7 +293,7 @@ def test_passes_for_references_count_neither_as_samples_nor_as_their_cost(measur
     for job in range(4, scene.jobs()):
         commit(scene, job)
     settings = TrainedRun.load(runs[0]).settings
-    train(StoreSource(store, scene.scene_id), settings.model_copy(update={"max_steps": 8}), runs[0])
+    train(SceneReader(store, scene.scene_id), settings.model_copy(update={"max_steps": 8}), runs[0])
     after = write_report(store, runs[:1], tmp_path / "after")
     spent, further = after["dataset"]["spent"], after["dataset"]["samples_complete"] - 32
     assert further > 0

@@ -12,7 +12,7 @@ from chromium import chromium, needs_chromium
 
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.records import Guides
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report
@@ -93,13 +93,13 @@ def test_the_page_holds_the_light_of_the_store_to_the_bit(measured, scene, tmp_p
     rows = [int(row) for row in re.findall(r"<summary>.*?row (\d+)</summary>", page, re.IGNORECASE)]
     assert sorted(rows) == figures["evaluation"]["shown"]
     assert "prediction of denoise_4" in lights[0], "the second run's"
-    source = StoreSource(store, scene.scene_id)
+    source = SceneReader(store, scene.scene_id)
     source.refresh()
     assert scene.spec.exposure == 1
     for row, layers in zip(rows, lights, strict=True):
-        (sample,) = source.read_samples([row])
+        sample = source.read(row)
         shown = np.frombuffer(base64.b64decode(layers["noisy half"]), "<f2").reshape(sample.radiance[0].shape)
-        np.testing.assert_array_equal(shown.astype(np.float64), sample.radiance[0] * sample.scale)
+        np.testing.assert_array_equal(shown.astype(np.float64), sample.radiance[0])
 
 
 def test_the_inputs_are_shown_with_guides_where_the_network_reads_them_and_these_show_something(contents) -> None:

@@ -18,18 +18,20 @@ import pytest
 import torch
 from torch import Tensor
 
+from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.keys import view_key
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Photons
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry
 from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import View, sample_view
-from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons
+from photonfarm.shared.store import Sample
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
@@ -62,8 +64,7 @@ class Seen:
 
     spec: SceneSpec
     base: tuple[Geometry, BasePointCloud]
-    sample: RawSample
-    photons: Photons
+    sample: Sample
     noisy: F32
     converged: F32
 
@@ -90,9 +91,11 @@ def seen() -> Seen:
     converged = targets(scene, view, R, samples=CONVERGED, seed=2_000_000)
     visible = visibility_of(scene, view, rebuild(base[1], modification), traced)
     guides = scene.guides(view, view_key(key, view.vector), spec.guides, lit_points(base[1], modification))
-    sample = RawSample(modification, view, noisy[0, 0], 1.0, scene.buffers(view), visible, 0, guides)
+    of_view = scene.buffers(view), visible, guides
+    shared = (lambda: base[1]), (lambda: traced)
+    sample = Sample(0, key, modification, view, 0, noisy[0, 0], *of_view, 1.0, *shared)
     noisy, converged = (x * np.float32(spec.exposure) for x in (noisy, converged))
-    return Seen(spec, base, sample, traced, noisy, converged)
+    return Seen(spec, base, sample, noisy, converged)
 
 
 @pytest.fixture(scope="module")
@@ -103,10 +106,10 @@ def rendered(seen: Seen) -> Rendered:
 def of_architecture(seen: Seen, architecture: Architecture) -> Rendered:
     """A network that has been trained a little, and what it sees."""
     network_settings = NetworkSettings(architecture=architecture, width=8)
-    batch = TrainingBatch.empty(1, POINTS, seen.spec, ARCHITECTURES[architecture].needs)
-    fill(batch, 0, seen.sample, seen.spec, seen.base[1])
-    if batch.inputs.photons is not None:
-        fill_photons(batch.inputs.photons, 0, seen.photons)
+    tensors = SampleTensors(seen.spec, ARCHITECTURES[architecture].needs.fields, exposure=seen.spec.exposure)
+    memory = tensors.empty(1)
+    tensors.fill(memory, 0, seen.sample)
+    batch = TrainingBatch.of((0,), (seen.sample.key,), memory)
     settings = TrainSettings(network=network_settings, learning_rate=2e-3)
     network = build(settings.network, SceneFrame.of(seen.spec, *seen.base, settings.network), 0)
     noisy, converged = torch.from_numpy(seen.noisy), torch.from_numpy(seen.converged)

@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 from held_out_errors import held_out_errors
+from read_batches import batch_of
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.trainer.data.dataset import TrainingBatch, fill
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predict.evaluation import network_predictor
 from photonfarm.trainer.runs import biased
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, settings_of
@@ -138,8 +139,7 @@ def test_the_rate_falls_with_every_epoch_of_samples_whatever_the_batch() -> None
 @pytest.mark.parametrize("architecture", ["cnn", "light_transport"])
 def test_a_demodulated_network_is_the_same_network_times_the_albedo(make_source, architecture: str) -> None:
     source = make_source(1)
-    batch = TrainingBatch.empty(1, 256, source.spec)
-    fill(batch, 0, source.read(0), source.spec, source.base()[1])
+    batch = batch_of(source, (0,), Needs())
     plain, demodulated = (
         build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
         for settings in (NetworkSettings(architecture=architecture, width=4, demodulation=e) for e in (None, 0.05))

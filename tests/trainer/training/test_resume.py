@@ -19,10 +19,9 @@ from safetensors import safe_open
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import SceneReader, Store
 from photonfarm.trainer.data.growth import Growth
 from photonfarm.trainer.data.sampler import RoundSampler
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.runs import checkpoint, metrics_log
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings
@@ -167,10 +166,10 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_repeats_from_its_log_howev
     growing.start()
     for step in sorted(random.Random(3).sample(range(5, 30), 3)):
         last = {"on_draws": die_after(3 * step)}
-        source = StoreSource(root, scene_id)
+        source = SceneReader(root, scene_id)
         assert ended_by(lambda s=source, k=last: train(s, tiny(**how), killed, Hooks(**k))) == -signal.SIGKILL
     growing.join()
-    train(StoreSource(root, scene_id), tiny(**how), killed)
+    train(SceneReader(root, scene_id), tiny(**how), killed)
 
     first = metrics_log.read(killed / METRICS)[0]
     state = checkpoint.load(killed / CHECKPOINT)
@@ -178,14 +177,14 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_repeats_from_its_log_howev
     assert len(state["store"]["plans"]) == 2
     script = Growth.of(state["following"])
     assert len(script.log) > 3
-    train(StoreSource(root, scene_id), tiny(**how), tmp_path / "again", Hooks(script=script))
+    train(SceneReader(root, scene_id), tiny(**how), tmp_path / "again", Hooks(script=script))
     assert_same(killed, tmp_path / "again")
 
 
 def test_a_checkpoint_is_safetensors_with_what_it_has_seen_beside(scene, commit, tiny, run) -> None:
     scene.plan(Request(modifications=10, seed=5), shard_rows=8)
     commit(scene, 0)
-    train(StoreSource(scene.storage.root, scene.scene_id), tiny(max_seconds=3.0, hold_out=0.3, max_steps=3), run)
+    train(SceneReader(scene.storage.root, scene.scene_id), tiny(max_seconds=3.0, hold_out=0.3, max_steps=3), run)
     with safe_open(run / CHECKPOINT, framework="np") as file:
         told = json.loads(file.metadata()["photonfarm"])
         weights = [name for name in file.keys() if name.startswith("network.")]  # noqa: SIM118 - no mapping
@@ -216,15 +215,15 @@ def test_a_checkpoint_of_a_million_samples_is_small_and_saved_at_once(tmp_path) 
 def test_a_run_is_not_continued_on_a_store_of_other_plans(scene, analytic, commit, tiny, run) -> None:
     scene.plan(Request(modifications=8), shard_rows=8)
     commit(scene, 0)
-    source = StoreSource(scene.storage.root, scene.scene_id)
+    source = SceneReader(scene.storage.root, scene.scene_id)
     train(source, tiny(max_steps=2, hold_out=0.3), run)
     other = Store(scene.storage.root.parent / "other", create=True).add(scene.spec)
     other.write_base(*analytic.base)
     other.plan(Request(modifications=8, seed=1), shard_rows=8)
     commit(other, 0)
     with pytest.raises(SpecError):
-        train(StoreSource(other.storage.root, scene.scene_id), tiny(max_steps=4, hold_out=0.3), run)
-    other_seed = StoreSource(scene.storage.root, scene.scene_id)
+        train(SceneReader(other.storage.root, scene.scene_id), tiny(max_steps=4, hold_out=0.3), run)
+    other_seed = SceneReader(scene.storage.root, scene.scene_id)
     scene.plan(Request(modifications=8, seed=1), shard_rows=8)
     commit(scene, 1)
     assert train(other_seed, tiny(max_steps=4, hold_out=0.3), run).step == 4

@@ -27,8 +27,7 @@ from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
 from photonfarm.trainer.compare.markdown import markdown_table
-from photonfarm.trainer.data.dataset import SampleSource
-from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import held

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -64,7 +63,7 @@ def run(
     Raises IncompleteError if the time is over before there is anything to train on, and with `until_complete` also if a
     signal stops it.
     """
-    from photonfarm.trainer.data.store_source import StoreSource
+    from photonfarm.shared.store import SceneReader
     from photonfarm.trainer.runs.device import described
     from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, leading, ranks
     from photonfarm.trainer.training.loop import stop_on_signals
@@ -75,7 +74,7 @@ def run(
         group = ours or SINGLE_PROCESS
         device = group.device(settings.device)
         if ours is not None and ours.rank:
-            assist(partial(StoreSource, store), settings, folder, ours)
+            assist(lambda scene_id, exposure: SceneReader(store, scene_id, exposure=exposure), settings, folder, ours)
             return
         with leading(group):
             log(f"training on {described(device, settings.network.precision)}")
@@ -101,7 +100,7 @@ def _lead(
     on_record: Callable[[dict[str, Any]], object] | None,
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
-    from photonfarm.trainer.data.store_source import StoreSource
+    from photonfarm.shared.store import SceneReader
     from photonfarm.trainer.runs.tensorboard import event_files
     from photonfarm.trainer.training.loop import Hooks, train
 
@@ -124,7 +123,7 @@ def _lead(
         if scene_id is None:
             log(f"{store}: no scene to train on has come; nothing was trained")
             return
-        source, waited = StoreSource(store, scene_id, exposure), time.monotonic() - began
+        source, waited = SceneReader(store, scene_id, exposure=exposure), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
             log(f"waiting for scene {scene_id}, {_lacks(Store(store), scene_id, spec)}")
         elif spec is not None and source.ready() and spec.exposure != source.spec.exposure:
@@ -157,6 +156,7 @@ def _lead(
                     on_draws=drawn,
                     on_phase=progress.phase,
                     on_images=show,
+                    on_wait=log,
                     waited=waited,
                     group=group,
                 ),
@@ -258,7 +258,7 @@ def search(
     Keys that `changes` sets are not searched. Raises SpecError without a spec, unless the store has one scene, for a
     store without the scene, and in one of several processes.
     """
-    from photonfarm.trainer.data.store_source import StoreSource
+    from photonfarm.shared.store import SceneReader
     from photonfarm.trainer.grid_search import AXES, STEPS, run_grid, table
     from photonfarm.trainer.runs.distributed import processes
     from photonfarm.trainer.training.loop import stop_on_signals
@@ -279,7 +279,7 @@ def search(
         elif (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
             axes["decay"] = (settings.decay,)
             log(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
-        cells = run_grid(lambda: StoreSource(store, scene_id), settings, folder, axes, stop=stop, log=log)
+        cells = run_grid(lambda: SceneReader(store, scene_id), settings, folder, axes, stop=stop, log=log)
         if stop.is_set():
             log(f"stopped after {len(cells)} cells; the same command goes on")
         return table(cells)

@@ -1,6 +1,7 @@
 """The sample store: Zarr v3 and JSON in a folder, written once and never changed. ARCHITECTURE.md has the layout."""
 
-from photonfarm.shared.store.read.reader import SceneReader, StoredSample
+from photonfarm.shared.store.read.batch import Sample
+from photonfarm.shared.store.read.reader import SceneReader
 from photonfarm.shared.store.write.commit import Figures, JobWriter
 from photonfarm.shared.store.write.plans import JobRows, SampleRow
 from photonfarm.shared.store.write.scene_store import PlanResult, Progress, SceneStore
@@ -13,11 +14,11 @@ __all__ = [
     "JobWriter",
     "PlanResult",
     "Progress",
+    "Sample",
     "SampleRow",
     "SceneReader",
     "SceneStatus",
     "SceneStore",
     "Store",
-    "StoredSample",
     "store_status",
 ]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.errors import CorruptError, StoreError
+from photonfarm.shared.core.errors import CorruptError, IncompleteError
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
@@ -107,7 +107,7 @@ def test_what_a_batch_has_no_memory_for_is_not_read(scene: SceneStore, source: S
 def test_rows_that_are_not_complete_are_refused_before_anything_is_read(source: SceneReader, row: int) -> None:
     memory = Batch.empty(source.spec, 2)
     memory.radiance[:] = 7
-    with pytest.raises(StoreError):
+    with pytest.raises(IncompleteError):
         source.read_batch([0, row], memory)
     assert (memory.radiance == 7).all()
 

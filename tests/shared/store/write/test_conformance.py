@@ -116,13 +116,15 @@ def same(reader: SceneReader, row: int, plain: Arrays) -> None:
         expected["photon_seen"] = sample.visibility.photons
     for name, values in expected.items():
         np.testing.assert_array_equal(plain[name], values, err_msg=name)
-    assert plain["pass"] == sample.pass_
+    assert plain["pass"] == sample.pass_number
     assert plain["densities"].tolist() == [1, 1]
     moved, vector = zip("xyz", sample.modification.translation.reshape(-1), strict=False), sample.modification
     changed = [f"object {axis}" for axis, value in moved if value] + ["object present"] * (not vector.present.all())
     assert plain["changed"].tolist() == changed
     np.testing.assert_allclose(plain["rays"], Camera.of(sample.view, reader.spec).rays(), atol=1e-6)
-    key = make_key("sample", reader.spec.radiance_id, sample.modification.vector, sample.view.vector, sample.pass_)
+    vectors = sample.modification.vector, sample.view.vector
+    key = make_key("sample", reader.spec.radiance_id, *vectors, sample.pass_number)
+    assert sample.key == key
     named = [(key, "half A"), (key, "half B"), (reader.modification_key(row), "photons")]
     assert plain["seeds"].tolist() == [seed_of(*purpose) for purpose in named]
 

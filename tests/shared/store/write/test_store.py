@@ -207,7 +207,7 @@ def test_a_sample_is_complete_only_with_its_views_and_modifications_job(scene: S
     assert reader.rows.size == 0
     samples.commit(scene, 0, samples.outputs(scene, 0))
     seen = reader.refresh()
-    assert {reader.read(int(row)).pass_ for row in seen} == {0, 1}
+    assert {reader.read(int(row)).pass_number for row in seen} == {0, 1}
     assert all(reader.modification_row(int(row)) < 4 for row in seen)
     assert reader.refresh().size == 0
     samples.commit_all(scene)

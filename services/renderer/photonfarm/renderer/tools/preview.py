@@ -18,7 +18,8 @@ from photonfarm.shared.core.records import Geometry, Photons
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store.read.reader import SceneReader, StoredSample
+from photonfarm.shared.store.read.batch import Sample
+from photonfarm.shared.store.read.reader import SceneReader
 
 COLUMNS = ("A", "B", "albedo", "normal", "depth", "photons")
 
@@ -110,7 +111,7 @@ def said(point: NDArray[np.floating]) -> str:
     return f"({', '.join(f'{value:.3g}' for value in np.where(np.abs(point) < 1e-6, 0, point))})"
 
 
-def photon_picture(sample: StoredSample, photons: Photons | None, spec: SceneSpec) -> Picture:
+def photon_picture(sample: Sample, photons: Photons | None, spec: SceneSpec) -> Picture:
     """The photons that this view sees, each as a dot of its colour on the dimmed albedo; (H, W, 3)."""
     canvas = 0.15 * sample.buffers.albedo
     if photons is not None:

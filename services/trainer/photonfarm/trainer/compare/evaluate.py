@@ -20,11 +20,11 @@ from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.store import SceneReader
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
-from photonfarm.trainer.data.dataset import TrainingBatch, kept_count
+from photonfarm.trainer.data.batch import TrainingBatch, kept_count
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.metrics import (
     Features,
     ImageMetrics,
@@ -319,7 +319,7 @@ class _Test:
     def _feed(self, predictor: TrainedRun | ReadyPredictor, *, batch: int) -> Feed:
         settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
         spec = self.samples.source.spec
-        source = StoreSource(self.store, spec.scene_id, spec.exposure)
+        source = SceneReader(self.store, spec.scene_id, exposure=spec.exposure)
         return Feed(source, settings, needs=predictor.needs)
 
     def _metrics(self, watched: _Watched, *, having_seen_a: bool) -> ImageMetrics | None:

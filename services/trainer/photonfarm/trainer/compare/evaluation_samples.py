@@ -13,8 +13,8 @@ from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
+from photonfarm.shared.store import SceneReader
 from photonfarm.shared.store.read.merge import MergedView
-from photonfarm.trainer.data.store_source import StoreSource
 
 SHOWN = 4  # samples shown as pictures
 
@@ -72,12 +72,12 @@ class Target:
 class HeldOutSamples:
     """The held-out samples that all predictors are measured on: one of each view, however many passes there are."""
 
-    source: StoreSource
+    source: SceneReader
     rows: list[int]  # ascending
     view_keys: list[Key]  # of each
 
     @classmethod
-    def of(cls, source: StoreSource, share: float, most: int) -> HeldOutSamples:
+    def of(cls, source: SceneReader, share: float, most: int) -> HeldOutSamples:
         """The first sample of each view held out by the smallest share: as shares are nested, no run was trained on it.
 
         At most `most` views; IncompleteError if there is none.
@@ -99,11 +99,10 @@ class HeldOutSamples:
         return sorted(first.values())[:SHOWN]
 
     def target(self, row: int, reference: Reference | None) -> Target:
-        """A sample's reference, or the mean of its halves; StoreError if a repair has removed the sample."""
+        """A sample's reference, or the mean of its halves; IncompleteError if a repair has set the sample aside."""
         spec = self.source.spec
         half_spp = spec.transport.half_spp
-        (sample,) = self.source.read_samples([row])
-        halves = np.float32(spec.exposure * sample.scale) * sample.radiance.astype(np.float32)
+        halves = np.float32(spec.exposure) * self.source.read(row).radiance
         if reference is not None:
             return Target(row, reference.mean, reference.count * half_spp, is_reference=True, half_a=halves[0])
         return Target(row, halves.mean(axis=0), 2 * half_spp, is_reference=False, half_a=halves[0])

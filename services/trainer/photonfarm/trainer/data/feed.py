@@ -1,34 +1,79 @@
-"""A thread that follows the store and reads batches ahead, into memory that is reused."""
+"""A thread that follows a scene's samples and reads batches ahead, into memory that is reused."""
 
 from __future__ import annotations
 
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Protocol, Self
 
-from photonfarm.shared.core.errors import StoreError
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from photonfarm.data.torch_dataset import Samples, SceneDataset
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.core.waiting import pause_after_look
-from photonfarm.shared.plan.hold_out import are_held_out, enough, units_of
-from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch, read_into
-from photonfarm.trainer.data.resident import ResidentSamples
+from photonfarm.shared.plan.hold_out import Keyed, are_held_out, enough, units_of
+from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, empty_memory, kept_pixels
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
 
+LATE_S = 60.0
+"""The seconds within which a row that another process has seen complete is complete here too."""
+
+NAP_S = 0.05
+
+Request = tuple[int, ...] | Callable[[], object] | None
+"""The rows of a batch; what is to be done between two batches; or the end."""
+
+
+class SampleSource(Samples, Keyed[Sequence[int]], Protocol):
+    """The samples of one scene: a `SceneReader`, or anything that behaves like it. Used by one thread at a time."""
+
+    def base(self) -> tuple[Geometry, BasePointCloud]:
+        """The geometry and the base cloud."""
+
+    def ready(self) -> bool:
+        """Whether spec and base are there; they come with the scene's first job."""
+
+    def refresh(self) -> NDArray[np.int64]:
+        """Look for new samples; returns the rows that became complete since the last call."""
+
+    def doubt(self) -> None:
+        """Look anew at all of them the next time: some may no longer be complete."""
+
+    def sample_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content keys of samples."""
+
+    def lease(self) -> str | None:
+        """Who has the scene for itself now, in words; None if nobody has."""
+
+    def at_work(self, what: str) -> AbstractContextManager[None]:
+        """Announce that this process is at work in the scene; raises LeasedError if another has it for itself."""
+
+    @property
+    def planned(self) -> int:
+        """The number of samples in all plans so far, complete or not."""
+
+    @property
+    def plan_requests(self) -> list[dict[str, Any]]:
+        """The requests of all plans so far, in order, as JSON documents: all rows follow from them."""
+
 
 class Feed:
     """Batches in the order of their requests, and rows as they arrive; a context manager.
 
-    Rows that are incomplete when they are read, for instance after a repair of the store, are left out of their batch,
-    until they are complete again. Only the feed's thread uses the source. On a CPU there is no cache of samples besides
-    the batches, unless one is asked for: to read a sample from the system's cache, checked, takes less than half of the
-    time to write it into a batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
+    Only the feed's thread uses the source. On a CPU there is no cache of samples besides the batches, unless one is
+    asked for: to read a sample from the system's cache, checked, takes less than half of the time to write it into a
+    batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
     """
 
     def __init__(
@@ -48,27 +93,26 @@ class Feed:
         self._source, self._settings, self._clock = source, settings, clock
         self._needs = needs or kind_of(settings.network.architecture).needs
         self._resident = resident if resident is not None and resident.keeps_any else None
-        if self._needs.guides:
-            source.read_guides()
         self.geometry, self.cloud = source.base()
         self.spec = source.spec
+        points = settings.network.points
+        self._dataset = SceneDataset(source, self._needs.fields, exposure=self.spec.exposure, points=points)
         self._lock = threading.Lock()
         self._arrived: list[tuple[int, bool]] = []
-        self._complete = False
         self._plans: list[dict[str, Any]] = []
         self._sides: set[bool] = set()  # whether samples so far are held out
         self._units: set[Key] = set()  # what is held out as one, until some are and some are not
-        self._here: set[int] = set()  # rows that are complete
-        self._known: set[int] = set()  # rows that are or were complete
+        self._known: set[int] = set()  # rows that have arrived
+        self._missing: set[int] = set()  # rows that are known, and were set aside and are not complete again yet
+        self._complete = False
         self._error: BaseException | None = None
-        points = min(settings.network.points or len(self.cloud.position), len(self.cloud.position))
         pinned = usable_device(settings.device).type == "cuda"
-        self._asked: queue.SimpleQueue[tuple[int, ...] | None] = queue.SimpleQueue()
-        self._ready: queue.SimpleQueue[tuple[TrainingBatch, TrainingBatch] | None] = queue.SimpleQueue()
-        self._free: queue.SimpleQueue[TrainingBatch | None] = queue.SimpleQueue()
+        self._asked: queue.SimpleQueue[Request] = queue.SimpleQueue()
+        self._ready: queue.SimpleQueue[tuple[TrainingBatch, dict[str, Tensor]] | None] = queue.SimpleQueue()
+        self._free: queue.SimpleQueue[dict[str, Tensor] | None] = queue.SimpleQueue()
         for _ in range(settings.prefetch + 1):
-            self._free.put(TrainingBatch.empty(settings.batch, points, self.spec, self._needs, pinned=pinned))
-        self._lent: TrainingBatch | None = None
+            self._free.put(empty_memory(self._dataset.tensors, settings.batch, pinned=pinned))
+        self._lent: dict[str, Tensor] | None = None
         self._polled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
 
@@ -99,11 +143,48 @@ class Feed:
         batch, self._lent = got
         return batch
 
+    @contextmanager
+    def quiet(self) -> Iterator[None]:
+        """Read nothing during the block, which begins once all requested batches are read; then look what is `missing`.
+
+        At most `prefetch` batches may be requested. Raises the errors of reading.
+        """
+        begun, over, looked = threading.Event(), threading.Event(), threading.Event()
+
+        def rest() -> None:
+            begun.set()
+            over.wait()
+            self._look_anew()
+            looked.set()
+
+        self._asked.put(rest)
+        self._wait_for(begun)
+        try:
+            yield
+        finally:
+            over.set()
+        self._wait_for(looked)
+
+    def expect(self, rows: Iterable[int]) -> None:
+        """Take rows as known that an earlier session has trained on, and look which samples are `missing`."""
+        self._asked.put(lambda: self._known.update(rows))
+        with self.quiet():
+            pass
+
+    def _wait_for(self, event: threading.Event) -> None:
+        while not event.wait(NAP_S):
+            self._raise()
+
+    @property
+    def missing(self) -> int:
+        """The number of samples that had arrived, and were not complete at the last look. Raises errors of reading."""
+        self._raise()
+        return len(self._missing)
+
     def arrivals(self) -> tuple[list[tuple[int, bool]], bool]:
         """The rows that became complete since the last call, each with whether it is held out; and whether all have.
 
-        The second is True once everything planned has been complete. A row that a repair removed is reported again when
-        it is complete again. Raises the errors of reading.
+        Raises the errors of reading.
         """
         self._raise()
         with self._lock:
@@ -141,45 +222,58 @@ class Feed:
                 self._poll()
                 due = self._clock() + pause_after_look(self._clock() - began, self._settings.poll_seconds)
             try:
-                rows = self._asked.get(timeout=max(due - self._clock(), 0.0))
+                asked = self._asked.get(timeout=max(due - self._clock(), 0.0))
             except queue.Empty:
                 continue
-            memory = self._free.get() if rows is not None else None
-            if rows is None or memory is None:
+            if callable(asked):
+                asked()
+                continue
+            memory = self._free.get() if asked is not None else None
+            if asked is None or memory is None:
                 return
-            self._ready.put((self._read(rows, memory), memory))
+            self._ready.put((self._read(asked, memory), memory))
 
     def _poll(self) -> None:
-        rows = [int(row) for row in self._source.refresh()]
-        gone = [int(row) for row in self._source.taken_back]
-        self._here.difference_update(gone)
-        if self._resident is not None:
-            self._resident.forget(gone)
-        self._here.update(rows)
-        self._known.update(rows)
-        units = units_of(self._source, rows)
+        new = [int(row) for row in self._source.refresh()]
+        units = units_of(self._source, new)
         held_out = are_held_out(units, self._settings.hold_out)
         with self._lock:
-            self._arrived.extend(zip(rows, held_out, strict=True))
+            self._arrived.extend(zip(new, held_out, strict=True))
             self._sides.update(held_out)
             self._units = set() if len(self._sides) > 1 else self._units.union(units)
             self._plans = list(self._source.plan_requests)
+            self._known.update(new)
+            self._missing.difference_update(new)
             self._complete = 0 < self._source.planned <= len(self._known)
         self._polled.set()
 
-    def _read(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
-        """Read those of the rows that are complete."""
-        if not self._known.issuperset(rows):
-            self._poll()  # another reader has seen them arrive
-        try:
-            return self._read_complete(rows, memory)
-        except StoreError:
-            self._poll()  # since then a repair may have set some aside, and a worker may have rendered them again
-            return self._read_complete(rows, memory)
+    def _look_anew(self) -> None:
+        self._source.doubt()
+        self._poll()
+        self._missing = self._known.difference(self._source.rows.tolist())
 
-    def _read_complete(self, rows: Sequence[int], memory: TrainingBatch) -> TrainingBatch:
-        there = [row for row in rows if row in self._here]
-        if self._resident is None:
-            return read_into(memory, self._source, there, self._needs, self.cloud)
-        fresh = read_into(memory, self._source, self._resident.lacking(there), self._needs, self.cloud)
-        return self._resident.batch(there, fresh)
+    def _read(self, rows: Sequence[int], memory: dict[str, Tensor]) -> TrainingBatch:
+        """Read a batch; another process may have seen its rows arrive before this one has looked."""
+        late = time.monotonic() + LATE_S
+        while not (self._known.issuperset(rows) and self._missing.isdisjoint(rows)) and time.monotonic() < late:
+            self._poll()
+            time.sleep(NAP_S)
+        fresh = rows if self._resident is None else self._resident.lacking(rows)
+        batch = read_batch(self._source, self._dataset, fresh, self._needs.kept, memory)
+        return batch if self._resident is None else self._resident.batch(rows, batch)
+
+
+def read_batch(
+    source: SampleSource,
+    dataset: SceneDataset,
+    rows: Sequence[int],
+    kept: int | None = None,
+    memory: dict[str, Tensor] | None = None,
+) -> TrainingBatch:
+    """Read complete samples of a source by its dataset; with `kept`, one of so many pixels of A is noisy colour."""
+    film = dataset.spec.film.height, dataset.spec.film.width
+    pixels = None
+    if kept:
+        chosen = [kept_pixels(key, dataset.spec, kept) for key in source.sample_keys(rows)]
+        pixels = torch.from_numpy(np.array(chosen, np.bool_).reshape(-1, *film))
+    return TrainingBatch.of(rows, units_of(source, rows), dataset.read(rows, memory), pixels)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import Counter, deque
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any, Self
 
 import torch
 
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.sampler import RoundSampler
 from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
@@ -55,6 +55,7 @@ class BatchStream:
         self._waiting: dict[int, bool] = {}  # arrived, not yet visible: row → held out
         self._known: set[int] = set()
         self._asked: deque[tuple[int, ...]] = deque()  # drawn, not yet trained on
+        self._restored: list[tuple[int, ...]] = []  # the same of an earlier session, not requested in this one yet
         self._complete = False
         self.growth = Growth()
         self.held_out: list[int] = []
@@ -109,6 +110,8 @@ class BatchStream:
 
     def draw_ahead(self, until: int) -> bool:
         """Draw and request batches, up to `prefetch` ahead and up to batch `until`; False if no batch is requested."""
+        while self._restored:
+            self._ask(self._restored.pop(0))
         while len(self._asked) < self._settings.prefetch and self.drawn < until:
             self.look()
             if not self.may_draw():
@@ -122,19 +125,12 @@ class BatchStream:
         self._group.send("rows", rows)
         self._feed.ask(self._group.part(rows))
 
-    def take(self) -> TrainingBatch | None:
-        """The next drawn batch, of which this process reads its part; draws of now incomplete rows do not count.
-
-        None if no row of the batch is left; another batch is then drawn in its place, after the others.
-        """
+    def take(self) -> TrainingBatch:
+        """The next drawn batch, of which this process has read its part."""
         batch = self._feed.take()
         self._group.send("take")  # only now, so that other ranks do not wait for a rank whose reading failed
-        rows, there = self._asked.popleft(), self._group.joined(batch.rows)
-        self._sampler.put_back((Counter(rows) - Counter(there)).elements())
-        if there:
-            return batch
-        self._ask(self._sampler.draw(self._settings.batch))
-        return None
+        self._asked.popleft()
+        return batch
 
     def drop(self) -> None:
         """Drop this process's batches that were read ahead, so that other rows can be read; other ranks keep theirs."""
@@ -150,7 +146,7 @@ class BatchStream:
         """The state from which the same batches follow; int64 tensors for values of each row."""
         return {
             "sampler": self._sampler.state(),
-            "asked": [list(rows) for rows in self._asked],
+            "asked": [list(rows) for rows in (*self._restored, *self._asked)],
             "drawn": self.drawn,
             "arrived": torch.tensor(self.growth.rows, dtype=torch.int64),
             "growth": torch.tensor(self.growth.log, dtype=torch.int64).reshape(-1, 2),
@@ -164,5 +160,4 @@ class BatchStream:
         self.growth = Growth.of(state)
         self.held_out = state["held_out"].tolist()
         self._known = set(self.growth.rows)
-        for rows in state["asked"]:
-            self._ask(tuple(rows))
+        self._restored = [tuple(rows) for rows in state["asked"]]

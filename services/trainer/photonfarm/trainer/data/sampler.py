@@ -59,11 +59,6 @@ class RoundSampler:
         self._deck.extendleft(reversed(passed))
         return tuple(self.rows[place] for place in chosen)
 
-    def put_back(self, rows: Iterable[int]) -> None:
-        """Undo draws of rows that could not be used, so that these rows are drawn more often later."""
-        for row in rows:
-            self._visits[self.rows.index(row)] -= 1
-
     def state(self) -> dict[str, Any]:
         """The state that later draws depend on, besides the seed; values of each row are int64 tensors."""
         return {

@@ -10,8 +10,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.trainer.data.dataset import TrainingBatch
-from photonfarm.trainer.data.resident import size_bytes
+from photonfarm.trainer.data.batch import TrainingBatch, size_bytes
 from photonfarm.trainer.dry_run.cards import CardHours, on_cards
 from photonfarm.trainer.dry_run.live_memory import LiveMemory
 from photonfarm.trainer.dry_run.made_up import MadeUpScene

@@ -13,12 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera, View
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.data.batch import TrainingBatch, empty_memory
 from photonfarm.trainer.networks import kind_of
-from photonfarm.trainer.networks.inputs import Inputs, map_tensors
+from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.runs.settings import TrainSettings
 
 METALS = 0.2
@@ -51,13 +52,14 @@ class MadeUpScene:
     def batch(self, size: int, settings: TrainSettings) -> TrainingBatch:
         """A batch of so many samples, with all that the settings' network reads; half of the points are seen."""
         spec, needs = self.spec, kind_of(settings.network.architecture).needs
-        points = min(settings.network.points or spec.points, spec.points)
-        batch = TrainingBatch.empty(size, points, spec, needs)
+        tensors = empty_memory(SampleTensors(spec, needs.fields, points=settings.network.points), size)
         generator = torch.Generator().manual_seed(0)
-        map_tensors(lambda tensor: _fill(tensor, generator), batch.inputs)
-        _fill(batch.target, generator)
+        for tensor in tensors.values():
+            _fill(tensor, generator)
+        kept = torch.rand(size, spec.film.height, spec.film.width, generator=generator) < 0.5 if needs.kept else None
+        batch = TrainingBatch.of(range(size), (b"made up",) * size, tensors, kept)
         self._make_plausible(batch.inputs, generator)
-        return batch.filled(tuple(range(size)), (b"made up",) * size)
+        return batch
 
     def _make_plausible(self, inputs: Inputs, generator: torch.Generator) -> None:
         """Cameras within the cube, unit normals, points and photons on its walls, and as many metals as usual."""

@@ -5,24 +5,19 @@ Shape letters: B batch, P points, L of them that are lit, K photon slots, H W im
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import torch
 from torch import Tensor
 
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format.schema import output_arrays
+from photonfarm.data.torch_dataset import GUIDES, IMAGES, PHOTONS, POINTS
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 M = TypeVar("M")
 T = TypeVar("T", bound="DataclassInstance")
-
-Memory = Callable[..., Tensor]
-"""A function that makes an empty tensor of a shape, after the batch's axis; `dtype=` unless it is float32."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,6 +28,13 @@ class Needs:
     photons: bool = False
     guides: bool = False
     kept: int | None = None  # one of so many pixels of half A is an input, in noisy colour; None: no colour
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """The fields of a `SceneDataset` that training needs: those of these inputs, and the radiance as target."""
+        points = POINTS if self.points else ()
+        photons = (*PHOTONS, "photon_seen") if self.photons else ()
+        return (*IMAGES, "world_to_camera", *points, *photons, *(GUIDES if self.guides else ()))
 
 
 POINTS_ONLY = Needs()
@@ -85,12 +87,6 @@ class GuideInputs:
     beyond_depth: Tensor  # (B, H, W) scene units, along the path
     point_light: Tensor  # (B, L, 3) irradiance × exposure of the first points
 
-    @classmethod
-    def empty(cls, memory: Memory, spec: SceneSpec) -> GuideInputs:
-        """Unfilled guides."""
-        shapes = {name: array.shape for name, array in output_arrays(spec).items()}
-        return cls(**{f.name: memory(*shapes[f.name]) for f in fields(cls)})
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Inputs:
@@ -106,24 +102,17 @@ class Inputs:
     guides: GuideInputs | None = None
 
     @classmethod
-    def empty(cls, memory: Memory, points: int, spec: SceneSpec, needs: Needs) -> Inputs:
-        """Unfilled inputs, with `points` points if points are needed."""
-        film, slots = (spec.film.height, spec.film.width), spec.photons.slots
-
-        def flags(*shape: int) -> Tensor:
-            return memory(*shape, dtype=torch.bool)
-
-        inputs = cls(memory(3, 4), memory(*film), memory(*film, 3), memory(*film, 3))
-        if needs.points:
-            inputs = replace(inputs, points=PointInputs(memory(points, 3), flags(points), flags(points)))
-        if needs.photons:
-            vectors = memory(slots, 3), memory(slots, 3), memory(slots, 3), memory(slots, 3)
-            inputs = replace(inputs, photons=PhotonInputs(*vectors, memory(slots), flags(slots), flags(slots)))
-        if needs.guides:
-            inputs = replace(inputs, guides=GuideInputs.empty(memory, spec))
-        if needs.kept:
-            inputs = replace(inputs, noisy=NoisyColour(memory(*film, 3), flags(*film)))
-        return inputs
+    def of(cls, tensors: Mapping[str, Tensor], noisy: NoisyColour | None = None) -> Inputs:
+        """The inputs that a `SceneDataset` has read, (B, …) by field, in the same memory; and noisy colour."""
+        found = cls(tensors["world_to_camera"], tensors["depth"], tensors["albedo"], tensors["normal"], noisy=noisy)
+        if POINTS[0] in tensors:
+            found = replace(found, points=PointInputs(*(tensors[name] for name in POINTS)))
+        if PHOTONS[0] in tensors:
+            arrays = {name.removeprefix("photon_"): tensors[name] for name in (*PHOTONS, "photon_seen")}
+            found = replace(found, photons=PhotonInputs(**arrays, present=arrays["bounce"] >= 0))
+        if GUIDES[0] in tensors:
+            found = replace(found, guides=GuideInputs(*(tensors[name] for name in GUIDES)))
+        return found
 
 
 def given(member: M | None) -> M:

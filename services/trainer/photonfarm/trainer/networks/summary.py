@@ -9,13 +9,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
+from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Inputs
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.projection import Optics
 from photonfarm.trainer.runs.settings import NetworkSettings
@@ -91,9 +91,9 @@ def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
 
 def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:
     """Inputs of one image that are all zero: all points lie in the eye, and none is projected."""
-
-    def memory(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-        return torch.zeros(1, *shape, dtype=dtype)
-
-    points = min(settings.points or spec.points, spec.points)
-    return Inputs.empty(memory, points, spec, kind_of(settings.architecture).needs)
+    needs = kind_of(settings.architecture).needs
+    tensors = SampleTensors(spec, needs.fields, points=settings.points).empty(1)
+    for values in tensors.values():
+        values.zero_()
+    image = tensors["albedo"]
+    return Inputs.of(tensors, NoisyColour(image, image[..., 0] > 0) if needs.kept else None)

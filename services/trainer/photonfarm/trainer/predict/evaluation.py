@@ -17,7 +17,7 @@ from photonfarm.shared.core.estimate import Estimate, clean_error, clean_error_h
 from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import image_of
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
@@ -94,11 +94,10 @@ def by_turns(calls: Sequence[tuple[DevicePredictor, Inputs]]) -> list[Seconds]:
 
 
 def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[TrainingBatch]:
-    """The rows as batches, read through the feed, in their order; without those that are no longer complete."""
+    """The rows as batches, read through the feed, in their order."""
     for start in range(0, len(rows), size):
         feed.ask(rows[start : start + size])
-        if (batch := feed.take()).rows:
-            yield batch
+        yield feed.take()
 
 
 def network_predictor(network: Network) -> DevicePredictor:

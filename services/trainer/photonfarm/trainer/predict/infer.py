@@ -16,17 +16,17 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.shared.core.records import F32, BasePointCloud
+from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.scene.frames import Frames
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import Store
+from photonfarm.shared.store import Sample, SceneReader, Store
 from photonfarm.shared.store.read.find import Query, find_samples
-from photonfarm.trainer.data.dataset import RawSample, TrainingBatch, fill, fill_photons
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.store_source import StoreSource
 from photonfarm.trainer.networks.inputs import given
 from photonfarm.trainer.predict import animation
 from photonfarm.trainer.predict.evaluation import error_of
@@ -77,11 +77,11 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     torch.set_num_threads(run.settings.threads)
     source = _source(store, run)
     with Feed(source, run.settings.model_copy(update={"device": "cpu"})) as feed:
+        if row not in dict(feed.arrivals()[0]):
+            raise _missing(source, row)
         feed.ask([row])
         batch = feed.take()
         predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), device)
-    if not batch.rows:
-        raise _missing(source, row)
     shown = {"prediction": (image := predict(batch)[0]), "target": batch.target[0].mean(dim=0).numpy()}
     files = tuple(out / f"{name}.png" for name in shown)
     _make(out)
@@ -91,7 +91,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     return InferResult(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
 
 
-def _missing(source: StoreSource, row: int) -> PhotonfarmError:
+def _missing(source: SceneReader, row: int) -> PhotonfarmError:
     rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests), default=0)
     if row >= rows:
         return StoreError(f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0")
@@ -146,7 +146,7 @@ def show_frames(
     _make(out)
     files = [out / f"frame-{i:04}.png" for i in range(len(frames))]
     seconds = 0.0
-    found = _batches(run, frames, source.spec, source.base()[1])
+    found = _batches(run, frames, source)
     for file in files:
         began = time.perf_counter()
         image = predict(next(found))[0]
@@ -182,20 +182,29 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
         raise SpecError(f"{run.folder}: {run.settings.network.architecture} needs photons, and the buffers have none")
 
 
-def _batches(run: TrainedRun, frames: Frames, spec: SceneSpec, cloud: BasePointCloud) -> Iterator[TrainingBatch]:
+def _batches(run: TrainedRun, frames: Frames, source: SceneReader) -> Iterator[TrainingBatch]:
     """The frames one by one, in memory that is reused."""
-    points = min(run.settings.network.points or len(cloud.position), len(cloud.position))
-    memory = TrainingBatch.empty(1, points, spec, run.needs)
-    if memory.inputs.photons is not None:
-        fill_photons(memory.inputs.photons, 0, given(frames.photons))
-    black = np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
+    spec = source.spec
+    tensors = SampleTensors(spec, run.needs.fields, exposure=spec.exposure, points=run.settings.network.points)
+    memory, black = tensors.empty(1), np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
     for i, view in enumerate(frames.views):
-        seen = frames.buffers(i), frames.visibility(i)
-        fill(memory, 0, RawSample(frames.modification, view, black, 1.0, *seen, 0, frames.guides_of(i)), spec, cloud)
-        yield memory.filled((i,), (b"",))
+        seen = frames.buffers(i), frames.visibility(i), frames.guides_of(i)
+        sample = Sample(
+            i,
+            b"",
+            frames.modification,
+            view,
+            0,
+            black,
+            *seen,
+            read_cloud=lambda: source.base()[1],
+            read_photons=lambda: given(frames.photons),
+        )
+        tensors.fill(memory, 0, sample)
+        yield TrainingBatch.of((i,), (b"",), memory)
 
 
-def _source(store: str | Path, run: TrainedRun) -> StoreSource:
+def _source(store: str | Path, run: TrainedRun) -> SceneReader:
     """The samples of the run's scene; StoreError if there is no store, or it lacks the scene."""
     source = run.source(Store(store).root)
     _ = source.spec  # which says what is there instead

@@ -9,7 +9,7 @@ from typing import Any, Self
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.trainer.data.store_source import StoreSource
+from photonfarm.shared.store import SceneReader
 from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs
@@ -46,9 +46,9 @@ class TrainedRun:
         weights = average["weights"] if (average := state.get("average")) else state["network"]
         return cls(folder, settings, str(state["scene_id"]), float(state["exposure"]), weights)
 
-    def source(self, store: str | Path) -> StoreSource:
+    def source(self, store: str | Path) -> SceneReader:
         """The samples of its scene in a store, exposed as they were when the run began."""
-        return StoreSource(store, self.scene_id, self.exposure)
+        return SceneReader(store, self.scene_id, exposure=self.exposure)
 
     def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:
         """The trained network, on the CPU, for the scene that it was trained on."""

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.trainer.data.dataset import SampleSource
-from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import (
     HeldOutErrors,
     batches,

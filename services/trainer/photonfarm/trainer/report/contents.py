@@ -7,11 +7,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
-
 from photonfarm.shared.core.errors import BackendError
 from photonfarm.shared.core.frame_costs import FrameCosts
-from photonfarm.shared.core.records import F32, Guides, ViewBuffers, arrays_of
+from photonfarm.shared.core.records import F32, Guides, ViewBuffers
 from photonfarm.trainer.compare import evaluate
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
@@ -127,22 +125,15 @@ def gathered(
 
 
 def _inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tuple[ViewBuffers, Guides | None]]:
-    """The buffers of some rows, and their guides if the run reads these, in memory of their own."""
+    """The buffers of some rows, and their guides if the run reads these,."""
     source = run.source(store)
-    if run.needs.guides:
-        source.read_guides()
     there = set(source.refresh().tolist())
     found = {}
     for row in rows:
         if row in there:
-            (sample,) = source.read_samples([row])
-            found[row] = (_copied(sample.buffers), None if sample.guides is None else _copied(sample.guides))
+            sample = source.read(row, guides=run.needs.guides)
+            found[row] = sample.buffers, sample.guides
     return found
-
-
-def _copied(record: R) -> R:
-    """A record in float32, in memory of its own; a source reads the next row into the memory of the last."""
-    return type(record)(**{name: part.astype(np.float32) for name, part in arrays_of(record).items()})
 
 
 def _entries(
@@ -208,7 +199,6 @@ class _CloseLook:
         surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
         views = []
         for row in references.keys() & images.keys():
-            (sample,) = source.read_samples([row])
             a, b = references[row].half_a, references[row].half_b
-            views.append(HeldOutView(row, images[row], a, b, _copied(sample.buffers), surfaces.get(row)))
+            views.append(HeldOutView(row, images[row], a, b, source.read(row).buffers, surfaces.get(row)))
         return sorted(views, key=lambda view: view.row)

@@ -1,9 +1,9 @@
 """Several processes that train one network, each on its part of every batch, as `torchrun` starts them.
 
 Rank 0 follows the store, draws, validates, writes and logs; the other ranks read and compute at its commands. In each
-step all ranks take the mean gradient over the joint batch, in one piece. Samples may become incomplete while they are
-read, so the parts of a batch may differ in length, and DistributedDataParallel would weigh them alike. It also sends
-gradients while others are computed, but that gains little, as these networks spend their time in convolutions.
+step all ranks take the mean gradient over the joint batch, in one piece. The parts of a batch may differ in length, and
+DistributedDataParallel would weigh them alike. It also sends gradients while others are computed, but that gains
+little, as these networks spend their time in convolutions.
 
 All processes must see the same store and the same run folder, in which ranks find the checkpoint of a resumed run.
 """
@@ -46,8 +46,8 @@ class TrainingGroup(Protocol):
     def send(self, command: str, value: Any = None) -> None:
         """Send the other ranks a command; for rank 0."""
 
-    def joined(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """The rows of a batch that all processes have read together; all must call."""
+    def meet(self) -> None:
+        """Wait until all processes call this."""
 
     def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
         """The loss over the joint batch, whose gradient the weights get; `count` of its samples are of this process."""
@@ -69,9 +69,8 @@ class SingleProcess:
     def send(self, command: str, value: Any = None) -> None:
         """Do nothing, as there are no other ranks."""
 
-    def joined(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """The rows as they are: no other process reads a part of them."""
-        return tuple(rows)
+    def meet(self) -> None:
+        """Do nothing, as there are no other ranks."""
 
     def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:  # noqa: ARG002
         """The loss as a number; the weights have its gradient already."""
@@ -102,6 +101,7 @@ class Ranks:
         """Send the other ranks a command; for rank 0."""
         with self._others_there():
             distributed.broadcast_object_list([command, value], src=0, group=self._commands)
+        self.within_step = command == "take"
 
     def receive(self) -> tuple[str, Any]:
         """Receive the next command of rank 0; for the others."""
@@ -110,14 +110,10 @@ class Ranks:
             distributed.broadcast_object_list(received, src=0, group=self._commands)
         return received[0], received[1]
 
-    def joined(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """The rows of a batch that all processes have read together; all must call."""
-        parts: list[Any] = [None] * self.size
+    def meet(self) -> None:
+        """Wait until all processes call this."""
         with self._others_there():
-            distributed.all_gather_object(parts, tuple(rows))
-        there = tuple(row for part in parts for row in part)
-        self.within_step = bool(there)
-        return there
+            distributed.all_reduce(torch.zeros(()))
 
     def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
         """The mean of losses and gradients, weighted by the number of samples of each process."""

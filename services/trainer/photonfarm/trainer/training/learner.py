@@ -10,7 +10,7 @@ import torch
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import build, image_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.network import Network
@@ -85,11 +85,9 @@ class Learner:
         for group in self.optimiser.param_groups:
             group["lr"] = self.rate(number)
         self.optimiser.zero_grad()
-        loss = torch.zeros((), device=self._device)
-        if batch.rows:  # all samples of a part may have become incomplete
-            batch = batch.to(self._device).for_training()
-            loss = self._loss(image_of(self.network, batch.inputs), batch.target)
-            torch.autograd.backward(loss)
+        batch = batch.to(self._device).for_training()
+        loss = self._loss(image_of(self.network, batch.inputs), batch.target)
+        torch.autograd.backward(loss)
         value = self._group.average(list(self.network.parameters()), loss, len(batch.rows))
         if math.isfinite(value):
             self.optimiser.step()

@@ -14,14 +14,13 @@ from typing import Any, TypeVar
 
 import torch
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
+from photonfarm.shared.core.errors import SpecError, store_errors
 from photonfarm.shared.core.estimate import group_means
 from photonfarm.shared.core.models import Changes
 from photonfarm.shared.core.processes import Stop
-from photonfarm.trainer.data.dataset import SampleSource, TrainingBatch
-from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
+from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.data.growth import BatchStream, Growth
-from photonfarm.trainer.data.resident import ResidentSamples
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import usable_device
@@ -33,6 +32,7 @@ from photonfarm.trainer.runs.user_code import named_in_errors
 from photonfarm.trainer.runs.wait_times import Stopwatch, TimeKind, samples_per_used, wait_shares
 from photonfarm.trainer.training.compiled import compiling
 from photonfarm.trainer.training.learner import DivergedError, Learner
+from photonfarm.trainer.training.presence import Presence
 from photonfarm.trainer.training.recovery import GoodState, settle
 from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
 
@@ -74,6 +74,7 @@ class Hooks:
     # samples that have arrived
     on_phase: Callable[[TimeKind], object] | None = None  # what the time is spent on from now on
     on_images: Show | None = None  # at each validation, with the first held-out samples
+    on_wait: Callable[[str], object] = lambda _: None  # gets a sentence on what others do in the store
     script: Growth | None = None  # the growth of an earlier run, to be repeated to the bit on a CPU
     group: TrainingGroup = SINGLE_PROCESS  # the processes that share each batch; this one is rank 0
     waited: float = 0.0  # seconds that have passed already
@@ -83,8 +84,8 @@ class Hooks:
 def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks | None = None) -> TrainingOutcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
-    Waits for the source to have a scene. Ends at `max_steps`, at `max_seconds`, or when `hooks.stop` is set; each
-    leaves a checkpoint.
+    Waits for the source to have a scene, and at any time for whoever takes the scene's lease. Ends at `max_steps`, at
+    `max_seconds`, or when `hooks.stop` is set; each leaves a checkpoint.
 
     Raises SpecError for a run of another network, scene or store, a device that is not there or a hold-out that leaves
     nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the loss or
@@ -95,22 +96,30 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
     watch = Stopwatch(hooks.clock, "wait_data", hooks.waited, hooks.on_phase)
-    with held(run):
-        while not source.ready():
-            if hooks.stop.wait(settings.poll_seconds) or watch.total >= (settings.max_seconds or math.inf):
-                return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
+
+    def is_over() -> bool:
+        return watch.total >= (settings.max_seconds or math.inf)
+
+    with held(run), Presence(source, f"trainer of run {run}", hooks.on_wait) as presence:
+        while not source.ready() and not is_over() and not hooks.stop.wait(settings.poll_seconds):
+            pass
+        if not source.ready() or not presence.begin(hooks.stop, is_over):
+            return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
         watch.turn("start")
         own = {"architecture": settings.network.architecture, "loss": settings.loss}
         resident = ResidentSamples(hooks.group.device(settings.device), settings.resident_gb)
         fed = Feed(source, settings, hooks.clock, resident=resident)
         with fed as feed, named_in_errors(**own), compiling(settings.compile):
-            return Session(feed, settings, run, watch, hooks).run()
+            return Session(feed, settings, run, watch, hooks, presence).run()
 
 
 class Session:
     """One session of a run, from its start or its last checkpoint to its end."""
 
-    def __init__(self, feed: Feed, settings: TrainSettings, run: Path, watch: Stopwatch, hooks: Hooks) -> None:
+    def __init__(
+        self, feed: Feed, settings: TrainSettings, run: Path, watch: Stopwatch, hooks: Hooks, presence: Presence
+    ) -> None:
+        self._presence, self._missing = presence, 0
         self._feed, self._settings, self._run, self._watch, self._hooks = feed, settings, run, watch, hooks
         self._stop = hooks.stop
         self._log = MetricsLog(run / METRICS, hooks.on_record)
@@ -137,7 +146,7 @@ class Session:
                 self._train_step(batch)
             if self._step % self._settings.checkpoint_every == 0:
                 self._save()
-        if reason != "stopped" and self._stream.held_out:
+        if reason != "stopped" and self._stream.held_out and self._presence.is_there and not self._missing:
             self._end_no_worse()
         self._save()
         self._log.write("end", step=self._step, reason=reason, **self._counts())
@@ -176,6 +185,7 @@ class Session:
         self._watch.add(state["seconds"])
         self._seconds_logged = dict(state["seconds"])
         self._send_begin(continues=True)
+        self._feed.expect(state["following"]["arrived"].tolist())
         self._stream.restore(state["following"])
         return changed
 
@@ -229,13 +239,30 @@ class Session:
     # -----------------------------------------------------------------------------------------------------------------
 
     def _wait(self, look: Callable[[], T | None]) -> T | None:
-        """Wait for data until `look` finds something, and return it; None once training has ended."""
-        while not (found := look()):
+        """Wait until the samples are there and `look` finds something, and return it; None once training has ended."""
+        while not (self._are_samples_there() and (found := look())):
             if self._ended() is not None:
                 return None
             with self._watch.on("wait_data"):
                 self._stop.wait(NAP_SECONDS)
         return found
+
+    def _are_samples_there(self) -> bool:
+        """Whether all samples that have arrived are complete; first leave the scene to whoever has taken its lease.
+
+        Those that a repair has set aside are rendered again, and training waits until then, so it never sees fewer.
+        """
+        if self._presence.is_to_end():
+            with self._watch.on("wait_data"), self._feed.quiet():
+                self._hooks.group.send("quiet")
+                self._hooks.group.meet()  # no process reads any more
+                self._presence.end()
+                self._presence.begin(self._stop, lambda: self._ended() is not None)
+                self._hooks.group.send("on")
+        before, self._missing = self._missing, self._feed.missing
+        if self._missing and not before:
+            self._hooks.on_wait(f"training waits: {self._missing} samples were set aside; workers render them again")
+        return self._presence.is_there and not self._missing
 
     def _next_batch(self) -> TrainingBatch | None:
         if not self._stream.draw_ahead(self._settings.max_steps):
@@ -271,14 +298,10 @@ class Session:
         with self._watch.on("validate"):
             self._stream.drop()
             found = batches(self._feed, rows, self._settings.batch)
-            try:
-                predict, loss = network_predictor(self._learner.predicting.eval()), self._settings.loss
-                now = validate(predict, self._step, found, self._hooks.on_images, loss=loss)
-            except IncompleteError:  # a repair has removed all of them, for now
-                return
-            finally:
-                self._learner.network.train()
-                self._stream.ask_again()
+            predict, loss = network_predictor(self._learner.predicting.eval()), self._settings.loss
+            now = validate(predict, self._step, found, self._hooks.on_images, loss=loss)
+            self._learner.network.train()
+            self._stream.ask_again()
         self._validated = self._step
         if self._settings.recover:
             self._compare(now)

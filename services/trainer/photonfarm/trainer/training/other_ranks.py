@@ -7,9 +7,8 @@ from pathlib import Path
 
 import torch
 
-from photonfarm.trainer.data.dataset import SampleSource
-from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.resident import ResidentSamples
+from photonfarm.trainer.data.batch import ResidentSamples
+from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.distributed import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
@@ -48,6 +47,11 @@ def _follow(ranks: Ranks, feed: Feed, good: GoodState, step: int) -> None:
             good.keep(value)
         elif command == "back":
             good.go_back(value)
-        elif ranks.joined((batch := feed.take()).rows):  # "take"
-            good.step_or_go_back(step, batch)
+        elif command == "quiet":
+            with feed.quiet():
+                ranks.meet()
+                if ranks.receive()[0] == "end":  # or "on"
+                    return
+        else:  # "take"
+            good.step_or_go_back(step, feed.take())
             step += 1

@@ -12,7 +12,7 @@ import torch
 
 from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.records import F32
-from photonfarm.trainer.data.dataset import TrainingBatch
+from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, measure
 
 Show = Callable[[int, tuple[int, ...], F32, F32], None]

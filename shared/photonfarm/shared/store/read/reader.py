@@ -1,4 +1,4 @@
-"""The trainer's access to the store: complete samples, while more of them arrive.
+"""A scene's samples as they are read: those that are complete, while more of them arrive.
 
 Shape letters: B batch, R rows of the scene, H W image.
 
@@ -11,44 +11,31 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
+from photonfarm.shared.core.errors import CorruptError, IncompleteError, StoreError, store_errors
 from photonfarm.shared.core.keys import KEY_BYTES, Key, view_key
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
+from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.shared.scene.modification import Modification, modification_keys
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, view_keys
-from photonfarm.shared.store.format import schema
+from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.followed_markers import FollowedMarkers
 from photonfarm.shared.store.format.shards import Shard
 from photonfarm.shared.store.io.storage import FORMAT_FILE, open_storage, renew_copy
-from photonfarm.shared.store.read.batch import Batch
+from photonfarm.shared.store.read.batch import Batch, Sample
 from photonfarm.shared.store.write import plans
+from photonfarm.shared.store.write.lease import at_work, leases
 from photonfarm.shared.store.write.plans import StoredPlan
 from photonfarm.shared.store.write.scene_store import SCENES, is_there, read_base, read_spec
 from photonfarm.shared.store.write.store import check_format
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredSample:
-    """One complete sample in float32, in memory of its own; the trainer reads into a `Batch` instead."""
-
-    row: int
-    modification: Modification
-    view: View
-    radiance: F32  # (2, H, W, 3) linear, unscaled; two independent noisy estimates A and B
-    buffers: ViewBuffers
-    visibility: Visibility
-    pass_: int
-    guides: Guides | None = None  # None: not asked for
-
 
 REPAIR = "`photonfarm store check --repair` sets its job aside, and workers render it again"
 """The remedy for damaged samples."""
@@ -60,9 +47,13 @@ OPEN_SHARDS = 400
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
-    def __init__(self, root: str | Path, scene_id: str) -> None:
-        """Take the scene to follow; store, scene and plans may appear later."""
+    def __init__(self, root: str | Path, scene_id: str, *, exposure: float | None = None) -> None:
+        """Take the scene to follow; store, scene and plans may appear later.
+
+        With an `exposure`, the spec has that one, as a training run keeps the one that it began with.
+        """
         self._storage = open_storage(root)
+        self._exposure = exposure
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
         self._spec: SceneSpec | None = None
@@ -72,9 +63,9 @@ class SceneReader:
         self.plan_requests: list[dict[str, Any]] = []  # the requests of the plans, from which all rows follow
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
-        self.taken_back = np.zeros(0, np.int64)  # rows that the last refresh found incomplete again, after a repair
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
         self._shards = _OpenShards()
+        self._base: tuple[Geometry, BasePointCloud] | None = None
 
     @property
     def spec(self) -> SceneSpec:
@@ -87,7 +78,8 @@ class SceneReader:
 
     def read_spec(self) -> SceneSpec:
         """The scene's spec as it is stored now; what a reader began with stays its `spec`."""
-        return read_spec(self._storage, self._scene_id)
+        spec = read_spec(self._storage, self._scene_id)
+        return spec if self._exposure is None else spec.model_copy(update={"exposure": self._exposure})
 
     def ready(self) -> bool:
         """Whether spec and base are there; the base comes with the scene's first job."""
@@ -109,7 +101,6 @@ class SceneReader:
         Costs one listing of the plans, and what `FollowedMarkers` costs. Raises StoreError for a store of another
         format.
         """
-        self.taken_back = np.zeros(0, np.int64)
         if self._spec is None and not self._storage.exists(f"{self._name}/spec.json"):
             if not self._storage.exists(FORMAT_FILE):
                 return np.zeros(0, np.int64)
@@ -124,10 +115,12 @@ class SceneReader:
         complete = plans.complete_rows(self._plans, committed)
         if self._committed - committed:  # markers removed by a repair
             self._shards.clear()
+            if not is_there(self._storage, self._scene_id):
+                where = f"{self._storage.where}/{self._name}"
+                raise IncompleteError(f"{where}: the scene is no longer there; submit its spec again")
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
         self._committed, self._complete = committed, complete
-        self.taken_back = np.flatnonzero(before & ~complete)
         return np.flatnonzero(complete & ~before)
 
     def _load_plans(self) -> None:
@@ -162,7 +155,7 @@ class SceneReader:
         batch.rows[:], batch.view_rows[:] = chosen, self._view_row[chosen]
         batch.modification_rows[:] = self._modification_row[chosen]
         batch.wide.clear()
-        with self._reading("read samples"):
+        with self._reading(chosen, "read samples"):
             for place, row in enumerate(chosen.tolist()):
                 self._read_radiance(row, place, batch)
             for name, memory in (*batch.buffers.items(), *batch.guides.items(), *batch.seen.items()):
@@ -170,18 +163,28 @@ class SceneReader:
                     self._read_into(name, row, memory[place])
         return batch
 
-    def read(self, row: int, *, guides: bool = False) -> StoredSample:
-        """Read one complete sample, with its view's `guides` or without.
+    def read_samples(self, rows: Sequence[int], out: Batch | None = None) -> list[Sample]:
+        """Read complete samples as `read_batch` does, and give them one by one, in the memory of that batch."""
+        batch = self.read_batch(rows, out)
+        return [self._sample(row, place, batch) for place, row in enumerate(rows)]
 
-        Raises CorruptError if its bytes are not what was committed.
+    def _sample(self, row: int, place: int, batch: Batch) -> Sample:
+        (key,), (modification, view, pass_number) = self.sample_keys([row]), self.inputs(row)
+        radiance, scale = (batch.wide[place], 1.0) if place in batch.wide else (batch.radiance[place], batch.scale)
+        buffers = ViewBuffers(**{name: values[place] for name, values in batch.buffers.items()})
+        known = {name: values[place] for name, values in batch.guides.items()}
+        of_view = buffers, batch.visibility(place), Guides(**known) if known else None
+        shared = (lambda: self.base()[1]), partial(self.read_photons, row)
+        return Sample(row, key, modification, view, pass_number, radiance, *of_view, scale, *shared)
+
+    def read(self, row: int, *, guides: bool = False) -> Sample:
+        """Read one complete sample in float32, with its view's `guides` or without.
+
+        Raises CorruptError if its bytes are not what was committed, IncompleteError if it is no longer there.
         """
-        batch = self.read_batch([row], Batch.empty(self.spec, 1, guides=guides))
-        buffers = {name: values[0].astype(np.float32, copy=False) for name, values in batch.buffers.items()}
-        modification, view, pass_ = self.inputs(row)
-        known = {name: values[0].astype(np.float32, copy=False) for name, values in batch.guides.items()}
-        of_view = ViewBuffers(**buffers), batch.visibility(0), pass_, Guides(**known) if known else None
-        sample = StoredSample(row, modification, view, batch.linear(0), *of_view)
-        if not all(np.isfinite(values).all() for values in (sample.radiance, *buffers.values(), *known.values())):
+        (stored,) = self.read_samples([row], Batch.empty(self.spec, 1, guides=guides))
+        sample = stored.decoded()
+        if not all(np.isfinite(values).all() for values in (sample.radiance, *sample.images.values())):
             where = f"{self._storage.where}/{self._name}"
             raise CorruptError(f"{where}: row {row} holds a value that is not finite; {REPAIR}")
         return sample
@@ -189,6 +192,11 @@ class SceneReader:
     def read_radiance(self, row: int) -> F32:
         """Read the halves of one complete sample, and nothing else, (2, H, W, 3) linear, unscaled."""
         return self.read_batch([row], Batch.empty(self.spec, 1, buffers=False)).linear(0)
+
+    def sample_keys(self, rows: Sequence[int]) -> list[Key]:
+        """The content keys of many samples."""
+        of_plans = [(plans.plan_of(self._plans, row), row) for row in rows]
+        return [plan.rows.sample_key[row - plan.first_row].tobytes() for plan, row in of_plans]
 
     def rows_by_key(self) -> dict[Key, int]:
         """The rows of all complete samples by their content keys."""
@@ -205,7 +213,7 @@ class SceneReader:
         if not self.spec.photons.paths:
             raise StoreError(f"scene {self._scene_id} has photons.paths = 0; no photons are stored")
         modification_row = self.modification_row(row)
-        with self._reading("read photons"):
+        with self._reading([row], "read photons"):
             bounce = self._read("photon_bounce", modification_row)
             floats = [f.name for f in fields(Photons) if f.name != "bounce"]
             read = {
@@ -260,18 +268,35 @@ class SceneReader:
         return view_key(modification_key, view.vector)
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
-        """Geometry and base point cloud; raises StoreError while they are not there."""
-        return read_base(self._storage, self._name)
+        """Geometry and base point cloud, read once; raises StoreError while they are not there."""
+        if self._base is None:
+            self._base = read_base(self._storage, self._name)
+        return self._base
+
+    # ----------------------------------------------------------------------------------------------------------- others
+
+    def at_work(self, what: str) -> AbstractContextManager[None]:
+        """Announce that this process is at work in the scene, as `lease.at_work` does."""
+        return at_work(self._storage, self._scene_id, what)
+
+    def lease(self) -> str | None:
+        """Who has the scene for itself now, in words; None if nobody has. Costs a listing."""
+        return leases(self._storage).get(self._scene_id)
+
+    def doubt(self) -> None:
+        """Look for all markers at the next refresh: some may have been removed."""
+        self._markers.doubt()
 
     # ----------------------------------------------------------------------------------------------------------- arrays
 
     def _check_complete(self, rows: NDArray[np.int64]) -> None:
-        if len(rows) and rows.min() >= 0 and rows.max() < len(self._complete) and self._complete[rows].all():
-            return
         there = (rows >= 0) & (rows < len(self._complete))
         there[there] = self._complete[rows[there]]
         if not there.all():
-            raise StoreError(f"row {int(rows[~there][0])} of scene {self._scene_id} is not complete")
+            raise self._incomplete(int(rows[~there][0]))
+
+    def _incomplete(self, row: int) -> IncompleteError:
+        return IncompleteError(f"row {row} of scene {self._scene_id} is not complete; workers render it")
 
     def _read_radiance(self, row: int, place: int, batch: Batch) -> None:
         shard, within = self._shard("radiance", row)
@@ -303,13 +328,23 @@ class SceneReader:
         return CorruptError(f"{self._storage.where}/{file}: row {row} is committed, but missing")
 
     @contextmanager
-    def _reading(self, what: str) -> Iterator[None]:
-        """Turn errors of the disk into StoreErrors, and tell of damage with its remedy."""
+    def _reading(self, rows: Sequence[int] | NDArray[np.int64], what: str) -> Iterator[None]:
+        """Turn errors of the disk into StoreErrors, and tell of damage with its remedy.
+
+        Raises IncompleteError instead for rows that a repair has set aside since the last look.
+        """
         with store_errors(what, self._storage.where):
             try:
                 yield
             except CorruptError as error:
-                self._markers.doubt()  # a repair may have set the job aside
+                self._markers.doubt()
+                parts = [
+                    (row, part) for row in rows for part in (row, self._view_row[row], self._modification_row[row])
+                ]
+                for row, part in parts:
+                    marker = markers.name_of(self._name, int(part) // self._plans[0].shard_rows)
+                    if not self._storage.exists(marker):
+                        raise self._incomplete(int(row)) from error
                 raise CorruptError(f"{error}; {REPAIR}") from error
 
     def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:

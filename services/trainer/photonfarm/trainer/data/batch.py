@@ -1,0 +1,170 @@
+"""Batches as tensors, and those of their samples that stay in the memory of a device.
+
+Shape letters: B batch, H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, is_dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from photonfarm.data.torch_dataset import SampleTensors
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.keys import Key, Stream
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, map_tensors
+
+FREE_SHARE = 0.25
+"""The share of a card's memory that stays free with "auto".
+
+It is measured before each sample is kept. Most samples come after the first steps, when torch holds the memory that
+steps need.
+"""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrainingBatch:
+    """Samples as tensors; valid until the next batch is taken."""
+
+    rows: tuple[int, ...]
+    units: tuple[Key, ...]  # by which each is held out: equal for samples that are not independent
+    inputs: Inputs
+    target: Tensor  # (B, 2, H, W, 3) half-estimates A and B, linear radiance × exposure
+
+    @classmethod
+    def of(
+        cls, rows: Sequence[int], units: Sequence[Key], tensors: Mapping[str, Tensor], kept: Tensor | None = None
+    ) -> TrainingBatch:
+        """What a `SceneDataset` has read, (B, …) by field, in the same memory; and A's `kept` pixels, (B, H, W)."""
+        target = tensors["radiance"]
+        noisy = None if kept is None else NoisyColour(target[:, 0] * kept[..., None], kept)
+        return cls(tuple(rows), tuple(units), Inputs.of(tensors, noisy), target)
+
+    def to(self, device: torch.device) -> TrainingBatch:
+        """The same batch on a device; itself on the CPU."""
+        inputs = map_tensors(lambda tensor: tensor.to(device), self.inputs)
+        return TrainingBatch(self.rows, self.units, inputs, self.target.to(device))
+
+    def for_training(self) -> TrainingBatch:
+        """The batch with targets that no input depends on: itself, unless its inputs hold noisy colour.
+
+        Otherwise it is twice as long: the samples with A in the inputs and B as the target, (B, 1, H, W, 3), then the
+        same samples with both exchanged (Lehtinen et al., Noise2Noise, 2018). The same pixels are kept of both.
+        """
+        noisy = self.inputs.noisy
+        if noisy is None:
+            return self
+        half_b = NoisyColour(self.target[:, 1] * noisy.kept[..., None], noisy.kept)
+        inputs = map_tensors(lambda *both: torch.cat(both), self.inputs, replace(self.inputs, noisy=half_b))
+        target = torch.cat([self.target[:, 1:], self.target[:, :1]])
+        return TrainingBatch(2 * self.rows, 2 * self.units, inputs, target)
+
+
+def empty_memory(tensors: SampleTensors, size: int, *, pinned: bool = False) -> dict[str, Tensor]:
+    """Memory for `size` samples, by field, which is reused for every batch; SpecError where there is not so much."""
+    try:
+        return tensors.empty(size, pinned=pinned)
+    except RuntimeError as error:  # torch's error for want of memory
+        raise SpecError(f"batch = {size}: no memory for so many samples") from error
+
+
+def kept_count(spec: SceneSpec, of: int) -> int:
+    """The number of pixels that one of `of` makes; SpecError if the film has fewer than `of` pixels."""
+    pixels = spec.film.height * spec.film.width
+    if of > pixels:
+        raise SpecError(
+            f"one of {of} pixels is to be kept, and the film has {pixels} ({spec.film.width}×{spec.film.height}); "
+            "keep one of fewer"
+        )
+    return pixels // of
+
+
+def kept_pixels(key: Key, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
+    """One of `of` pixels, (H, W), H·W / `of` in all: a random choice derived from a sample's content key.
+
+    So each pass of a view keeps pixels of its own, and a resumed run gets the same pixels. A smaller share of the
+    pixels is a subset of a larger one. Raises SpecError as `kept_count` does.
+    """
+    film = spec.film.height, spec.film.width
+    chance = Stream(key, "kept pixels").uniform(*film)
+    last = kept_count(spec, of) - 1
+    kept: NDArray[np.bool_] = chance <= np.partition(chance, last, axis=None)[last]
+    return kept
+
+
+class ResidentSamples:
+    """The decoded samples on a device, up to a limit. What is kept stays: in rounds, the oldest is the next one drawn.
+
+    One thread uses it. On CUDA its copies and the steps are in one stream, in the order in which they were asked for.
+    """
+
+    def __init__(self, device: torch.device, limit_gb: float | Literal["auto"]) -> None:
+        """Keep up to `limit_gb` 10⁹ bytes; by "auto" none on a CPU, and on CUDA while `FREE_SHARE` of it is free."""
+        self._device = device
+        self._limit_bytes = None if limit_gb == "auto" else limit_gb * 1e9  # None: "auto"
+        self._kept: dict[int, TrainingBatch] = {}  # batches of one sample, by row
+        self._bytes = 0
+
+    @property
+    def keeps_any(self) -> bool:
+        """Whether there is a limit above 0."""
+        return self._device.type == "cuda" if self._limit_bytes is None else self._limit_bytes > 0
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """The rows of the samples that are kept."""
+        return tuple(self._kept)
+
+    def lacking(self, rows: Iterable[int]) -> list[int]:
+        """Those of the rows that are not kept, each once, in their order."""
+        return [row for row in dict.fromkeys(rows) if row not in self._kept]
+
+    def batch(self, rows: Sequence[int], fresh: TrainingBatch) -> TrainingBatch:
+        """The batch of these rows on the device, of which `fresh` has those that were `lacking`; keeps what fits.
+
+        Its tensors are its own. Values are those of the store's samples, to the bit, wherever they were kept.
+        """
+        moved = fresh.to(self._device)
+        parts = {row: _one(moved, place) for place, row in enumerate(fresh.rows)}
+        for row, part in parts.items():
+            if self._has_room(needed := size_bytes(part)):
+                self._kept[row], self._bytes = _changed(torch.clone, part), self._bytes + needed
+        return _joined([parts[row] if row in parts else self._kept[row] for row in rows]) if rows else moved
+
+    def _has_room(self, needed: int) -> bool:
+        if self._limit_bytes is not None:
+            return self._bytes + needed <= self._limit_bytes
+        free, total = torch.cuda.mem_get_info(self._device)
+        return free - needed >= FREE_SHARE * total
+
+
+def size_bytes(record: Any) -> int:
+    """The bytes of all tensors of a batch, or of its inputs."""
+    if isinstance(record, Tensor):
+        return record.numel() * record.element_size()
+    return sum(size_bytes(getattr(record, f.name)) for f in fields(record)) if is_dataclass(record) else 0
+
+
+def _one(batch: TrainingBatch, place: int) -> TrainingBatch:
+    """One sample of a batch, in the batch's memory."""
+    inputs = map_tensors(lambda tensor: tensor[place : place + 1], batch.inputs)
+    return TrainingBatch((batch.rows[place],), (batch.units[place],), inputs, batch.target[place : place + 1])
+
+
+def _changed(change: Callable[[Tensor], Tensor], sample: TrainingBatch) -> TrainingBatch:
+    """The sample with `change` applied to its tensors."""
+    return TrainingBatch(sample.rows, sample.units, map_tensors(change, sample.inputs), change(sample.target))
+
+
+def _joined(samples: Sequence[TrainingBatch]) -> TrainingBatch:
+    """Samples as a batch in memory of its own."""
+    rows, units = (tuple(getattr(sample, name)[0] for sample in samples) for name in ("rows", "units"))
+    first, *others = (sample.inputs for sample in samples)
+    inputs = map_tensors(lambda *parts: torch.cat(parts), first, *others)
+    return TrainingBatch(rows, units, inputs, torch.cat([sample.target for sample in samples]))

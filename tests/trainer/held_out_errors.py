@@ -4,8 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm.trainer.data.batch import SampleSource
-from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import batches, measure, network_predictor
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.baselines import Baselines

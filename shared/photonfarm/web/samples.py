@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from photonfarm.shared.core import pictures
-from photonfarm.shared.core.records import F32, BasePointCloud
+from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.sample_costs import relative_variance
-from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.store import Sample, SceneReader
 from photonfarm.web import images
 from photonfarm.web.server import NotThereError
@@ -45,12 +45,16 @@ class SceneSamples:
         self._wall: deque[int] = deque(maxlen=WALL)
         self._noise: OrderedDict[int, float] = OrderedDict()  # by row, of those whose pictures were made
         self._opened: OrderedDict[int, Sample] = OrderedDict()
-        self._base: BasePointCloud | None = None
 
     def look(self) -> list[int]:
         """Look for new samples; returns the rows on the wall, the latest first."""
         with self._lock:
-            new = self._reader.refresh()
+            try:
+                new = self._reader.refresh()
+            except IncompleteError:  # the scene was forgotten, and is another one now
+                self._reader, new = SceneReader(self._place, self._scene_id), np.zeros(0, np.int64)
+                self._noise.clear()
+                self._opened.clear()
             kept = [row for row in self._wall if self._is_complete(row)]
             at_once = AT_ONCE if kept else WALL
             if len(new) > at_once:
@@ -100,18 +104,16 @@ class SceneSamples:
 
     def points(self, row: int) -> bytes:
         """The points of a sample's configuration, as `images.packed` has them."""
-        sample, base = self._open(row), self._base_cloud()
-        position, present = rebuild(base, sample.modification)
-        colour = images.point_colours(base.albedo, base.emission)
-        return images.packed(
-            position[present], base.normal[present], colour[present], sample.visibility.points[present]
-        )
+        cloud = self._open(row).point_cloud
+        colour, there = images.point_colours(cloud.albedo, cloud.emission), cloud.present
+        return images.packed(cloud.position[there], cloud.normal[there], colour[there], cloud.seen[there])
 
     def photons(self, row: int) -> bytes:
         """The photons of a sample's configuration, as `images.packed` has them; none for a scene without photons."""
         if not self._reader.spec.photons.paths:
             return b""
-        sample, photons = self._open(row), self._reader.read_photons(row)
+        sample = self._open(row)
+        photons = sample.photons
         there = photons.bounce >= 0
         colour = images.photon_colours(photons.power[there])
         return images.packed(photons.position[there], photons.normal[there], colour, sample.visibility.photons[there])
@@ -192,12 +194,6 @@ class SceneSamples:
                     self._opened.popitem(last=False)
             self._opened.move_to_end(row)
             return self._opened[row]
-
-    def _base_cloud(self) -> BasePointCloud:
-        with self._lock:
-            if self._base is None:
-                self._base = self._reader.base()[1]
-            return self._base
 
     def _noted_noise(self, sample: Sample) -> float | None:
         """The relative noise of a sample's mean, a standard deviation; None for a black image."""

@@ -186,8 +186,8 @@ def test_an_error_of_rank_0_ends_the_others_and_that_of_all_ends_each(
             Ranks.average = fail  # in a process of its own
         honest = source.read_samples
 
-        def read_samples(rows: Any) -> Any:
-            samples = honest(rows)
+        def read_samples(rows: Any, out: Any) -> Any:
+            samples = honest(rows, out)
             if fault == "store" and os.environ["RANK"] == "0" and len(source.reads) > 20:
                 raise StoreError("the disk is gone")
             if fault == "loss" and len(source.reads) > 20:
@@ -214,10 +214,10 @@ def test_a_rank_that_hangs_in_a_step_is_waited_for_by_far_less_than_one_that_has
         source.ready = lambda: time.monotonic() - began > patience_s + 0.5
         honest, hangs = source.read_samples, [2 * patience_s]
 
-        def read_samples(rows: Any) -> Any:
+        def read_samples(rows: Any, out: Any) -> Any:
             if os.environ["RANK"] == "1" and len(source.reads) > 6 and hangs:
                 time.sleep(hangs.pop())
-            return honest(rows)
+            return honest(rows, out)
 
         source.read_samples = read_samples
         return source

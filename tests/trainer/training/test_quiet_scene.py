@@ -16,7 +16,8 @@ import torch
 
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore
+from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.shared.store.write.forgetting import forget
 from photonfarm.shared.store.write.lease import lease
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.distributed import leading, ranks
@@ -179,7 +180,6 @@ def test_a_scene_that_was_forgotten_ends_training(committed: SceneStore, setting
     thread = threading.Thread(target=training)
     thread.start()
     until(lambda: (run / CHECKPOINT).exists())
-    with lease(committed.storage, committed.scene_id, "store forget", lambda _: None):
-        committed.folder.rename(committed.folder.with_name("gone"))
+    forget(Store(committed.storage.root), committed.scene_id)
     thread.join(60)
-    assert "submit its spec again" in str(ended[0])
+    assert "was forgotten" in str(ended[0])

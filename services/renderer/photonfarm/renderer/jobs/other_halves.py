@@ -29,7 +29,7 @@ class OtherHalves:
         try:
             if len(self._reader.refresh()):
                 self._rows = self._reader.rows_by_key()
-        except CorruptError as error:
+        except (CorruptError, IncompleteError) as error:
             self._rows = {}
             log.warning("no halves are taken over from scene %s: %s", self._scene_id, error)
 

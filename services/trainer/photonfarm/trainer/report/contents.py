@@ -125,15 +125,11 @@ def gathered(
 
 
 def _inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tuple[ViewBuffers, Guides | None]]:
-    """The buffers of some rows, and their guides if the run reads these,."""
+    """The buffers of some rows, and their guides if the run reads these."""
     source = run.source(store)
-    there = set(source.refresh().tolist())
-    found = {}
-    for row in rows:
-        if row in there:
-            sample = source.read(row, guides=run.needs.guides)
-            found[row] = sample.buffers, sample.guides
-    return found
+    source.refresh()
+    samples = {row: source.read(row, guides=run.needs.guides) for row in rows}
+    return {row: (sample.buffers, sample.guides) for row, sample in samples.items()}
 
 
 def _entries(

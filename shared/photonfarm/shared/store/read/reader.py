@@ -115,16 +115,18 @@ class SceneReader:
         complete = plans.complete_rows(self._plans, committed)
         if self._committed - committed:  # markers removed by a repair
             self._shards.clear()
-            if not is_there(self._storage, self._scene_id):
-                where = f"{self._storage.where}/{self._name}"
-                raise IncompleteError(f"{where}: the scene is no longer there; submit its spec again")
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
         self._committed, self._complete = committed, complete
         return np.flatnonzero(complete & ~before)
 
     def _load_plans(self) -> None:
-        known, self._plans = self._plans, plans.load_all(self._storage, self._name, self._plans)
+        known, found = self._plans, plans.load_all(self._storage, self._name, self._plans)
+        if known and (not found or found[0].forgotten != known[0].forgotten):
+            raise IncompleteError(
+                f"{self._storage.where}/{self._name}: the scene was forgotten; open what is there anew"
+            )
+        self._plans = found
         if self._plans != known:
             self._committed = set()  # complete rows are to be counted again
             inputs = [plan.rows for plan in self._plans]

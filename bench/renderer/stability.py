@@ -43,7 +43,8 @@ def main() -> int:
     from photonfarm.renderer.scene import backend
 
     backend.load(options.threads)
-    from photonfarm.renderer.verify import invariances, report, rows
+    from bench.renderer import invariances
+    from photonfarm.renderer.verify import report, rows
 
     try:
         checks = invariances.chosen(options.invariances or [], long=not options.quick)
@@ -72,7 +73,7 @@ def main() -> int:
 
 def hold(checks: Any) -> bool:
     """Run the checks, print their table; whether all of them hold."""
-    from photonfarm.renderer.verify import invariances
+    from bench.renderer import invariances
 
     found = []
     for check in checks:

@@ -8,8 +8,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from bench.renderer.invariances import COUNTS, Invariance, checks
 from photonfarm.renderer.bdpt import launches
-from photonfarm.renderer.verify.invariances import COUNTS, Invariance, checks
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
 # The oracle's have tests of their own, and more of them: test_oracle.py

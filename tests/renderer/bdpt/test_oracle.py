@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from bench.renderer.weights import weight_check
+from bench.renderer.weights.oracle import F64
+from bench.renderer.weights.weight_check import SCENES, compare_weights
 from photonfarm.renderer.verify.scenes.case import BdptSettings
-from photonfarm.renderer.verify.weights import weight_check
-from photonfarm.renderer.verify.weights.oracle import F64
-from photonfarm.renderer.verify.weights.weight_check import SCENES, compare_weights
 
 LANES = 256
 

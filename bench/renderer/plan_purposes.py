@@ -34,8 +34,8 @@ class Compared:
 
     def over(self, other: Any) -> str:
         """How much longer another takes to the same error than the best, in words."""
-        from photonfarm.renderer.strategy.comparison import saving
-        from photonfarm.renderer.strategy.reasons import plus_minus
+        from photonfarm.renderer.strategy.candidates import saving
+        from photonfarm.renderer.strategy.printed import plus_minus
 
         found = saving(self.plan.at_equal_cost[self.best], over=self.plan.at_equal_cost[other])
         return "1" if other == self.best else plus_minus(found.factor, found.spread)
@@ -53,11 +53,10 @@ def kept(render: Callable[..., Any]) -> Callable[..., Any]:
     return again
 
 
-def compare(spec: Any, seconds: float, pairs: int) -> tuple[Compared, Compared, Compared]:
-    """The settings of a spec for training, for images, and for training if the time of images alone counted."""
-    from photonfarm.renderer.strategy.measurement import measure
-    from photonfarm.renderer.strategy.objective.purpose import Purpose
-    from photonfarm.renderer.strategy.pilot_scene import PilotScene
+def compare(spec: Any, seconds: float, pairs: int) -> tuple[Compared, Compared]:
+    """The settings of a spec for training, and for images."""
+    from photonfarm.renderer.strategy.measurement import PilotScene, measure
+    from photonfarm.renderer.strategy.noise import Purpose
 
     log = partial(print, file=sys.stderr)
     measured = measure(spec, None, Purpose.TRAINING, seconds, log)
@@ -65,23 +64,17 @@ def compare(spec: Any, seconds: float, pairs: int) -> tuple[Compared, Compared, 
     scene = PilotScene(spec, None).on_film(measured.film)
     renders = [kept(render) for render in scene.renders(measured.views)]
     training = measured.model_copy(update={"rows": rows(measured, renders, Purpose.TRAINING, spec.exposure, pairs)})
-    images = measured.model_copy(
-        update={
-            "purpose": Purpose.IMAGES,
-            "rows": rows(measured, renders, Purpose.IMAGES, spec.exposure, pairs),
-            "configuration_s": 0.0,
-            "view_s": 0.0,
-        }
-    )
-    alone = training.model_copy(update={"configuration_s": 0.0, "view_s": 0.0})
-    return compared(spec, training), compared(spec, images), compared(spec, alone)
+    weighed = rows(measured, renders, Purpose.IMAGES, spec.exposure, pairs)
+    images = measured.model_copy(update={"purpose": Purpose.IMAGES, "rows": weighed})
+    return compared(spec, training), compared(spec, images)
 
 
 def rows(measured: Any, renders: list[Any], purpose: Any, exposure: float, pairs: int) -> tuple[Any, ...]:
     """The measured rows with errors by these renderers as a purpose weighs them; images share no launch."""
+    from photonfarm.renderer.strategy.budget import ImageCost
     from photonfarm.renderer.strategy.measurement import CandidateRow
-    from photonfarm.renderer.strategy.objective.purpose import Purpose
-    from photonfarm.renderer.strategy.rounds import Rounds
+    from photonfarm.renderer.strategy.noise import Purpose
+    from photonfarm.renderer.strategy.pilot import Rounds
 
     candidates = [row.candidate for row in measured.rows]
     rounds = Rounds(renders, candidates, measured.spp, SEED, {}, purpose.weigh(exposure), lambda: 0.0)
@@ -90,14 +83,10 @@ def rows(measured: Any, renders: list[Any], purpose: Any, exposure: float, pairs
     launches = 1 if purpose is Purpose.TRAINING else 2
     return tuple(
         CandidateRow(
-            connections=row.connections,
-            light_ratio=row.light_ratio,
-            guided_light=row.guided_light,
-            light_samples=row.light_samples,
+            candidate=row.candidate,
             errors=rounds.errors(row.candidate),
             missed=rounds.missed(row.candidate),
-            fixed_s=launches * row.fixed_s,
-            sample_s=row.sample_s,
+            cost=ImageCost(launches * row.cost.fixed_s, row.cost.sample_s),
         )
         for row in measured.rows
     )
@@ -105,8 +94,7 @@ def rows(measured: Any, renders: list[Any], purpose: Any, exposure: float, pairs
 
 def compared(spec: Any, measurement: Any) -> Compared:
     """The plan that follows from a measurement, and its best settings."""
-    from photonfarm.renderer.strategy.choices import best
-    from photonfarm.renderer.strategy.plan import plan_of
+    from photonfarm.renderer.strategy.plan import best, plan_of
 
     plan = plan_of(spec, measurement, cached=False)
     return Compared(plan, best({c: at_cost for c, at_cost in plan.at_equal_cost.items() if at_cost.fits}).candidate)
@@ -118,10 +106,9 @@ def short(candidate: Any) -> str:
     return f"({candidate.connections}, {candidate.light_ratio:g}{', guided' * candidate.guided_light}{samples})"
 
 
-def line(spec: Any, training: Compared, images: Compared, alone: Compared) -> list[Any]:
+def line(spec: Any, training: Compared, images: Compared) -> list[Any]:
     """The spec's line of the table."""
     m = training.plan.measurement
-    beside_ms, halves_ms = 1e3 * (m.configuration_s + m.view_s), 2e3 * m.half_s
     return [
         spec.name,
         f"{m.views} of {m.film.width} × {m.film.height}, {m.spp} spp",
@@ -129,8 +116,6 @@ def line(spec: Any, training: Compared, images: Compared, alone: Compared) -> li
         f"{short(training.best)} → {short(training.plan.candidate)}",
         training.over(images.best),
         images.over(training.best),
-        short(alone.best),
-        f"{beside_ms:.0f} + {halves_ms:.0f}",
     ]
 
 
@@ -138,21 +123,19 @@ def figures(plan: Any) -> dict[str, Any]:
     """The plan for the JSON file, without what is measured for photons."""
     document = plan.document()
     measured = document.pop("measurement").items()
-    return {**document, "measurement": {k: v for k, v in measured if k not in ("filled", "near", "power")}}
+    return {**document, "measurement": {k: v for k, v in measured if k not in ("near", "power")}}
 
 
 def page(lines: list[list[Any]], pairs: int) -> str:
     header = ["spec", "views", "for images: best → plan", "for training: best → plan"]
     header += ["for training: images' best takes", "for images: training's best takes"]
-    header += ["for training, with images' time alone: best", "ms of a sample: beside + both halves"]
     return f"""# Sampling for training, and for images
 
 All settings of `photonfarm scene plan`, (connections, light ratio), by {2 * pairs} images of each in each view, of the
 same seeds, weighed once as `--for training` and once as `--for images`; times are measured once. **Best**: the least
 error × time. **Plan**: what is proposed, which stays with the spec's settings unless others gain at least 5 % and two
 standard errors. **Takes**: the time until the other purpose's best settings reach the error of this purpose's best, ±
-one standard error over the views. **With images' time alone**: the best for training if what a sample takes beside its
-half-estimates did not count.
+one standard error over the views.
 
 {results.table(header, lines)}"""
 
@@ -169,8 +152,8 @@ def main() -> int:
     lines, plans = [], []
     for name in options.spec:
         spec = ready_spec(name)
-        training, images, alone = compare(spec, options.seconds, options.pairs)
-        lines.append(line(spec, training, images, alone))
+        training, images = compare(spec, options.seconds, options.pairs)
+        lines.append(line(spec, training, images))
         print(*lines[-1], sep=" | ", file=sys.stderr)
         plans.append({"spec": name, "training": figures(training.plan), "images": figures(images.plan)})
     values = {"seconds": options.seconds, "pairs": options.pairs, "specs": plans}

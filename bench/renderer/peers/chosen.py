@@ -70,7 +70,9 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
 
     import mitsuba as mi
 
-    from photonfarm.renderer.strategy import content, measurement, pilot
+    from photonfarm.renderer.strategy import content, pilot
+    from photonfarm.renderer.strategy.candidates import GRID
+    from photonfarm.renderer.strategy.printed import BLACK, reasons_for
 
     plugins: dict[Any, Any] = {}
 
@@ -83,10 +85,11 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
 
     start = time.perf_counter()
     found = content.read(scene, scene.sensors()[0])
-    candidates, _ = content.restrict(found, max_depth, 1.0, measurement.GRID)
+    candidates, _ = content.restrict(found, max_depth, 1.0, GRID)
     choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED)
     best = choice.candidate
+    reasons = reasons_for(choice.row(best), choice.measured, choice.shared) if choice.measured else (BLACK,)
     spent_s = time.perf_counter() - start
     return Chosen(
-        best.connections, best.light_ratio, spent_s, "; ".join(choice.reasons), best.guided_light, best.light_samples
+        best.connections, best.light_ratio, spent_s, "; ".join(reasons), best.guided_light, best.light_samples
     )

@@ -12,10 +12,9 @@ from click.testing import CliRunner, Result
 from photonfarm.renderer.cli.measuring_verbs import scene_cost
 from photonfarm.renderer.measure import sample_costs as measuring
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
-from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs
+from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs, timed
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.strategy.objective.view_cost import timed
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.shared.scene.modification import Modification, rest

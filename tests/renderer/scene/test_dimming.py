@@ -11,8 +11,8 @@ import pytest
 
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.strategy import content, light_reach
-from photonfarm.renderer.strategy.pilot_scene import PilotScene
+from photonfarm.renderer.strategy import content
+from photonfarm.renderer.strategy.measurement import PilotScene
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.statistics import block_z_test
 from photonfarm.shared.scene.files import BUILTIN_EMITTING
@@ -214,7 +214,7 @@ def test_a_plan_and_photons_see_only_what_shines(file_scene: Loader, folder: Pat
     assert found[0].lights == {"area": 2, "environment map": 1}
     assert found[1].lights == {"area": 1}
     assert "lights: 1 area" in content.sentences(found[1], 4)
-    reaches = [light_reach.measure([scene.scene], scene.spec.view, 0) for scene in (lit, night)]
+    reaches = [content.light_reach([scene.scene], scene.spec.view, 0) for scene in (lit, night)]
     assert reaches[0].hit < 0.5 < reaches[1].hit  # the sky's paths miss
     dark = file_scene(folder, BLOCK + own, emitters={"all": 0})
     read = content.read(dark.scene, PilotScene(dark.spec, folder).camera())

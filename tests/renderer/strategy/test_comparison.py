@@ -4,8 +4,14 @@ import math
 
 import pytest
 
-from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
-from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors, is_alike, saving
+from photonfarm.renderer.strategy.candidates import (
+    PLAIN,
+    Candidate,
+    MeasuredCandidate,
+    RelativeErrors,
+    is_alike,
+    saving,
+)
 
 
 def measured(

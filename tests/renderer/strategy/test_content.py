@@ -7,9 +7,8 @@ from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
 
-from photonfarm.renderer.strategy import content, light_reach  # noqa: E402
-from photonfarm.renderer.strategy.candidate import PLAIN  # noqa: E402
-from photonfarm.renderer.strategy.measurement import GRID  # noqa: E402
+from photonfarm.renderer.strategy import content  # noqa: E402
+from photonfarm.renderer.strategy.candidates import GRID, PLAIN  # noqa: E402
 from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 from photonfarm.shared.scene.spec import Box, PhotonSpec, ViewSpec  # noqa: E402
 
@@ -93,9 +92,8 @@ def test_light_in_a_closed_sphere_loses_what_it_absorbs_at_each_bounce() -> None
     grey = {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}}
     sphere = {"type": "sphere", "radius": 0.5, "flip_normals": True, "bsdf": grey}
     scene = mi.load_dict({"type": "scene", "sphere": sphere, "bulb": BULB}, optimize=False)
-    reach = light_reach.measure([scene, scene], AROUND, seed=1)
+    reach = content.light_reach([scene, scene], AROUND, seed=1)
     assert reach.hit == 1
-    assert (reach.filled, reach.filled) == reach.near
     expected = 0.5 ** np.arange(16)
     np.testing.assert_allclose(reach.power, [expected / expected.sum()] * 2, rtol=1e-4)
 
@@ -103,11 +101,11 @@ def test_light_in_a_closed_sphere_loses_what_it_absorbs_at_each_bounce() -> None
 def test_hits_far_from_the_cameras_do_not_count() -> None:
     far = {"type": "sphere", "center": [50, 0, 0], "radius": 40, "flip_normals": True}
     scene = mi.load_dict({"type": "scene", "sphere": far, "bulb": {**BULB, "position": [50, 0, 0]}}, optimize=False)
-    reach = light_reach.measure([scene], AROUND, seed=1)
+    reach = content.light_reach([scene], AROUND, seed=1)
     assert reach.hit == 1
     assert np.max(reach.near) == 0
     assert np.sum(reach.power) == 0
-    photons, reason = light_reach.recommend(PhotonSpec(), reach.near, reach.power, max_depth=8)
+    photons, reason = content.recommend_photons(PhotonSpec(), reach.near, reach.power, max_depth=8)
     assert photons.paths == 0
     assert "0.0% of the light paths, at most, reach" in reason
 
@@ -126,7 +124,7 @@ def test_bounces_that_carry_next_to_nothing_are_not_stored(
     wanted: int, power: tuple[float, ...], max_depth: int, depth: int
 ) -> None:
     near = [(0.9, 0.8, 0.7, 0.6)]
-    photons, sentence = light_reach.recommend(PhotonSpec(paths=64, depth=wanted), near, [power], max_depth)
+    photons, sentence = content.recommend_photons(PhotonSpec(paths=64, depth=wanted), near, [power], max_depth)
     assert photons == PhotonSpec(paths=64, depth=depth)
     assert ("raise it by hand" in sentence) == (depth < wanted)
 
@@ -136,17 +134,17 @@ def test_photons_that_shine_in_one_configuration_are_stored_for_all() -> None:
     dull, bright = (0.9, 0.1, 0.0, 0.0), (0.8, 0.176, 0.024, 0.0)
     wanted = PhotonSpec(paths=64, depth=4)
     near = [(0.9, 0.8, 0.7, 0.6)] * 16
-    assert light_reach.recommend(wanted, near, [dull] * 16, 8)[0].depth == 2
-    photons, sentence = light_reach.recommend(wanted, near, [dull] * 15 + [bright], 8)
+    assert content.recommend_photons(wanted, near, [dull] * 16, 8)[0].depth == 2
+    photons, sentence = content.recommend_photons(wanted, near, [dull] * 15 + [bright], 8)
     assert photons.depth == 3
     assert "16 draws of the configuration" in sentence
     unlit = [(0.001,) * 4] * 15
-    assert light_reach.recommend(wanted, [*unlit, (0.1,) * 4], [dull] * 16, 8)[0].paths == 64
-    photons, sentence = light_reach.recommend(wanted, [*unlit, (0.001,) * 4], [dull] * 16, 8)
+    assert content.recommend_photons(wanted, [*unlit, (0.1,) * 4], [dull] * 16, 8)[0].paths == 64
+    photons, sentence = content.recommend_photons(wanted, [*unlit, (0.001,) * 4], [dull] * 16, 8)
     assert photons.paths == 0
     assert "raise it by hand" in sentence
 
 
 def test_no_photons_stay_no_photons() -> None:
-    assert light_reach.recommend(PhotonSpec(paths=0), [(1.0,)], [(1.0,)], 8)[0].paths == 0
-    assert light_reach.recommend(PhotonSpec(), [(1.0,)], [(1.0,)], 1)[0].paths == 0
+    assert content.recommend_photons(PhotonSpec(paths=0), [(1.0,)], [(1.0,)], 8)[0].paths == 0
+    assert content.recommend_photons(PhotonSpec(), [(1.0,)], [(1.0,)], 1)[0].paths == 0

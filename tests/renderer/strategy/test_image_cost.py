@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.strategy.candidate import PLAIN, Candidate
-from photonfarm.renderer.strategy.image_cost import ImageCost, time_images
+from photonfarm.renderer.strategy.budget import ImageCost, time_images
+from photonfarm.renderer.strategy.candidates import PLAIN, Candidate
 
 JOINED = Candidate(1, 1.0)
 CANDIDATES = [PLAIN, JOINED]

@@ -9,16 +9,10 @@ from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
 
-from photonfarm.renderer.scene.loaded_scene import LoadedScene  # noqa: E402 - after the variant is set
-from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
-from photonfarm.renderer.strategy.noise import pair_errors, training_weights, view_weights  # noqa: E402
-from photonfarm.renderer.strategy.objective import view_cost  # noqa: E402
-from photonfarm.renderer.strategy.objective.purpose import Purpose  # noqa: E402
+from photonfarm.renderer.strategy.candidates import PLAIN, Candidate  # noqa: E402
+from photonfarm.renderer.strategy.noise import Purpose, pair_errors, training_weights, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import Choice, choose  # noqa: E402
-from photonfarm.renderer.strategy.pilot_scene import PilotScene  # noqa: E402
 from photonfarm.shared.core.records import F32  # noqa: E402
-from photonfarm.shared.scene.spec import SceneSpec  # noqa: E402
-from photonfarm.shared.scene.spec_loading import parse_spec  # noqa: E402
 
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
 CANDIDATES = [PLAIN, LIGHT, JOINED]
@@ -93,44 +87,3 @@ def test_a_black_view_has_no_weights() -> None:
     black = [np.zeros(SHAPE, np.float32)] * 2
     assert view_weights(black) is None
     assert training_weights(black, 1.0) is None
-
-
-# -------------------------------------------------------------------------------------------------------- a real scene
-
-
-@pytest.fixture(scope="module")
-def box() -> SceneSpec:
-    described = {
-        "name": "box",
-        "scene": {"builtin": "cornell"},
-        "view": {
-            "origin": {"min": [-0.5, 0.5, 1], "max": [0.5, 1.5, 1.8]},
-            "look_at": {"min": [-0.5, 0.5, -0.5], "max": [0.5, 1.5, 0]},
-        },
-        "film": {"width": 16, "height": 16},
-        "transport": {"max_depth": 3, "half_spp": 2},
-        "photons": {"paths": 64},
-        "points": 64,
-    }
-    return parse_spec(described, where="test")
-
-
-def test_all_that_a_sample_takes_beside_its_images_is_timed_and_the_first_view_does_not_count(
-    box: SceneSpec, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Photons take 10 s, buffers 1 s, points and photons seen 2 s, guides 4 s; a hundred times that at first."""
-    now, looked = [0.0], [0]
-    pilot_scene = PilotScene(box, None)
-    monkeypatch.setattr(backend, "work_s", lambda: now[0])
-    for name, seconds in (("photons", 10.0), ("buffers", 1.0), ("sees", 2.0), ("guides", 4.0)):
-        whole = getattr(LoadedScene, name)
-
-        def slow(self: LoadedScene, *given: Any, whole: Any = whole, seconds: float = seconds) -> Any:
-            looked[0] += seconds == 10.0
-            now[0] += seconds * (100 if looked[0] == 1 else 1)
-            return whole(self, *given)
-
-        monkeypatch.setattr(LoadedScene, name, slow)
-    found = view_cost.measure(pilot_scene, pilot_scene.draw(4))
-    assert (found.configuration_s, found.view_s, found.half_s) == (10.0, 7.0, 8.5)
-    assert looked == [4]

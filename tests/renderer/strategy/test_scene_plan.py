@@ -11,20 +11,18 @@ from photonfarm.renderer.scene import backend
 
 backend.load(threads=1)
 
-from photonfarm.renderer.strategy import cache  # noqa: E402 - after the variant is set
-from photonfarm.renderer.strategy.candidate import PLAIN, Candidate  # noqa: E402
-from photonfarm.renderer.strategy.image_cost import ImageCost  # noqa: E402
-from photonfarm.renderer.strategy.measurement import GRID  # noqa: E402
-from photonfarm.renderer.strategy.objective.purpose import Purpose  # noqa: E402
-from photonfarm.renderer.strategy.output.printed import lines  # noqa: E402
+from photonfarm.renderer.strategy import measurement as measuring  # noqa: E402 - after the variant is set
+from photonfarm.renderer.strategy.budget import ImageCost  # noqa: E402
+from photonfarm.renderer.strategy.candidates import GRID, PLAIN, Candidate  # noqa: E402
+from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
 from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
-from photonfarm.renderer.strategy.reasons import plus_minus  # noqa: E402
+from photonfarm.renderer.strategy.printed import lines, plus_minus  # noqa: E402
 from photonfarm.shared.scene.spec import SceneSpec  # noqa: E402
 from photonfarm.shared.scene.spec_loading import parse_spec  # noqa: E402
 
 
 def digest(spec: SceneSpec) -> str:
-    return cache.digest(spec, Purpose.IMAGES)
+    return measuring.digest(spec, Purpose.IMAGES)
 
 
 def text_of(found: TransportPlan) -> str:
@@ -53,30 +51,13 @@ def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -
     assert found.at_equal_cost[LIGHT].relative_cost == pytest.approx(0.08 * 0.1 / 2 / (0.1 * 0.1 / 10))
 
 
-def test_what_a_sample_takes_beside_its_halves_counts_for_training() -> None:
-    """In 0.1 s (1, 1) has 2 samples, which take all of it, and (0, 1) has a single one, which takes 0.07 s.
-
-    For images these are 0.08·0.07/1 against 0.06·0.10/2. With 0.4 s more for each half-estimate they are 0.08·0.47/1
-    against 0.06·0.50/2: what is saved by fewer samples is little of a sample's time.
-    """
-    rows = row(PLAIN, 0.2, 0.02, 0.04), row(LIGHT, 0.08, 0.0, 0.07), row(JOINED, 0.06, 0.02, 0.04)
-    alone = measurement(*rows)
-    beside = alone.model_copy(update={"purpose": Purpose.TRAINING, "configuration_s": 0.5, "view_s": 0.3})
-    for found, ratio in ((alone, 0.0056 / 0.003), (beside, 0.0376 / 0.015)):
-        compared = plan_of(spec_with(), found, cached=False).at_equal_cost
-        assert compared[LIGHT].relative_cost / compared[JOINED].relative_cost == pytest.approx(ratio)
-
-
 def test_a_plan_for_training_says_so_and_what_its_figures_are() -> None:
-    times = {"purpose": Purpose.TRAINING, "configuration_s": 0.5, "view_s": 0.3}
-    found = plan_of(spec_with(), measurement().model_copy(update=times), cached=False)
+    found = plan_of(spec_with(), measurement().model_copy(update={"purpose": Purpose.TRAINING}), cached=False)
     text = text_of(found)
     assert lines(found)[1].startswith("for training: ")
-    assert "a sample takes 500.0 ms for its configuration and 300.0 ms for its view" in text
     assert "half_spp    loss  " in text
     assert "relMSE" not in text
     assert found.document()["for"] == "training"
-    assert found.halves_overhead is None
 
 
 def test_half_estimates_for_training_share_the_fixed_part_of_a_launch() -> None:
@@ -87,19 +68,12 @@ def test_half_estimates_for_training_share_the_fixed_part_of_a_launch() -> None:
 def test_no_measurement_for_one_purpose_is_taken_for_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     spec, images = spec_with(), measurement()
-    training = images.model_copy(update={"purpose": Purpose.TRAINING, "view_s": 0.5})
-    cache.keep(spec, images)
-    assert cache.find(spec, Purpose.TRAINING) is None
-    cache.keep(spec, training)
-    assert cache.find(spec, Purpose.TRAINING) == training
-    assert cache.find(spec, Purpose.IMAGES) == images
-
-
-def test_the_guides_whose_time_belongs_to_a_sample_enter_the_digest_for_training_alone() -> None:
-    spec = spec_with()
-    more = spec.model_copy(update={"guides": spec.guides.model_copy(update={"light_samples": 9})})
-    assert cache.digest(more, Purpose.IMAGES) == cache.digest(spec, Purpose.IMAGES)
-    assert cache.digest(more, Purpose.TRAINING) != cache.digest(spec, Purpose.TRAINING)
+    training = images.model_copy(update={"purpose": Purpose.TRAINING})
+    measuring.keep(spec, images)
+    assert measuring.find(spec, Purpose.TRAINING) is None
+    measuring.keep(spec, training)
+    assert measuring.find(spec, Purpose.TRAINING) == training
+    assert measuring.find(spec, Purpose.IMAGES) == images
 
 
 UNUSUAL = [
@@ -138,9 +112,6 @@ def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int
     transport = {**asdict(now), "half_spp": int(rng.integers(1, 9))}
     half_s = next(r for r in rows if r.candidate == now).cost.time_s(transport["half_spp"])
     found = measurement(*rows).model_copy(update={"half_s": half_s})
-    if seed % 2:  # for training, where samples take more than their half-estimates
-        beside = dict(zip(("configuration_s", "view_s"), half_s * np.exp(rng.normal(0, 1, 2)), strict=True))
-        found = found.model_copy(update={"purpose": Purpose.TRAINING, **beside})
     first = plan_of(spec_with(**transport), found, cached=False)
     written = spec_with(**first.settings["transport"])
     again = plan_of(written, found, cached=True)
@@ -217,7 +188,6 @@ def test_savings_are_ratios_of_time_to_equal_error() -> None:
         "1.8 ± 0.1 times as fast to the same error as plain path tracing\n",
         "half_spp 4 costs about what 2 does with the spec's settings, light ratio 1 with 1 connection\n",
         "lights: 1 area\n",
-        "connections: all settings with them take longer to the same error here\n",
     ):
         assert sentence in text
 
@@ -226,9 +196,7 @@ def test_what_was_not_shown_is_not_claimed() -> None:
     rows = row(PLAIN, 0.1, 0.01, 0.01), row(LIGHT, 0.05, 0.01, 0.02, 0.3), row(JOINED, 0.0501, 0.01, 0.02, 0.9)
     text = text_of(plan_of(spec_with(connections=0), measurement(*rows), cached=False))
     assert "not distinguishable from it, within 2 standard errors: plain path tracing; light ratio 1 with 1" in text
-    assert "connections: no settings with them that fit the cost are shown to be worth a change" in text
     text = text_of(plan_of(spec_with(connections=0, light_ratio=0.0), measurement(*rows), cached=False))
-    assert "light paths: no settings with them that fit the cost are shown to be worth a change" in text
     for claim in ("is best:", "pays here", "reach the same error sooner"):
         assert claim not in text
 
@@ -268,7 +236,7 @@ def test_where_nothing_was_measured_nothing_is_said_of_time() -> None:
     text = text_of(plan_of(spec_with(), black, cached=False))
     assert "nothing was measured: every view is black" in text
     assert "none: nothing to compare with" in text
-    for claim in ("error × time", "both half-estimates", "costs about"):
+    for claim in ("error × time", "costs about"):
         assert claim not in text
 
 
@@ -297,7 +265,8 @@ def test_what_a_plan_decides_does_not_enter_its_digest_and_all_else_does() -> No
 
 
 @pytest.mark.parametrize(
-    ("where", "name"), [(cache, "_processor"), (cache.os, "cpu_count"), (cache, "versions"), (cache, "_revision")]
+    ("where", "name"),
+    [(measuring, "_processor"), (measuring.os, "cpu_count"), (measuring, "versions"), (measuring, "_revision")],
 )
 def test_what_was_measured_elsewhere_is_not_taken_for_what_was_measured_here(
     where: Any, name: str, monkeypatch: pytest.MonkeyPatch
@@ -311,10 +280,10 @@ def test_what_was_measured_elsewhere_is_not_taken_for_what_was_measured_here(
 def test_a_measurement_that_cannot_be_read_is_as_good_as_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     spec, found = spec_with(), measurement()
-    assert cache.find(spec, Purpose.IMAGES) is None
-    file = cache.keep(spec, found)
-    assert cache.find(spec, Purpose.IMAGES) == found
+    assert measuring.find(spec, Purpose.IMAGES) is None
+    file = measuring.keep(spec, found)
+    assert measuring.find(spec, Purpose.IMAGES) == found
     whole = file.read_bytes()
     for broken in (whole[:100], b"", b"\xff\xfe", b"{}", whole.replace(b'"views": 3', b'"views": "many"')):
         file.write_bytes(broken)
-        assert cache.find(spec, Purpose.IMAGES) is None
+        assert measuring.find(spec, Purpose.IMAGES) is None

@@ -87,7 +87,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     loaded = load_spec(spec, measured_again=True)
     backend.load(threads=1)
     from photonfarm.renderer.measure.free_space import measure
-    from photonfarm.renderer.strategy.output import spec_file
+    from photonfarm.renderer.tools import spec_file
 
     file = spec_file.writable(spec) if write else find_spec(spec)
     with WorkLog(partial(click.echo, err=True)) as work:
@@ -114,8 +114,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     type=click.Choice(["training", "images"]),
     default="training",
     show_default=True,
-    help="How noise counts: as the trainer's relative loss weighs it, with all that a sample takes, or relative to the "
-    "brightness of each pixel, with the time of images alone.",
+    help="How noise counts: as the trainer's relative loss weighs it, or relative to the brightness of each pixel.",
 )
 @click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
@@ -129,10 +128,10 @@ def scene_plan(spec: str, seconds: int, purpose: str, write: bool, again: bool, 
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.strategy.objective.purpose import Purpose
-    from photonfarm.renderer.strategy.output import spec_file
-    from photonfarm.renderer.strategy.output.printed import lines
+    from photonfarm.renderer.strategy.noise import Purpose
     from photonfarm.renderer.strategy.plan import make_plan
+    from photonfarm.renderer.strategy.printed import lines
+    from photonfarm.renderer.tools import spec_file
 
     file = spec_file.writable(spec) if write else find_spec(spec)
     log = partial(click.echo, err=True)

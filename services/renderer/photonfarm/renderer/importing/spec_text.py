@@ -13,7 +13,7 @@ import numpy as np
 from photonfarm.renderer.importing.changes import Changes, listed
 from photonfarm.renderer.importing.proposal.proposed import RADIANCE, Proposal, View
 from photonfarm.renderer.importing.proposal.surfaces import Box, Frame, Points
-from photonfarm.renderer.strategy.output.spec_file import put
+from photonfarm.renderer.tools.spec_file import put
 
 WIDTH = 110
 

@@ -14,22 +14,27 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+import drjit as dr
 import numpy as np
+from numpy.typing import NDArray
 
+from photonfarm.renderer.jobs.estimates import photons_of
+from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.strategy import cache
 from photonfarm.renderer.strategy.budget import Budget
-from photonfarm.renderer.strategy.objective.view_cost import configure, guide, look, timed
+from photonfarm.renderer.strategy.measurement import digest_here, file_of
 from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.records import BasePointCloud
+from photonfarm.shared.core.keys import view_key
+from photonfarm.shared.core.records import F32, BasePointCloud, Photons
 from photonfarm.shared.core.waiting import Log, Steps, WorkLog
 from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
-from photonfarm.shared.scene.modification import sample_modification
+from photonfarm.shared.scene.modification import Modification, sample_modification
+from photonfarm.shared.scene.pointcloud import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.shared.scene.view import View, sample_view
 
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
@@ -71,7 +76,7 @@ def find_or_measure(
     IncompleteError if not even one view fits.
     """
     of = "sample costs", spec.scene_id, spec.transport.model_dump_json(), str(frames)
-    whole, part = (cache.file_of("costs", cache.digest_here(*of, *also)) for also in ((), ("in few seconds",)))
+    whole, part = (file_of("costs", digest_here(*of, *also)) for also in ((), ("in few seconds",)))
     for file in [] if again else [whole, part] if math.isfinite(seconds) else [whole]:
         if (kept := _kept(file)) is not None:
             return kept
@@ -161,15 +166,43 @@ def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
     spec = scene.spec
     modification = sample_modification(spec, SEED, number)
     view = sample_view(spec, modification.key(spec.radiance_id), SEED, number, modification)
-    configuration_s, (points, photons) = timed(partial(configure, scene, cloud, modification))
-    view_s, _ = timed(partial(look, scene, view, points, photons))
-    guides_s, _ = timed(partial(guide, scene, view, cloud, modification))
+    configuration_s, (points, photons) = timed(partial(_configure, scene, cloud, modification))
+    view_s, _ = timed(partial(_look, scene, view, points, photons))
+    guides_s, _ = timed(partial(_guide, scene, view, cloud, modification))
     few = fewer_samples(spec)
     few_s, halves = timed(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
     many_s, _ = timed(partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few))
     pass_s, spp_s = line_through(2 * few, few_s, 2 * RANGE * few, many_s)
     noise = relative_variance(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
     return _Frame(configuration_s, view_s + guides_s, guides_s, pass_s, spp_s, noise)
+
+
+def _configure(
+    scene: LoadedScene, cloud: BasePointCloud, modification: Modification
+) -> tuple[tuple[F32, NDArray[np.bool_]], Photons | None]:
+    """Bring a scene into a configuration; returns its points, as `rebuild` does, and its photons."""
+    scene.apply(modification)
+    dr.sync_thread()  # pending evaluations would be charged to the view
+    return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.radiance_id))[0]
+
+
+def _look(scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None) -> None:
+    """Render the buffers of a view, and which points and photons it sees."""
+    scene.buffers(view)
+    visibility_of(scene, view, points, photons)
+
+
+def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: Modification) -> None:
+    """Render the guides of a view."""
+    key = view_key(modification.key(scene.spec.radiance_id), view.vector)
+    scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
+
+
+def timed(work: Callable[[], T]) -> tuple[float, T]:
+    """The processor seconds of some work, and its result."""
+    begun = backend.work_s()
+    result = work()
+    return backend.work_s() - begun, result
 
 
 def fewer_samples(spec: SceneSpec) -> int:

@@ -2,51 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import hashlib
+import os
+import platform
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
-from photonfarm.renderer.strategy import content, light_reach, pilot
-from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, Budget, affordable
-from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
-from photonfarm.renderer.strategy.comparison import MeasuredCandidate, RelativeErrors
-from photonfarm.renderer.strategy.image_cost import RANGE, ImageCost, time_images
-from photonfarm.renderer.strategy.objective import view_cost
-from photonfarm.renderer.strategy.objective.purpose import Purpose
-from photonfarm.renderer.strategy.objective.view_cost import FREE, ViewCost
-from photonfarm.renderer.strategy.pilot_scene import SEED, PilotScene
-from photonfarm.renderer.strategy.rounds import SCOUTS
+from photonfarm.renderer.jobs.render import versions
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
+from photonfarm.renderer.scene.sensor import AimedSensor
+from photonfarm.renderer.strategy import content, pilot
+from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, RANGE, Budget, ImageCost, affordable, time_images
+from photonfarm.renderer.strategy.candidates import DEFAULT, GRID, PLAIN, Candidate, RelativeErrors, Render, present
+from photonfarm.renderer.strategy.noise import Purpose
+from photonfarm.renderer.strategy.pilot import SCOUTS
+from photonfarm.shared.core.files import write_whole
+from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.core.models import Frozen
+from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.waiting import Log, WorkLog
-from photonfarm.shared.scene.spec import Film, SceneSpec
+from photonfarm.shared.scene.modification import Modification, rest, sample_modification
+from photonfarm.shared.scene.spec import Film, SceneSpec, Transport
+from photonfarm.shared.scene.view import View, sample_view
 
-GRID = (
-    PLAIN,
-    Candidate(4, 0.125, True),
-    Candidate(2, 0.25, light_samples=4),
-    Candidate(0, 1.0, True),
-    Candidate(8, 0.0625, True),
-    Candidate(4, 0.125, light_samples=2),
-    Candidate(2, 0.25),
-    Candidate(2, 0.25, True, light_samples=2),
-    Candidate(0, 16.0, True),
-    Candidate(4, 0.125),
-    Candidate(2, 0.25, light_samples=2),
-    Candidate(2, 0.25, True),
-    Candidate(1, 1.0),
-    *(Candidate(0, ratio) for ratio in (0.25, 1.0, 4.0, 16.0)),
-)
-"""The candidates of every pilot, except those that a scene's content makes pointless.
-
-Where there is no time for all, only the first are compared. So the most useful come first: guided light paths with
-connections for indirect light, several light samples for evenly lit rooms, guided splats alone for caustics.
-
-A light ratio above 1 helps only with light that splats alone find. Connections need few light paths, as several eye
-paths may be joined to the same one. Several light samples pay where direct light at the first eye vertex has much of
-the noise, as in evenly lit rooms.
-"""
+SEED = 0
+"""The master seed of a pilot's configurations, views and images."""
 
 FIRST_ROUND = 0.4
 """The largest share of the pilot's time for its first round: later rounds decide between the best."""
@@ -60,34 +47,20 @@ LIT, LEAST_LIT, REACH = 16, 2, 0.25
 """The number of configurations in which light paths are traced, to see which photons are worth storing: 16, or as many,
 at least 2, as a quarter of the time allows, with what went before."""
 
-BESIDE = 0.35
-"""The share of the time after which no more views are looked at beside their images, for training."""
-
 IMAGES = 400
 """The number of images that the time should pay for: about as many as ten settings need at least."""
 
+_DECIDED = ("connections", "light_ratio", "half_spp", "guided_light", "light_samples")
+"""The settings that a plan decides."""
+
 
 class CandidateRow(Frozen):
-    """One candidate: the values of `MeasuredCandidate`, and the two parts of its time."""
+    """One candidate, as the pilot measured it."""
 
-    connections: int
-    light_ratio: float
-    guided_light: bool = False
-    light_samples: int = 1
+    candidate: Candidate
     errors: RelativeErrors  # of images of `Measurement.spp`
     missed: float  # as in `MeasuredCandidate`
-    fixed_s: float  # as in `ImageCost`, of a half-estimate on the spec's film
-    sample_s: float
-
-    @property
-    def candidate(self) -> Candidate:
-        """The settings."""
-        return Candidate(self.connections, self.light_ratio, self.guided_light, self.light_samples)
-
-    @property
-    def cost(self) -> ImageCost:
-        """The CPU time of a half-estimate."""
-        return ImageCost(self.fixed_s, self.sample_s)
+    cost: ImageCost  # of a half-estimate on the spec's film
 
 
 class Measurement(Frozen):
@@ -97,46 +70,80 @@ class Measurement(Frozen):
     film: Film  # of the pilot
     spp: int
     half_s: float  # CPU time of a half-estimate that the spec accepted, at which the pilot compared
-    configuration_s: float  # this and the next one as in `ViewCost`; 0 for images
-    view_s: float
     views: int
-    max_depth: int
     modelled: tuple[str, ...]
     left_out: tuple[str, ...]
     rows: tuple[CandidateRow, ...]  # empty if every view is black
     shared: float  # as in `Choice`
-    filled: tuple[float, ...]  # this and the next two as in `light_reach`
-    near: tuple[tuple[float, ...], ...]
+    near: tuple[tuple[float, ...], ...]  # this and the next one as in `LightReach`
     power: tuple[tuple[float, ...], ...]
     asked_s: float  # CPU time that the pilot was given
     spent_s: float  # CPU time in all
-    compiling_s: float  # the part for loading, kernels, and the images that give the weights
-
-    @property
-    def view_cost(self) -> ViewCost:
-        """The CPU time of a sample beside its half-estimates."""
-        return ViewCost(self.configuration_s, self.view_s)
-
-    def knows(self, candidate: Candidate) -> bool:
-        """Whether a candidate was measured."""
-        return any(row.candidate == candidate for row in self.rows)
 
     def row(self, candidate: Candidate) -> CandidateRow:
         """The measurement of a candidate."""
         return next(row for row in self.rows if row.candidate == candidate)
 
 
-@dataclass(frozen=True, slots=True)
-class _Compared:
-    """The comparison of candidates: the film and samples per pixel of the images, and the pilot's results."""
+class PilotScene:
+    """A loaded scene that renders any candidate in any of its configurations. Not thread-safe, like `LoadedScene`."""
 
-    film: Film
-    spp: int
-    half_s: float
-    beside: ViewCost
-    choice: pilot.Choice
-    rows: tuple[CandidateRow, ...]
-    notes: tuple[str, ...]  # sentences on what there was no time for
+    def __init__(self, spec: SceneSpec, beside: Path | None, loaded: LoadedScene | None = None) -> None:
+        """Load the scene of a spec, on a film as small as the pilot requires, or take the loaded one."""
+        self.spec = spec
+        self.loaded = loaded or LoadedScene.load(spec, beside)
+        self._integrators: dict[Candidate, Any] = {}
+        self._applied: Modification | None = None
+        self._editing_s = 0.0
+
+    def on_film(self, film: Film) -> PilotScene:
+        """The same scene on another film, without loading it again; after that, only the new one may be used."""
+        if film == self.spec.film:
+            return self
+        self.loaded.apply(rest(self.spec))
+        spec = self.spec.model_copy(update={"film": film})
+        return PilotScene(spec, None, LoadedScene(spec, self.loaded.scene))
+
+    def clock(self) -> float:
+        """The seconds of `backend.work_s` without those of edits, which cost all candidates the same."""
+        return backend.work_s() - self._editing_s
+
+    def _draw(self, count: int) -> Iterator[tuple[Modification, View]]:
+        """Some configurations, and a view of each; always the same."""
+        for i in range(count):
+            modification = sample_modification(self.spec, SEED, i)
+            yield modification, sample_view(self.spec, modification.key(self.spec.radiance_id), SEED, i, modification)
+
+    def renders(self, count: int) -> list[Render]:
+        """A function for each of some configurations; it renders one view of it."""
+        return [partial(self._render, *drawn) for drawn in self._draw(count)]
+
+    def configurations(self, count: int) -> Iterator[Any]:
+        """The Mitsuba scene in each of the same configurations, in turn."""
+        for modification, _ in self._draw(count):
+            self._apply(modification)
+            yield self.loaded.scene
+
+    def camera(self) -> Any:
+        """Mitsuba's sensor, in any direction."""
+        return AimedSensor(self.spec).sensor
+
+    def _render(self, modification: Modification, view: View, candidate: Candidate, seed: int, spp: int) -> F32:
+        self._apply(modification)
+        if self.spec.groups:
+            self.loaded.forget_guides()  # a sample has them to learn, as with one view of each configuration
+        if candidate not in self._integrators:
+            settings = asdict(candidate)
+            self._integrators[candidate] = integrator_of(self.spec.transport.model_copy(update=settings))
+        return self.loaded.render(view, seed, self._integrators[candidate], spp)
+
+    def _apply(self, modification: Modification) -> None:
+        """Bring the scene into a configuration, unless that object is the one that it is in."""
+        if modification is not self._applied:
+            start = backend.work_s()
+            self.loaded.apply(modification)
+            self._applied = modification
+            self._editing_s += backend.work_s() - start
 
 
 def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: float, log: Log) -> Measurement:
@@ -148,92 +155,75 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
     budget = Budget(seconds)
     with WorkLog(log) as work_log:
         work_log.begin(f"loading {spec.name}", budget.words)
-        pilot_scene = PilotScene(spec, beside)
+        scene = PilotScene(spec, beside)
         budget.require(f"{spec.name}: loading it", 0.0, budget.spent_s)
-        found = content.read(pilot_scene.loaded.scene, pilot_scene.camera())
         work_log.begin(f"following the light of {spec.name}", budget.words)
-        loaded_s = budget.spent_s
-        reach = light_reach.measure(budget.within(REACH, pilot_scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
+        found, depth, loaded_s = (
+            content.read(scene.loaded.scene, scene.camera()),
+            spec.transport.max_depth,
+            budget.spent_s,
+        )
+        reach = content.light_reach(budget.within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
         edit_s = (budget.spent_s - loaded_s) / len(reach.near)
-        depth = spec.transport.max_depth
-        candidates, left_out = content.restrict(found, depth, reach.hit, GRID)
-        every = list(dict.fromkeys([*candidates, present(spec)]))
-        compared = _compare(pilot_scene, every, purpose, edit_s, budget, work_log)
-    spent = budget.spent_s
+        useful, left_out = content.restrict(found, depth, reach.hit, GRID)
+
+        now, half_spp = present(spec), spec.transport.half_spp
+        every = list(dict.fromkeys([*useful, now]))
+        work_log.begin("compiling and timing images", budget.words)
+        scene = _on_quick_film(scene, budget)
+        render, first = scene.renders(1)[0], {PLAIN, now} & set(every)
+        candidates = affordable(render, every, first, budget, edit_s, f"{spec.name}: comparing settings")
+        pixels, quick = spec.film.width * spec.film.height, scene.spec.film
+        timed = time_images(render, candidates, half_spp, TIMING * budget.left_s, scene.clock)
+        scale = pixels / (quick.width * quick.height)
+        costs = {c: ImageCost(cost.fixed_s, scale * cost.sample_s) for c, cost in timed.items()}
+        halves = {c: cost.of_a_half() if purpose is Purpose.TRAINING else cost for c, cost in costs.items()}
+        half_s = halves[now].time_s(half_spp)
+
+        left_s = max(budget.left_s - EDITS * LEAST_VIEWS * edit_s, 0.0)
+        film, spp, views = _pilot_film(spec, costs, left_s)
+        scene = scene.on_film(film)
+        what = f"{len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp"
+        work_log.begin(f"measuring {what}", budget.words)
+        pilot_spp = spp * film.width * film.height / pixels  # of the spec's film
+        choice = pilot.choose(
+            scene.renders(views),
+            candidates,
+            seconds=left_s,
+            spp=spp,
+            seed=SEED,
+            keep=[c for c in (DEFAULT, now) if c in candidates],
+            later={c: _images_s(halves[c], half_s, spp) / cost.time_s(pilot_spp) for c, cost in costs.items()},
+            weigh=purpose.weigh(spec.exposure),
+            clock=scene.clock,
+        )
+    fewer = f"settings compared: {len(candidates)} of {len(every)}, as --seconds {seconds:g} allows no more"
+    similar = RANGE * pilot_spp >= half_spp  # where an image's fixed part does not hide the time of its samples
+    corrections = {
+        m.candidate: m.time_s / costs[m.candidate].time_s(pilot_spp) if similar else 1.0 for m in choice.measured
+    }
     return Measurement(
         purpose=purpose,
-        film=compared.film,
-        spp=compared.spp,
-        half_s=compared.half_s,
-        configuration_s=compared.beside.configuration_s,
-        view_s=compared.beside.view_s,
-        views=compared.choice.views,
-        max_depth=depth,
-        modelled=(*content.sentences(found, depth), *compared.notes),
-        left_out=tuple(map(str, left_out)),
-        rows=compared.rows,
-        shared=compared.choice.shared,
-        filled=reach.filled,
+        film=film,
+        spp=spp,
+        half_s=half_s,
+        views=choice.views,
+        modelled=(*content.sentences(found, depth), *[fewer] * (len(candidates) < len(every))),
+        left_out=tuple(left_out),
+        rows=tuple(
+            CandidateRow(
+                candidate=measured.candidate,
+                errors=measured.errors,
+                missed=measured.missed,
+                cost=halves[measured.candidate].times(corrections[measured.candidate]),
+            )
+            for measured in choice.measured
+        ),
+        shared=choice.shared,
         near=reach.near,
         power=reach.power,
         asked_s=seconds,
-        spent_s=spent,
-        compiling_s=spent - compared.choice.spent_s + compared.choice.scouting_s,
-    )
-
-
-def _compare(
-    pilot_scene: PilotScene,
-    every: list[Candidate],
-    purpose: Purpose,
-    edit_s: float,
-    budget: Budget,
-    work_log: WorkLog,
-) -> _Compared:
-    spec = pilot_scene.spec
-    now, half_spp = present(spec), spec.transport.half_spp
-    beside = _beside(pilot_scene, budget, work_log) if purpose is Purpose.TRAINING else FREE
-    work_log.begin("compiling and timing images", budget.words)
-    quick = _on_quick_film(pilot_scene, budget)
-    what = f"{spec.name}: comparing settings"
-    candidates = affordable(quick.renders(1)[0], every, {PLAIN, now} & set(every) or {now}, budget, edit_s, what)
-    timed = time_images(quick.renders(1)[0], candidates, half_spp, TIMING * budget.left_s, quick.clock)
-    pixels = spec.film.width * spec.film.height
-    scale = pixels / (quick.spec.film.width * quick.spec.film.height)
-    costs = {candidate: ImageCost(cost.fixed_s, scale * cost.sample_s) for candidate, cost in timed.items()}
-    halves = {c: cost.of_a_half() if purpose is Purpose.TRAINING else cost for c, cost in costs.items()}
-    half_s = halves[now].time_s(half_spp)
-    left_s = max(budget.left_s - EDITS * LEAST_VIEWS * edit_s, 0.0)
-    film, spp, views = _pilot_film(spec, costs, left_s)
-    pilot_scene = quick.on_film(film)
-    work_log.begin(
-        f"measuring {len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp",
-        budget.words,
-    )
-    pilot_spp = spp * film.width * film.height / pixels  # of the spec's film
-    choice = pilot.choose(
-        pilot_scene.renders(views),
-        candidates,
-        seconds=left_s,
-        spp=spp,
-        seed=SEED,
-        keep=[c for c in (DEFAULT, now) if c in candidates],
-        later={c: _images(halves[c], half_s, beside, spp) / cost.time_s(pilot_spp) for c, cost in costs.items()},
-        weigh=purpose.weigh(spec.exposure),
-        clock=pilot_scene.clock,
-    )
-    rows = tuple(
-        _row(measured, costs[measured.candidate], halves[measured.candidate], pilot_spp, half_spp)
-        for measured in choice.measured
-    )
-    fewer = f"settings compared: {len(candidates)} of {len(every)}, as --seconds {budget.seconds:g} allows no more"
-    return _Compared(film, spp, half_s, beside, choice, rows, (fewer,) if len(candidates) < len(every) else ())
-
-
-def _beside(pilot_scene: PilotScene, budget: Budget, work_log: WorkLog) -> ViewCost:
-    work_log.begin("timing what a sample has beside its images", budget.words)
-    return view_cost.measure(
-        pilot_scene, budget.within(BESIDE, pilot_scene.draw(view_cost.MOST_VIEWS), view_cost.LEAST_VIEWS)
+        spent_s=budget.spent_s,
     )
 
 
@@ -257,19 +247,10 @@ def _halved(film: Film) -> Film:
     return Film(width=film.width // 16 * 8, height=film.height // 16 * 8)
 
 
-def present(spec: SceneSpec) -> Candidate:
-    """The present settings of a spec."""
-    t = spec.transport
-    return Candidate(t.connections, t.light_ratio, t.guided_light, t.light_samples)
-
-
-def _images(half: ImageCost, half_s: float, beside: ViewCost, spp: int) -> float:
-    """The CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel.
-
-    What else their samples take counts.
-    """
+def _images_s(half: ImageCost, half_s: float, spp: int) -> float:
+    """The CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel."""
     samples = half.bought(half_s)
-    return spp / samples * (half.time_s(samples) + beside.half_s)
+    return spp / samples * half.time_s(samples)
 
 
 def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: float) -> tuple[Film, int, int]:
@@ -289,24 +270,73 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 
 
-def _row(
-    measured: MeasuredCandidate, cost: ImageCost, half: ImageCost, pilot_spp: float, half_spp: int
-) -> CandidateRow:
-    """A candidate's row: the cost of its half-estimates, corrected by the times of the pilot's many images.
+# -------------------------------------------------------------------------------------- kept measurements
 
-    `cost` is that of an image as timed beforehand, and `half` that of a half-estimate which follows from it.
 
-    Images of the pilot with far fewer samples correct nothing, as their fixed part hides the time of their samples.
+def digest(spec: SceneSpec, purpose: Purpose) -> str:
+    """32 hexadecimal digits: the scene without what a plan decides, the purpose, the candidates, machine, and code.
+
+    So a plan that is written into its spec does not require another one.
     """
-    similar = RANGE * pilot_spp >= half_spp
-    correction = measured.time_s / cost.time_s(pilot_spp) if similar else 1.0
-    return CandidateRow(
-        connections=measured.candidate.connections,
-        light_ratio=measured.candidate.light_ratio,
-        guided_light=measured.candidate.guided_light,
-        light_samples=measured.candidate.light_samples,
-        errors=measured.errors,
-        missed=measured.missed,
-        fixed_s=correction * half.fixed_s,
-        sample_s=correction * half.sample_s,
-    )
+    default = Transport()
+    undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
+    scene = spec.model_copy(update={"transport": undecided})
+    known = scene.radiance_id, str(undecided.rr_depth), repr(spec.exposure), str(spec.points)
+    return digest_here("scene plan", *known, repr(GRID), purpose.value)
+
+
+def find(spec: SceneSpec, purpose: Purpose) -> Measurement | None:
+    """The kept measurement of this scene for a purpose; None if it is missing, unreadable or unusable."""
+    try:
+        return Measurement.model_validate_json(file_of("plans", digest(spec, purpose)).read_bytes())
+    except (OSError, ValidationError):
+        return None
+
+
+def keep(spec: SceneSpec, measurement: Measurement) -> Path:
+    """Keep a measurement; returns its file, which appears whole. Raises OSError if it cannot be written."""
+    file = file_of("plans", digest(spec, measurement.purpose))
+    write_whole(file, measurement.model_dump_json(indent=1) + "\n")
+    return file
+
+
+def digest_here(*parts: str) -> str:
+    """32 hexadecimal digits: the `parts` that identify a measurement, the machine, and all code that renders."""
+    return make_key(*parts, repr(_machine()), _revision()).hex()
+
+
+def _machine() -> tuple[object, ...]:
+    """All that times depend on beside the scene and the code: processor, cores, device, versions of the packages.
+
+    The number of threads is not among them, as a pilot has one.
+    """
+    device = backend.device()
+    return _processor(), os.cpu_count(), device.variant, device.name, sorted(versions().items())
+
+
+def _processor() -> str:
+    """The model's name, if the system states it; else its kind."""
+    try:
+        described = Path("/proc/cpuinfo").read_text()
+    except OSError:
+        described = ""
+    names = [line.partition(":")[2].strip() for line in described.splitlines() if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _revision() -> bytes:
+    """A digest of the renderer's source: a checkout has one version for many renderers.
+
+    It leaves out how configurations and views are drawn: that never changes, since the keys of stored samples depend on
+    it.
+    """
+    hashed = hashlib.sha256()
+    for file in sorted(Path(__file__).parents[1].rglob("*.py")):
+        hashed.update(file.read_bytes())
+    return hashed.digest()
+
+
+def file_of(folder: str, digest: str) -> Path:
+    """The file of a measurement; each kind has a folder of its own."""
+    root = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(root) / "photonfarm" / folder / f"{digest}.json"

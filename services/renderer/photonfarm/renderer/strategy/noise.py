@@ -17,8 +17,11 @@ chance explains (`missed`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from enum import StrEnum
+from functools import partial
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,6 +45,21 @@ RARE = 0.01
 """The share of the pixels that count as the worst: if their shared noise exceeds that of all others, it is rare."""
 
 Blocks = NDArray[np.float64]
+
+
+Weigh: TypeAlias = Callable[[Sequence[F32]], F32 | None]
+"""Images of a view → the factors on its pixels, (H, W, 3), whose squares weigh variance; None for a black view."""
+
+
+class Purpose(StrEnum):
+    """What samples are for."""
+
+    TRAINING = "training"  # targets of a network, weighed as the trainer's relative loss does
+    IMAGES = "images"  # images to look at, or references
+
+    def weigh(self, exposure: float) -> Weigh:
+        """How the noise of pixels counts, in a scene of this exposure."""
+        return partial(training_weights, exposure=exposure) if self is Purpose.TRAINING else view_weights
 
 
 def view_weights(images: Sequence[F32]) -> F32 | None:

@@ -7,13 +7,19 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from photonfarm.renderer.strategy import cache, light_reach
-from photonfarm.renderer.strategy.candidate import DEFAULT, PLAIN, Candidate
-from photonfarm.renderer.strategy.choices import CandidateAtCost, candidates_at_equal_cost, settled
-from photonfarm.renderer.strategy.comparison import Saving, saving
-from photonfarm.renderer.strategy.measurement import Measurement, measure, present
-from photonfarm.renderer.strategy.objective.purpose import Purpose
-from photonfarm.renderer.strategy.output.spec_file import SpecTables
+from photonfarm.renderer.strategy.candidates import (
+    DEFAULT,
+    PLAIN,
+    Candidate,
+    MeasuredCandidate,
+    Saving,
+    present,
+    saving,
+)
+from photonfarm.renderer.strategy.content import recommend_photons
+from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement, find, keep, measure
+from photonfarm.renderer.strategy.noise import Purpose
+from photonfarm.renderer.strategy.pilot import longest
 from photonfarm.shared.core.waiting import Log
 from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
 
@@ -23,6 +29,88 @@ SIMILAR = 4.0
 The choice depends on an image's fixed part, which matters if samples are few. A written plan keeps the time, up to a
 sample.
 """
+
+SpecTables = Mapping[str, Mapping[str, int | float]]
+"""The numbers of a spec, by table and key."""
+
+# -------------------------------------------------------------------------------------------- at equal cost
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateAtCost(MeasuredCandidate):
+    """A candidate with the samples per pixel that fit the time; `time_s` is the time of such a half-estimate."""
+
+    half_spp: int
+    half_error: float  # of such a half-estimate: relMSE, or relative loss (see `noise`)
+    fits: bool  # whether at least about one sample per pixel fits the time
+
+
+def candidates_at_equal_cost(measurement: Measurement, half_s: float) -> dict[Candidate, CandidateAtCost]:
+    """Every measured candidate, at the samples per pixel that fit `half_s`.
+
+    The variance of an image is that of one sample over the number of samples n. So error × time is the error of one
+    sample × time / n.
+    """
+    return {row.candidate: _at_cost(row, measurement, half_s) for row in measurement.rows}
+
+
+def _at_cost(row: CandidateRow, measurement: Measurement, half_s: float) -> CandidateAtCost:
+    plain, samples = measurement.row(PLAIN), row.cost.bought(half_s)
+    cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
+    relative = row.errors.relative_spread(plain.errors)
+    return CandidateAtCost(
+        candidate=row.candidate,
+        errors=row.errors,
+        missed=row.missed,
+        time_s=row.cost.time_s(samples),
+        relative_cost=cost,
+        spread=None if relative is None else cost * relative,
+        half_spp=samples,
+        half_error=row.errors.mean * measurement.spp / samples,
+        fits=row.cost.pays(half_s),
+    )
+
+
+def _per_sample_s(row: CandidateRow, half_s: float) -> float:
+    samples = row.cost.bought(half_s)
+    return row.cost.time_s(samples) / samples
+
+
+def best(candidates: Mapping[Candidate, CandidateAtCost]) -> CandidateAtCost:
+    """The candidate with the least error × time, among those that were measured longest."""
+    measured_longest = longest(list(candidates), lambda c: candidates[c].errors.images)
+    return min((candidates[c] for c in measured_longest), key=lambda at_cost: at_cost.relative_cost)
+
+
+def fitting(candidates: Mapping[Candidate, CandidateAtCost]) -> dict[Candidate, CandidateAtCost]:
+    """Those of which a sample per pixel fits the cost."""
+    return {c: at_cost for c, at_cost in candidates.items() if at_cost.fits}
+
+
+def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
+    """The settings to choose, given present ones: these, or others that are significantly better at the same cost.
+
+    Rounding to a whole number of samples changes the cost a little, and at the new cost another candidate may be better
+    still. So the search goes on until nothing is better, and a plan made for the result chooses it again. If the search
+    comes back to earlier settings, the present ones stay.
+    """
+    seen = [(candidate, half_spp)]
+    while (better := _better(measurement, *seen[-1])) is not None:
+        if better in seen:
+            return seen[0]
+        seen.append(better)
+    return seen[-1]
+
+
+def _better(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int] | None:
+    candidates = candidates_at_equal_cost(measurement, measurement.row(candidate).cost.time_s(half_spp))
+    found = best(fitting(candidates))
+    if found.candidate == candidate or not saving(found, over=candidates[candidate]).significant:
+        return None
+    return found.candidate, found.half_spp
+
+
+# -------------------------------------------------------------------------------------------------- the plan
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,8 +125,6 @@ class TransportPlan:
     photons: PhotonSpec
     photons_reason: str
     at_equal_cost: Mapping[Candidate, CandidateAtCost]  # all measured ones; empty if every view is black
-    halves_overhead: float | None  # share of time that two half-estimates add to one image of twice the samples; None
-    # if they were taken to share a launch, as for training
 
     @property
     def settings(self) -> SpecTables:
@@ -51,8 +137,8 @@ class TransportPlan:
             unusual["light_samples"] = planned.light_samples
         return {
             "transport": {
-                "connections": self.candidate.connections,
-                "light_ratio": self.candidate.light_ratio,
+                "connections": planned.connections,
+                "light_ratio": planned.light_ratio,
                 "half_spp": self.half_spp,
                 **unusual,
             },
@@ -82,26 +168,22 @@ class TransportPlan:
             "for": self.measurement.purpose.value,
             "settings": self.settings,
             "changes": self.changes,
-            "savings": [
-                {**asdict(s.over), "factor": s.factor, "spread": s.spread}
-                for s in self.savings
-            ],
-            "halves_overhead": self.halves_overhead,
+            "savings": [{**asdict(s.over), "factor": s.factor, "spread": s.spread} for s in self.savings],
             "cached": self.cached,
             "measurement": self.measurement.model_dump(mode="json"),
-        }  # fmt: skip
+        }
 
 
 def make_plan(
     spec: SceneSpec, beside: Path | None, purpose: Purpose, *, seconds: float, again: bool, log: Log
 ) -> TransportPlan:
     """The plan of a spec for a purpose; a cached measurement is used if it took `seconds`, unless `again` is set."""
-    found = None if again else cache.find(spec, purpose)
+    found = None if again else find(spec, purpose)
     if found is not None and found.asked_s >= seconds and _knows(found, spec):
         return plan_of(spec, found, cached=True)
     measurement = measure(spec, beside, purpose, seconds, log)
     try:
-        cache.keep(spec, measurement)
+        keep(spec, measurement)
     except OSError as error:
         log(f"the measurement could not be kept: {error}")
     return plan_of(spec, measurement, cached=False)
@@ -111,30 +193,17 @@ def _knows(measurement: Measurement, spec: SceneSpec) -> bool:
     """Whether the spec's settings were measured, and at about their cost; if all is black, none need be."""
     if not measurement.rows:
         return True
-    now = present(spec)
-    if not measurement.knows(now):
+    if not any(row.candidate == present(spec) for row in measurement.rows):
         return False
-    half_s = measurement.row(now).cost.time_s(spec.transport.half_spp)
+    half_s = measurement.row(present(spec)).cost.time_s(spec.transport.half_spp)
     return 1 / SIMILAR <= half_s / measurement.half_s <= SIMILAR
 
 
 def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> TransportPlan:
     """The plan that follows from a measurement for a spec as it is now; its settings are among those measured."""
-    photons, reason = light_reach.recommend(spec.photons, measurement.near, measurement.power, spec.transport.max_depth)
-    half_spp = spec.transport.half_spp
+    photons = recommend_photons(spec.photons, measurement.near, measurement.power, spec.transport.max_depth)
+    now, half_spp = present(spec), spec.transport.half_spp
     if not measurement.rows:
-        return TransportPlan(spec, measurement, cached, PLAIN, half_spp, photons, reason, {}, None)
-    now = present(spec)
-    candidate, samples = settled(measurement, now, half_spp)
-    cost, shared = measurement.row(candidate).cost, measurement.purpose is Purpose.TRAINING
-    return TransportPlan(
-        spec=spec,
-        measurement=measurement,
-        cached=cached,
-        candidate=candidate,
-        half_spp=samples,
-        photons=photons,
-        photons_reason=reason,
-        at_equal_cost=candidates_at_equal_cost(measurement, measurement.row(now).cost.time_s(half_spp)),
-        halves_overhead=None if shared else 2 * cost.time_s(samples) / cost.time_s(2 * samples) - 1,
-    )
+        return TransportPlan(spec, measurement, cached, PLAIN, half_spp, *photons, {})
+    at_equal_cost = candidates_at_equal_cost(measurement, measurement.row(now).cost.time_s(half_spp))
+    return TransportPlan(spec, measurement, cached, *settled(measurement, now, half_spp), *photons, at_equal_cost)

@@ -1,22 +1,83 @@
-"""How much sooner one candidate reaches the error of another, and the uncertainty of that factor."""
+"""The settings of `bdpt` that compete, and how much sooner one reaches the error of another."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.strategy.candidate import Candidate
 from photonfarm.shared.core.models import Frozen
+from photonfarm.shared.core.records import F32
+from photonfarm.shared.scene.spec import SceneSpec
 
 CLEAR = 2.0
 """The standard errors by which two candidates must differ to be distinguished."""
 
 WORTHWHILE = 0.05
-"""The least gain that changes settings: a changed scene has another id, so all its samples are rendered again."""
+"""The least gain that changes settings."""
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Candidate:
+    """Settings of `bdpt`; all candidates have the same mean."""
+
+    connections: int  # light vertices joined to each of the first two eye vertices
+    light_ratio: float  # light paths per eye path; 0: plain path tracing
+    guided_light: bool = False  # whether a guide says where light paths start and connections go
+    light_samples: int = 1  # of next event estimation at the first eye vertex
+
+    def __str__(self) -> str:
+        few = {0: "without connections", 1: "with 1 connection"}
+        joined = few.get(self.connections, f"with {self.connections} connections")
+        walks = f"light ratio {self.light_ratio:g} {joined}" if self.light_ratio else "plain path tracing"
+        samples = f", {self.light_samples} light samples" if self.light_samples > 1 else ""
+        return walks + ", guided light" * self.guided_light + samples
+
+
+PLAIN = Candidate(0, 0.0)
+"""Plain path tracing with next event estimation: the baseline of all comparisons."""
+
+DEFAULT = Candidate(1, 1.0)
+"""The settings of a spec that states none."""
+
+GRID = (
+    PLAIN,
+    Candidate(4, 0.125, True),
+    Candidate(2, 0.25, light_samples=4),
+    Candidate(0, 1.0, True),
+    Candidate(8, 0.0625, True),
+    Candidate(4, 0.125, light_samples=2),
+    Candidate(2, 0.25),
+    Candidate(2, 0.25, True, light_samples=2),
+    Candidate(0, 16.0, True),
+    Candidate(4, 0.125),
+    Candidate(2, 0.25, light_samples=2),
+    Candidate(2, 0.25, True),
+    Candidate(1, 1.0),
+    *(Candidate(0, ratio) for ratio in (0.25, 1.0, 4.0, 16.0)),
+)
+"""The candidates of every pilot, except those that a scene's content makes pointless.
+
+Where there is no time for all, only the first are compared. So the most useful come first: guided light paths with
+connections for indirect light, several light samples for evenly lit rooms, guided splats alone for caustics.
+
+A light ratio above 1 helps only with light that splats alone find. Connections need few light paths, as several eye
+paths may be joined to the same one. Several light samples pay where direct light at the first eye vertex has much of
+the noise, as in evenly lit rooms.
+"""
+
+Render: TypeAlias = Callable[[Candidate, int, int], F32]
+"""(candidate, seed, samples per pixel) → one unbiased noisy image (H, W, 3) of one configuration and view."""
+
+
+def present(spec: SceneSpec) -> Candidate:
+    """The present settings of a spec."""
+    t = spec.transport
+    return Candidate(t.connections, t.light_ratio, t.guided_light, t.light_samples)
 
 
 class RelativeErrors(Frozen):

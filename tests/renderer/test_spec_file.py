@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.renderer.strategy.output import spec_file
+from photonfarm.renderer.tools import spec_file
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.scene.spec_loading import find_spec, load_spec
 

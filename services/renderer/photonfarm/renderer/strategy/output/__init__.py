@@ -1,1 +1,0 @@
-"""The sampling plan as people read it, and as a spec holds it."""

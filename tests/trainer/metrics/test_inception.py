@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.shared.core.errors import StoreError
-from photonfarm.trainer.metrics import FIDInceptionV3, InceptionWeights, find_weights, inception_weights, load_inception
+from photonfarm.trainer.metrics import FIDInceptionV3, InceptionWeights, find_weights, load_inception
 from photonfarm.trainer.metrics.inception import network_input
 
 SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
@@ -39,18 +39,6 @@ def _random_archive(seed: int = 0) -> dict[str, Tensor]:
     return state
 
 
-def _hub_names() -> list[str]:
-    """Units of the hub's network in the order in which it registers them."""
-    a = "1x1 5x5_1 5x5_2 3x3dbl_1 3x3dbl_2 3x3dbl_3 _pool"
-    c = "1x1 7x7_1 7x7_2 7x7_3 7x7dbl_1 7x7dbl_2 7x7dbl_3 7x7dbl_4 7x7dbl_5 _pool"
-    e = "1x1 3x3_1 3x3_2a 3x3_2b 3x3dbl_1 3x3dbl_2 3x3dbl_3a 3x3dbl_3b _pool"
-    blocks = dict.fromkeys(("5b", "5c", "5d"), a) | {"6a": "3x3 3x3dbl_1 3x3dbl_2 3x3dbl_3"}
-    blocks |= dict.fromkeys(("6b", "6c", "6d", "6e"), c)
-    blocks |= {"7a": "3x3_1 3x3_2 7x7x3_1 7x7x3_2 7x7x3_3 7x7x3_4", "7b": e, "7c": e}
-    stem = [f"Conv2d_{name}" for name in ("1a_3x3", "2a_3x3", "2b_3x3", "3b_1x1", "4a_3x3")]
-    return stem + [f"Mixed_{block}.branch{branch}" for block, all_ in blocks.items() for branch in all_.split()]
-
-
 def _saved(state: dict[str, Tensor], path: Path) -> Path:
     torch.save(state, path)
     return path
@@ -63,16 +51,6 @@ def _images(count: int, seed: int = 0) -> Tensor:
 @pytest.fixture(scope="module")
 def random_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return _saved(_random_archive(), tmp_path_factory.mktemp("inception") / "random.pt")
-
-
-@pytest.fixture
-def nothing_installed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """The folder of torch hub's cache; neither the package nor a file in that cache is there."""
-    monkeypatch.setattr(sys, "path", [])
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    cache = tmp_path / "hub" / "checkpoints"
-    cache.mkdir(parents=True)
-    return cache
 
 
 # ----------------------------------------------------------------------------------------------- the published network
@@ -179,38 +157,10 @@ def test_a_given_file_that_is_not_there_is_refused() -> None:
         find_weights(Path("gone.pt"))
 
 
-def test_without_weights_there_is_no_network(nothing_installed: Path) -> None:
+def test_without_weights_there_is_no_network(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [])
     assert find_weights() is None
     assert load_inception() is None
-
-
-def test_a_file_in_torch_hubs_cache_with_another_hash_is_refused(nothing_installed: Path) -> None:
-    _saved({}, nothing_installed / "pt_inception-2015-12-05-6726825d.pth")
-    with pytest.raises(StoreError, match="6726825d"):
-        find_weights()
-
-
-def test_the_file_in_torch_hubs_cache_is_found_by_its_hash(
-    nothing_installed: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    file = _saved({}, nothing_installed / "pt_inception-2015-12-05-6726825d.pth")
-    sha256 = hashlib.sha256(file.read_bytes()).hexdigest()
-    monkeypatch.setattr(inception_weights, "HUB_SHA256_START", sha256[:8])
-    assert find_weights() == (file, InceptionWeights("torch hub's cache", sha256, published=True))
-
-
-def test_torch_hubs_names_give_the_same_network(random_file: Path, tmp_path: Path) -> None:
-    archive, hub = _random_archive(), {}
-    for unit, name in zip(_units(), _hub_names(), strict=True):
-        weight, beta, mean, var = (archive[f"net.layers.{unit}.{part}"] for part in ("weight", "beta", "mean", "var"))
-        hub |= {f"{name}.conv.weight": weight, f"{name}.bn.weight": torch.ones_like(beta), f"{name}.bn.bias": beta}
-        hub |= {f"{name}.bn.running_mean": mean, f"{name}.bn.running_var": var}
-    hub["fc.weight"] = torch.zeros(1008, 2048)
-    of_hub, of_archive = load_inception(_saved(hub, tmp_path / "hub.pth")), load_inception(random_file)
-    assert of_hub is not None
-    assert of_archive is not None
-    expected = of_archive.network.state_dict()
-    assert all(torch.equal(tensor, expected[name]) for name, tensor in of_hub.network.state_dict().items())
 
 
 def test_a_file_of_another_network_is_refused(tmp_path: Path) -> None:
@@ -218,7 +168,7 @@ def test_a_file_of_another_network_is_refused(tmp_path: Path) -> None:
     state["net.layers.mixed_3.tower.conv_1.beta"] = torch.zeros(5)
     for saved, named in (
         (state, r"mixed_3\.tower\.conv_1\.beta"),
-        ({"weight": torch.zeros(1)}, r"Conv2d_1a_3x3\.conv\.weight"),
+        ({"weight": torch.zeros(1)}, r"net\.layers\.conv\.weight"),
     ):
         with pytest.raises(StoreError, match=named):
             load_inception(_saved(saved, tmp_path / "other.pt"))

@@ -116,7 +116,7 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 @click.option("--grid", is_flag=True, help="Search optimisers, rates and decays by short runs on a complete store.")
 @click.option("--summary", is_flag=True, help="Only print the network's parameters and work, part by part.")
 @click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
-@click.option("--dry-run", is_flag=True, help="Only estimate memory, and time here and on some cards, by a few steps "
+@click.option("--dry-run", is_flag=True, help="Only estimate work, memory and time here, by a few steps "
               "on made-up samples; write nothing.")  # fmt: skip
 @click.option("--film", type=click.IntRange(8), metavar="PIXELS",
               help="With --dry-run: the side of images, instead of the spec's.")  # fmt: skip

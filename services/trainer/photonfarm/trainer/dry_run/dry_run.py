@@ -11,7 +11,6 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch, size_bytes
-from photonfarm.trainer.dry_run.cards import CardHours, on_cards
 from photonfarm.trainer.dry_run.live_memory import LiveMemory
 from photonfarm.trainer.dry_run.made_up import MadeUpScene
 from photonfarm.trainer.runs.device import described, usable_device
@@ -62,7 +61,6 @@ class DryRun:
     work: Work
     state_bytes: int  # weights, gradients, the optimiser's memory, the average
     timed: Timed
-    cards: list[CardHours]
 
     @property
     def step_flops(self) -> int:
@@ -95,7 +93,6 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
     with compiling(settings.compile):
         took = timed(learner, scene, settings, work)
     parameters = sum(weight.numel() for weight in learner.network.parameters())
-    needed = settings.batch * (work.activation_bytes + work.sample_bytes) + state
     return DryRun(
         scene=spec.name,
         architecture=settings.network.architecture,
@@ -108,7 +105,6 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
         work=work,
         state_bytes=state,
         timed=took,
-        cards=on_cards(float(work.flops) * settings.batch * settings.max_steps, needed),
     )
 
 

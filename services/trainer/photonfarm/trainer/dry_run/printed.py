@@ -6,14 +6,13 @@ from dataclasses import asdict
 from typing import Any
 
 from photonfarm.shared.core.waiting import in_words
-from photonfarm.trainer.dry_run.cards import UTILISATION
 from photonfarm.trainer.dry_run.dry_run import DryRun
 
 
 def document(found: DryRun) -> dict[str, Any]:
-    """The estimate for programs: its fields, what follows from them, and what is assumed."""
+    """The estimate for programs: its fields, and what follows from them."""
     derived = {"step_flops": found.step_flops, "memory_bytes": found.memory_bytes, "seconds": found.seconds}
-    return {**asdict(found), **derived, "assumed_utilisation": dict(UTILISATION)}
+    return {**asdict(found), **derived}
 
 
 def text(found: DryRun) -> str:
@@ -39,28 +38,8 @@ def text(found: DryRun) -> str:
         f"{timed.device}",
         f"             (median of {timed.steps} steps of {timed.samples}{of}, on made-up samples; without reading, "
         "waiting, validation)",
-        "",
-        *_cards(found),
-        "",
-        "The hours of a card are work over its peak rate by the data sheet times an assumed share: "
-        + ", ".join(f"{share:g} in {name}" for name, share in UTILISATION.items())
-        + ". No card was measured; steps of a few milliseconds take longer, as they do not fill a card.",
     ]
     return "\n".join(lines)
-
-
-def _cards(found: DryRun) -> list[str]:
-    """A line for each card."""
-    head = f"{'GPU-hours':<13}" + "".join(f"{name:>10}" for name in UTILISATION)
-    lines = []
-    for card in found.cards:
-        hours = "".join(f"{_hours(card.hours[name]):>10}" for name in UTILISATION)
-        lines.append(f"{card.card:<13}{hours}" + ("" if card.fits else f"   {card.memory_gb:g} GB are too few"))
-    return [head, *lines]
-
-
-def _hours(hours: float) -> str:
-    return f"{hours:,.1f}" if hours >= 0.1 else "< 0.1"
 
 
 def _size(size: float) -> str:

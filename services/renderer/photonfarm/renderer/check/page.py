@@ -20,7 +20,6 @@ from photonfarm.shared.core.errors import store_errors
 from photonfarm.shared.core.pages import rendered
 from photonfarm.shared.core.pictures import Picture, display_values
 from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.scene.spec_lines import SpecLines
 
 TEMPLATE = Path(__file__).with_name("check.html.j2")
@@ -98,19 +97,11 @@ def _camera_facts(check: SceneCheck) -> list[Fact]:
 
 
 def _light_facts(check: SceneCheck) -> list[Fact]:
-    spec, samples = check.spec, check.measured.samples
-    mean = float(samples.images.display_means(spec.exposure).mean())
-    better = samples.images.exposure(TARGET)
-    spp, costs = 2 * spec.transport.half_spp, samples.costs
-    seconds = costs.seconds(spp, configurations=1, views=1, samples=1)
-    noise = (costs.relative_variance / spp) ** 0.5
-    return [
-        Fact("display mean", f"{mean:.2f}", "" if better is None else f"{TARGET:g} at exposure {better:.2g}",
-             not MEANS[0] <= mean <= MEANS[1]),
-        Fact("noise of a pixel", percent(noise), f"root mean square at {spp} samples per pixel"),
-        Fact("cost of a sample", f"{seconds:.2g} s", "of one core, without guides; roughly"),
-        Fact("1000 samples", in_words(1000 * seconds), "of one core, without guides"),
-    ]  # fmt: skip
+    images = check.measured.samples.images
+    mean = float(images.display_means(check.spec.exposure).mean())
+    better = images.exposure(TARGET)
+    note = "" if better is None else f"{TARGET:g} at exposure {better:.2g}"
+    return [Fact("display mean", f"{mean:.2f}", note, not MEANS[0] <= mean <= MEANS[1])]
 
 
 def _brightness(halves: F32, exposure: float) -> NDArray[Any]:

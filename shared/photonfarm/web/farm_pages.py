@@ -113,10 +113,12 @@ def _curves(run: RunFolder) -> dict[str, Any]:
         for r in records
         if r.get("kind") == "validation"
     ]
+    trained = [r for r in records if r.get("kind") == "train" and isinstance(r.get("loss"), float)]
+    losses = [[r["step"], _seconds(r), r["loss"]] for r in trained]
     return {
         "run": run.folder.name,
         "validations": _thinned(validations),
-        "losses": _thinned([[r["step"], _seconds(r), r["loss"]] for r in records if _has_loss(r)]),
+        "losses": _thinned(losses),
         "steps": steps,
         **_shown(run.folder, steps),
     }
@@ -146,10 +148,6 @@ def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:
 def _seconds(record: dict[str, Any]) -> float:
     """How long a run had been at it when it wrote a record."""
     return float(sum(record.get("seconds", {}).values()))
-
-
-def _has_loss(record: dict[str, Any]) -> bool:
-    return record.get("kind") == "train" and isinstance(record.get("loss"), float)
 
 
 def _thinned(points: list[list[Any]]) -> list[list[Any]]:

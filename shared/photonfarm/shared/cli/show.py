@@ -5,38 +5,19 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import click
 from rich import markup
 from rich.console import Console
 from rich.table import Table
 
+from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.scene.spec import SceneSpec, shape_ids
 
 if TYPE_CHECKING:
     from photonfarm.shared.farm.dry_run import DryRun
     from photonfarm.shared.farm.submission import Submission
-
-
-class CheckResult(Protocol):
-    """The result of one check of `photonfarm doctor`."""
-
-    @property
-    def name(self) -> str:
-        """What was checked."""
-
-    @property
-    def works(self) -> bool:
-        """Whether it works."""
-
-    @property
-    def detail(self) -> str:
-        """What was found, or what to do."""
-
-    @property
-    def exit_code(self) -> int:
-        """The exit code of the command if this check fails; 0 if the check is optional."""
 
 
 def print_json(document: Any) -> None:
@@ -153,7 +134,7 @@ def _cost(result: DryRun) -> None:
         click.echo(size)
         return
     cores = "1 core" if result.cores == 1 else f"{result.cores} cores"
-    click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {_duration(result.wall_s)} on the {cores} here")
+    click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {in_words(result.wall_s)} on the {cores} here")
     if result.planned:
         click.echo(_suggestion(result))
 
@@ -176,27 +157,3 @@ def _suggestion(result: DryRun) -> str:
 
 def _amount(seconds: float) -> str:
     return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.1f}"
-
-
-def _duration(seconds: float) -> str:
-    if seconds < 120:
-        return f"{_amount(seconds)} s"
-    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:,.1f} h"
-
-
-# --------------------------------------------------------------------------------------------------------------- doctor
-
-
-def findings(found: Iterable[CheckResult], as_json: bool) -> int:
-    """Print the results of checks as they come; returns the exit code of the first required check that failed, or 0."""
-    console, code, seen = Console(soft_wrap=True), 0, []
-    for finding in found:
-        if not finding.works and not code:
-            code = finding.exit_code
-        seen.append(finding)
-        if not as_json:
-            mark = "[green]ok[/]  " if finding.works else ("[red]FAIL[/]" if finding.exit_code else "[yellow]none[/]")
-            console.print(f"{mark} [bold]{finding.name}[/]: {markup.escape(finding.detail)}", highlight=False)
-    if as_json:
-        print_json([{"name": f.name, "works": f.works, "detail": f.detail} for f in seen])
-    return code

@@ -6,10 +6,10 @@ T timed frames, K sizes of image.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,15 +18,6 @@ from photonfarm.shared.core.archives import stored_arrays, write_arrays
 
 PARTS = ("edit_s", "buffers_s", "guides_s", "points_s", "photons_s", "photons_seen_s")
 """What a network's frame needs besides samples, in the order in which it is made."""
-
-_ARRAYS = {
-    "rows": ("N", np.int64),
-    "surface": ("NHW", np.uint8),
-    **dict.fromkeys(PARTS, ("T", np.float64)),
-    "kept": ("K", np.int64),
-    "render_s": ("KT", np.float64),
-}
-"""Shape and type of each array."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,10 +49,7 @@ class Surface(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameCosts:
-    """Wall-clock seconds on one core for each timed frame, and the first surfaces of some rows.
-
-    Raises ValueError for arrays of other shapes or types than these, empty ones, and kinds that are not a `Surface`.
-    """
+    """Wall-clock seconds on one core for each timed frame, and the first surfaces of some rows."""
 
     scene_id: str
     rows: NDArray[np.int64]  # (N,) of the store
@@ -74,19 +62,6 @@ class FrameCosts:
     photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees; 0 likewise
     kept: NDArray[np.int64]  # (K,) k: an image of about 1/k of the pixels
     render_s: NDArray[np.float64]  # (K, T) one half-estimate of it: `half_spp` samples of each of these pixels
-
-    def __post_init__(self) -> None:
-        sizes: dict[str, int] = {}
-        for name, (letters, dtype) in _ARRAYS.items():
-            array = getattr(self, name)
-            fits = array.dtype == dtype and array.ndim == len(letters)
-            if not fits or any(sizes.setdefault(s, n) != n for s, n in zip(letters, array.shape, strict=True)):
-                wanted = f"{np.dtype(dtype)} ({', '.join(letters)})"
-                raise ValueError(f"{name}: is {array.dtype} {array.shape}; {wanted} is required, with {sizes}")
-        if empty := [letter for letter, size in sizes.items() if not size]:
-            raise ValueError(f"{', '.join(empty)} is 0; at least 1 of each is required")
-        if self.surface.max() > max(Surface):
-            raise ValueError(f"surface: holds {self.surface.max()}; kinds up to {max(Surface)} are allowed")
 
     def parts(self) -> dict[str, Seconds]:
         """The times of each part of a frame, by its name in `PARTS`, over the timed frames."""
@@ -106,11 +81,12 @@ class FrameCosts:
 
     def write(self, file: Path) -> None:
         """Store them as a NumPy archive, whole or not at all; raises StoreError if the disk refuses."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        write_arrays(file, {"scene_id": np.array(self.scene_id), **arrays}, "frame costs")
+        arrays = {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)}
+        write_arrays(file, arrays, "frame costs")
 
     @classmethod
     def read(cls, file: Path) -> Self:
         """Read what `write` stored; raises StoreError for anything else."""
         with stored_arrays(file, "frame costs", "measure-frames") as stored:
-            return cls(str(stored["scene_id"]), **{name: stored[name] for name in _ARRAYS})
+            arrays: dict[str, Any] = {each.name: stored[each.name] for each in fields(cls)}
+            return cls(**{**arrays, "scene_id": str(arrays["scene_id"])})

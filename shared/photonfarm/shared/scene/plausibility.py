@@ -9,9 +9,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonfarm.shared.scene.spec import Box, Movable, SceneSpec
+from photonfarm.shared.scene.spec import Box, SceneSpec
 from photonfarm.shared.scene.spec_lines import SpecLines
 from photonfarm.shared.scene.spec_loading import NamedSpec
 
@@ -63,7 +62,8 @@ def _of_view(spec: SceneSpec) -> Iterator[Doubt]:
             f"fov_deg = {view.fov_deg:g} stretches what is near the image's edges; 40 to 90 degrees are usual in rooms",
         )
     gap = _gap(view.origin, view.look_at)
-    scale = max(_size(view.origin), _size(view.look_at), _spread(np.array([group.at for group in spec.groups])))
+    spread = float(np.linalg.norm(np.ptp([group.at for group in spec.groups], axis=0))) if spec.groups else 0.0
+    scale = max(_size(view.origin), _size(view.look_at), spread)
     if gap >= view.far:
         yield Doubt(
             "view.far",
@@ -105,7 +105,7 @@ def _of_groups(spec: SceneSpec) -> Iterator[Doubt]:
     for index, group in enumerate(spec.groups):
         key = group_key(spec, index)
         size, seen = _size(group.box), _size(around)
-        off = _distance(group)
+        off = _gap(Box(min=group.at, max=group.at), group.box)
         if size > TOO_LARGE * seen:
             yield Doubt(
                 f"{key}.box",
@@ -135,11 +135,3 @@ def _gap(one: Box, other: Box) -> float:
     """The distance between two boxes; 0 if they meet."""
     apart = np.maximum(np.maximum(one.low - other.high, other.low - one.high), 0)
     return float(np.linalg.norm(apart))
-
-
-def _distance(group: Movable) -> float:
-    return _gap(Box(min=group.at, max=group.at), group.box)
-
-
-def _spread(points: NDArray[np.float64]) -> float:
-    return float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) else 0.0

@@ -19,7 +19,6 @@ from photonfarm.renderer.measure.exposure import TARGET
 from photonfarm.shared.core.errors import store_errors
 from photonfarm.shared.core.pages import rendered
 from photonfarm.shared.core.pictures import Picture, display_values
-from photonfarm.shared.core.records import F32
 from photonfarm.shared.scene.spec_lines import SpecLines
 
 TEMPLATE = Path(__file__).with_name("check.html.j2")
@@ -64,6 +63,7 @@ def page(check: SceneCheck, lines: SpecLines) -> str:
         (each, [g.name for g, there in zip(spec.groups, each.modification.present, strict=True) if not there])
         for each in samples.shown
     ]
+    exposed = spec.exposure * np.nan_to_num(samples.images.halves.mean(axis=1))
     return rendered(
         TEMPLATE,
         title=f"photonfarm: {spec.name}",
@@ -76,7 +76,7 @@ def page(check: SceneCheck, lines: SpecLines) -> str:
         cameras=_camera_facts(check),
         light=_light_facts(check),
         seen=_bars(samples.cameras.seen, (0.0, float(max(samples.cameras.seen.max(), 1e-6)))),
-        brightness=_bars(_brightness(samples.images.halves, spec.exposure), (0.0, 1.0)),
+        brightness=_bars(display_values(exposed.astype(np.float32)).mean(axis=-1), (0.0, 1.0)),
         most_seen=f"{100 * float(samples.cameras.seen.max()):.0f} %",
         sections=_sections(check),
         limits={"outside": OUTSIDE, "cut": CUT_AT_ALL},
@@ -102,11 +102,6 @@ def _light_facts(check: SceneCheck) -> list[Fact]:
     better = images.exposure(TARGET)
     note = "" if better is None else f"{TARGET:g} at exposure {better:.2g}"
     return [Fact("display mean", f"{mean:.2f}", note, not MEANS[0] <= mean <= MEANS[1])]
-
-
-def _brightness(halves: F32, exposure: float) -> NDArray[Any]:
-    """What a display is given for each pixel of all pictures, mean over channels."""
-    return display_values((exposure * np.nan_to_num(halves.mean(axis=1))).astype(np.float32)).mean(axis=-1)
 
 
 def _bars(values: NDArray[Any], ends: tuple[float, float]) -> list[float]:

@@ -22,10 +22,21 @@ from photonfarm.shared.core.processes import ended_by_ctrl_c
 @json_option
 def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Try each part on this machine, and say what to do about what does not work."""
+    from rich import markup
+    from rich.console import Console
+
     from photonfarm.renderer.tools.doctor import examine
     from photonfarm.shared.cli import show
 
-    sys.exit(show.findings(examine(store, redis_url, partial(click.echo, err=True)), as_json))
+    console, found = Console(soft_wrap=True), []
+    for check in examine(store, redis_url, partial(click.echo, err=True)):
+        found.append(check)
+        if not as_json:
+            mark = "[green]ok[/]  " if check.works else ("[red]FAIL[/]" if check.exit_code else "[yellow]none[/]")
+            console.print(f"{mark} [bold]{check.name}[/]: {markup.escape(check.detail)}", highlight=False)
+    if as_json:
+        show.print_json([{"name": check.name, "works": check.works, "detail": check.detail} for check in found])
+    sys.exit(next((check.exit_code for check in found if not check.works and check.exit_code), 0))
 
 
 @click.command()

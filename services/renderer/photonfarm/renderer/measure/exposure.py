@@ -132,7 +132,7 @@ def propose(
     the target.
     """
     small = shrunk(spec, SIDE).model_copy(update={"exposure": 1.0})  # with the same views whatever it is
-    spp = _half_spp(small.film)
+    spp = PATHS // (small.film.width * small.film.height)
     scene, steps = LoadedScene.load(small, beside), Steps(frames, slow=1)
     size = f"{small.film.width} × {small.film.height}"
     work.begin(f"rendering {frames} views of {spec.name}, {size}, 2 × {spp} spp", steps.words)
@@ -174,10 +174,6 @@ def shrunk(spec: SceneSpec, side: int) -> SceneSpec:
     width, height = (max(8, pixels // times // 8 * 8) for pixels in (spec.film.width, spec.film.height))
     photons = spec.photons.model_copy(update={"paths": 0})
     return spec.model_copy(update={"film": Film(width=width, height=height), "photons": photons})
-
-
-def _half_spp(film: Film) -> int:
-    return PATHS // (film.width * film.height)
 
 
 def _rendered(scene: LoadedScene, frames: int, spp: int, steps: Steps) -> Iterator[F32]:

@@ -35,7 +35,9 @@ def comparison(evaluation: Evaluation) -> Picture:
     height, width = cells[0][0].shape[:2]
     font = ImageFont.load_default(TEXT)
     letters = int(width // font.getlength("n"))
-    heads = [textwrap.wrap(head, letters) for head in (_of_targets(evaluation.shown), *_names(evaluation))]
+    heads = [
+        textwrap.wrap(head, letters) for head in [_of_targets(evaluation.shown), *(row.name for row in evaluation.rows)]
+    ]
     top = max(map(len, heads)) * LINE + GAP
     step = height + LINE + GAP  # each row has its own line of text
     sheet = Image.new("RGB", (len(heads) * (width + GAP) - GAP, top + len(cells) * step - GAP), "white")
@@ -56,10 +58,6 @@ def _cells(evaluation: Evaluation) -> list[list[Picture]]:
         images = [row.shown.get(target.row, np.zeros_like(target.image)) for row in evaluation.rows]
         found.append([enlarged(image) for image in (target.image, *images)])
     return found
-
-
-def _names(evaluation: Evaluation) -> list[str]:
-    return [row.name for row in evaluation.rows]
 
 
 def _of_targets(shown: tuple[Target, ...]) -> str:

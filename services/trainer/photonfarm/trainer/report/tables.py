@@ -44,6 +44,7 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
     card, about = contents.card, contents.card.document()
     spec, status = card.spec, card.status
     t, owed = spec.transport, spec.credits
+    versions = ", ".join(f"{package} {' and '.join(found)}" for package, found in card.versions.items())
     return [
         ("scene", f"{spec.name}, {about['source']}, id {spec.scene_id}"),
         ("credits", "not said" if owed is None else f"“{owed.title}” by {owed.author}, {owed.licence}"),
@@ -60,7 +61,7 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
         ("seeds", _seeds(contents)),
         ("cost", _cost(contents)),
         ("size", f"{status.size_bytes / 1e6:.1f} MB"),
-        ("rendered by", f"{counted(card.workers, 'worker')} with " + _versions(card.versions)),
+        ("rendered by", f"{counted(card.workers, 'worker')} with {versions}"),
         ("times taken on", contents.machine.stated),
         ("GPU", _gpu(contents)),
     ]  # fmt: skip
@@ -105,10 +106,6 @@ def _seeds(contents: ReportContents) -> str:
             asked.append(f"plan {number}: {'+' if request['adds'] else ''}{request['spp']} samples per pixel{where}")
     trained = sorted({str(story.run.settings.seed) for story in contents.stories})
     return f"{'; '.join(asked)}; training: {', '.join(trained)}"
-
-
-def _versions(versions: dict[str, list[str]]) -> str:
-    return ", ".join(f"{package} {' and '.join(found)}" for package, found in versions.items())
 
 
 # -------------------------------------------------------------------------------------------------- the paper's columns

@@ -103,17 +103,13 @@ def scaled(factor: float) -> Callable[[int], SceneDict]:
 # ------------------------------------------------ What is refused ------------------------------------------------
 
 
-def _with_filter(size: int) -> SceneDict:
-    return seen_by(film={"rfilter": {"type": "gaussian"}})(size)
-
-
 def _fog(size: int) -> SceneDict:
     fog = {"type": "sphere", "bsdf": {"type": "null"}, "interior": {"type": "homogeneous"}}
     return {**hard_scenes.cove(size), "fog": fog}
 
 
 REFUSALS = (
-    Refusal(30, "gaussian-filter", _with_filter, "only the box filter is allowed"),
+    Refusal(30, "gaussian-filter", seen_by(film={"rfilter": {"type": "gaussian"}}), "only the box filter is allowed"),
     Refusal(None, "orthographic-camera", orthographic, "light paths can be joined to 'perspective' and 'thinlens'",
             allowed=EYE_ALONE[0]),
     Refusal(None, "medium", _fog, "bounds a participating medium"),

@@ -151,6 +151,11 @@ class ImageCost:
         """The samples per pixel that a time pays for, as a whole number of at least 1."""
         return int(np.clip(round((seconds - self.fixed_s) / self.sample_s), 1, MOST_SAMPLES))
 
+    def per_sample_s(self, seconds: float) -> float:
+        """The time of each of the samples per pixel that a time pays for."""
+        samples = self.bought(seconds)
+        return self.time_s(samples) / samples
+
 
 def time_images(
     render: Render, candidates: Sequence[Candidate], half_spp: int, seconds: float, clock: Callable[[], float]

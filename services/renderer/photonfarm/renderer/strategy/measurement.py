@@ -158,11 +158,8 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         scene = PilotScene(spec, beside)
         budget.require(f"{spec.name}: loading it", 0.0, budget.spent_s)
         work_log.begin(f"following the light of {spec.name}", budget.words)
-        found, depth, loaded_s = (
-            content.read(scene.loaded.scene, scene.camera()),
-            spec.transport.max_depth,
-            budget.spent_s,
-        )
+        found, depth = content.read(scene.loaded.scene, scene.camera()), spec.transport.max_depth
+        loaded_s = budget.spent_s
         reach = content.light_reach(budget.within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
         edit_s = (budget.spent_s - loaded_s) / len(reach.near)
         useful, left_out = content.restrict(found, depth, reach.hit, GRID)
@@ -193,7 +190,7 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
             spp=spp,
             seed=SEED,
             keep=[c for c in (DEFAULT, now) if c in candidates],
-            later={c: _images_s(halves[c], half_s, spp) / cost.time_s(pilot_spp) for c, cost in costs.items()},
+            later={c: spp * halves[c].per_sample_s(half_s) / cost.time_s(pilot_spp) for c, cost in costs.items()},
             weigh=purpose.weigh(spec.exposure),
             clock=scene.clock,
         )
@@ -247,12 +244,6 @@ def _halved(film: Film) -> Film:
     return Film(width=film.width // 16 * 8, height=film.height // 16 * 8)
 
 
-def _images_s(half: ImageCost, half_s: float, spp: int) -> float:
-    """The CPU time until half-estimates that take `half_s` have the error of an image of `spp` samples per pixel."""
-    samples = half.bought(half_s)
-    return spp / samples * half.time_s(samples)
-
-
 def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: float) -> tuple[Film, int, int]:
     """The film, samples per pixel and number of views whose first round takes no more than its share of the time.
 
@@ -281,7 +272,7 @@ def digest(spec: SceneSpec, purpose: Purpose) -> str:
     default = Transport()
     undecided = spec.transport.model_copy(update={name: getattr(default, name) for name in _DECIDED})
     scene = spec.model_copy(update={"transport": undecided})
-    known = scene.radiance_id, str(undecided.rr_depth), repr(spec.exposure), str(spec.points)
+    known = scene.radiance_id, str(undecided.rr_depth), repr(spec.exposure)
     return digest_here("scene plan", *known, repr(GRID), purpose.value)
 
 

@@ -56,7 +56,7 @@ def candidates_at_equal_cost(measurement: Measurement, half_s: float) -> dict[Ca
 
 def _at_cost(row: CandidateRow, measurement: Measurement, half_s: float) -> CandidateAtCost:
     plain, samples = measurement.row(PLAIN), row.cost.bought(half_s)
-    cost = row.errors.ratio * _per_sample_s(row, half_s) / _per_sample_s(plain, half_s)
+    cost = row.errors.ratio * row.cost.per_sample_s(half_s) / plain.cost.per_sample_s(half_s)
     relative = row.errors.relative_spread(plain.errors)
     return CandidateAtCost(
         candidate=row.candidate,
@@ -69,11 +69,6 @@ def _at_cost(row: CandidateRow, measurement: Measurement, half_s: float) -> Cand
         half_error=row.errors.mean * measurement.spp / samples,
         fits=row.cost.pays(half_s),
     )
-
-
-def _per_sample_s(row: CandidateRow, half_s: float) -> float:
-    samples = row.cost.bought(half_s)
-    return row.cost.time_s(samples) / samples
 
 
 def best(candidates: Mapping[Candidate, CandidateAtCost]) -> CandidateAtCost:

@@ -26,6 +26,16 @@ from photonfarm.trainer.metrics.mse import mse
 from photonfarm.trainer.metrics.mssim import mssim
 
 CHUNK = 8  # images at a time
+TITLES = {
+    "mse": "MSE",
+    "mssim": "MSSIM",
+    "fid": "FID",
+    **{f"feature-l1-{block}": f"Feature L1, Inception block {block}" for block in range(4)},
+    "kid": "KID",
+    "flip": "FLIP",
+}
+"""The metrics by name: those of Fig. 5 of the supplement, and further ones of ours."""
+HEADLINE = f"feature-l1-{HEADLINE_BLOCK}"
 NOT_AVAILABLE = "n/a"
 
 
@@ -42,16 +52,21 @@ class ImageMetrics:
     kid: Estimate | None
     inception: InceptionWeights | None  # the weights of these three
 
+    def estimates(self) -> dict[str, Estimate]:
+        """The metrics that are available, by their names in `TITLES`; FID has no standard error."""
+        found = {name: getattr(self, name).estimate for name in ("mse", "mssim", "flip")}
+        found |= {f"feature-l1-{block}": each.estimate for block, each in enumerate(self.feature_l1 or ())}
+        found |= {"fid": Estimate(self.fid.value, None, self.fid.predictions)} if self.fid else {}
+        return found | ({"kid": self.kid} if self.kid else {})
+
     def columns(self) -> dict[str, str]:
         """Column heads and their entries, `n/a` for a metric that is not available."""
-        headline = None if self.feature_l1 is None else self.feature_l1[HEADLINE_BLOCK].estimate.mean
+        found = self.estimates()
+        heads = {"mse": ("MSE", 5), "mssim": ("MSSIM", 4), "fid": ("FID", 2), "kid": ("KID", 5)}
+        heads |= {HEADLINE: ("Feature L1", 4), "flip": ("FLIP", 4)}
         return {
-            "MSE": f"{self.mse.estimate.mean:.5f}",
-            "MSSIM": f"{self.mssim.estimate.mean:.4f}",
-            "FID": NOT_AVAILABLE if self.fid is None else f"{self.fid.value:.2f}",
-            "KID": NOT_AVAILABLE if self.kid is None else f"{self.kid.mean:.5f}",
-            "Feature L1": NOT_AVAILABLE if headline is None else f"{headline:.4f}",
-            "FLIP": f"{self.flip.estimate.mean:.4f}",
+            head: f"{found[name].mean:.{digits}f}" if name in found else NOT_AVAILABLE
+            for name, (head, digits) in heads.items()
         }
 
 

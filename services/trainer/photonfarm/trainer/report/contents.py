@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from photonfarm.shared.core.errors import BackendError
+from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.core.frame_costs import FrameCosts
 from photonfarm.shared.core.records import F32, Guides, ViewBuffers
 from photonfarm.trainer.compare import evaluate
@@ -36,6 +37,11 @@ class ReportEntry:
     row: PredictorRow
     time: FrameTime | None  # None if the renderer is not installed
     published: Published | None  # the paper's row of the same architecture
+
+    @property
+    def estimates(self) -> dict[str, Estimate]:
+        """Its metrics against references, by name, as far as they are available."""
+        return {} if self.row.metrics is None else self.row.metrics.estimates()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

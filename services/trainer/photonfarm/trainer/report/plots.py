@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.metrics.image_metrics import TITLES
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry
 from photonfarm.trainer.report.trained_runs import CurvePoint, RunStory
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 FEW = 3  # places along an axis: fewer show no curve
 FAR_BELOW = 4  # a level so many times below all curves is not drawn: it would press them together
-MSSIM, KID = "mssim", "kid"  # the metrics whose axes are linear
+LINEAR = ("mssim", "kid")  # the metrics whose axes are linear
 NARROW = 20  # times the least value: axes of less have ticks at round numbers…
 TIGHT = 2.5  # …and of less than this at equal distances
 SIZE = (4.6, 4.2)  # inches, of 72 CSS pixels and a third each; the legend's rows are in it
@@ -135,42 +136,6 @@ def _columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[f
 
 
 @dataclass(frozen=True, slots=True)
-class PlottedMetric:
-    """A metric of the tables."""
-
-    name: str
-    title: str
-    of: Callable[[ReportEntry], Estimate | None]
-
-
-def measures() -> list[PlottedMetric]:
-    """The metrics of Fig. 5, and further ones of ours."""
-
-    def feature(block: int) -> PlottedMetric:
-        def value(entry: ReportEntry) -> Estimate | None:
-            found = entry.row.metrics
-            return None if found is None or found.feature_l1 is None else found.feature_l1[block].estimate
-
-        return PlottedMetric(f"feature-l1-{block}", f"Feature L1, Inception block {block}", value)
-
-    def of(field: str) -> Callable[[ReportEntry], Estimate | None]:
-        return lambda entry: None if entry.row.metrics is None else getattr(entry.row.metrics, field).estimate
-
-    def fid(entry: ReportEntry) -> Estimate | None:
-        found = entry.row.metrics
-        return None if found is None or found.fid is None else Estimate(found.fid.value, None, found.fid.predictions)
-
-    return [
-        PlottedMetric("mse", "MSE", of("mse")),
-        PlottedMetric(MSSIM, "MSSIM", of("mssim")),
-        PlottedMetric("fid", "FID", fid),
-        *(feature(block) for block in range(4)),
-        PlottedMetric(KID, "KID", lambda entry: None if entry.row.metrics is None else entry.row.metrics.kid),
-        PlottedMetric("flip", "FLIP", of("flip")),
-    ]
-
-
-@dataclass(frozen=True, slots=True)
 class PlottedPredictor:
     """A predictor in a plot over the time of a frame."""
 
@@ -182,15 +147,15 @@ class PlottedPredictor:
 
 
 def _over_time(contents: ReportContents) -> Iterator[Plot]:
-    for measure in measures():
+    for name, title in TITLES.items():
         points = [
-            PlottedPredictor(1e3 * entry.time.total, entry.name, _group(entry), colour, value)
+            PlottedPredictor(1e3 * entry.time.total, entry.name, _group(entry), colour, entry.estimates[name])
             for entry, colour in zip(contents.entries, cycle(COLOURS), strict=False)
-            if entry.time is not None and (value := measure.of(entry)) is not None
+            if entry.time is not None and name in entry.estimates
         ]
         if len(points) > 1:
-            about = f"{measure.title} over the time of a frame"
-            yield _drawn(f"{TIMES}{measure.name}", about, partial(_scatter, measure=measure, points=points))
+            about = f"{title} over the time of a frame"
+            yield _drawn(f"{TIMES}{name}", about, partial(_scatter, metric=name, points=points))
 
 
 GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
@@ -210,9 +175,9 @@ def _group(entry: ReportEntry) -> str:
     return ready if entry.architecture is None else trained
 
 
-def _scatter(axes: Axes, measure: PlottedMetric, points: Sequence[PlottedPredictor]) -> None:
+def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> None:
     least = min(point.value.mean for point in points)
-    logarithmic = measure.name not in (MSSIM, KID) and least > 0
+    logarithmic = metric not in LINEAR and least > 0
     floor = least / 2 if logarithmic else -math.inf
     lowest = math.inf
     for name, (marker, line) in GROUPS.items():
@@ -234,7 +199,7 @@ def _scatter(axes: Axes, measure: PlottedMetric, points: Sequence[PlottedPredict
             axes.set_ylim(bottom=floor)
     _plain_ticks(axes)
     axes.set_xlabel("time per frame, ms")
-    axes.set_ylabel(measure.title)
+    axes.set_ylabel(TITLES[metric])
 
 
 # ---------------------------------------------------------------------------------------------------------------- axes

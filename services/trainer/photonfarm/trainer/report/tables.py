@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.core.frame_costs import Seconds
 from photonfarm.trainer.compare.evaluation_table import counted, notes, place_of_networks
-from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
-from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE, TITLES
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry
-from photonfarm.trainer.report.plots import measures
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,15 +165,14 @@ def _of_paper(contents: ReportContents) -> str:
 
 
 def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) -> tuple[str, ...]:
-    metrics, paper, unit = entry.row.metrics, entry.published, contents.measure
-    headline = None if metrics is None or metrics.feature_l1 is None else metrics.feature_l1[HEADLINE_BLOCK].estimate
+    found, paper, unit = entry.estimates, entry.published, contents.measure
     cells = [
         (f"{1e3 * entry.time.total:.1f}" if entry.time else NOT_AVAILABLE, None),
         (_ratio(entry, unit, alone=len(contents.entries) == 1), _published_ratio(entry, unit)),
-        (with_interval(None if metrics is None else metrics.mse.estimate, 5), f"{paper.mse:.4f}" if paper else ""),
-        (with_interval(None if metrics is None else metrics.mssim.estimate, 3), f"{paper.mssim:.3f}" if paper else ""),
-        (f"{metrics.fid.value:.1f}" if metrics and metrics.fid else NOT_AVAILABLE, f"{paper.fid:.1f}" if paper else ""),
-        (with_interval(headline, 3), f"{paper.feature_l1:.3f}" if paper else ""),
+        (with_interval(found.get("mse"), 5), f"{paper.mse:.4f}" if paper else ""),
+        (with_interval(found.get("mssim"), 3), f"{paper.mssim:.3f}" if paper else ""),
+        (with_interval(found.get("fid"), 1), f"{paper.fid:.1f}" if paper else ""),
+        (with_interval(found.get(HEADLINE), 3), f"{paper.feature_l1:.3f}" if paper else ""),
     ]
     row = [entry.name]
     for ours, theirs in cells:
@@ -210,16 +208,16 @@ def with_interval(estimate: Estimate | None, digits: int) -> str:
 
 def _further(contents: ReportContents) -> Table:
     """Metrics that the paper does not have, and its Fig. 5 in numbers."""
-    shown = [m for m in measures() if m.name.startswith(("feature", "flip"))] if _has_references(contents) else []
+    shown = [m for m in TITLES if m.startswith(("feature", "flip"))] if _has_references(contents) else []
     first = contents.evaluation.rows[0]
     rows = []
     for entry in contents.entries:
         behind = "–" if entry.row is first else with_interval(entry.row.behind(first), 5)
-        values = (m.of(entry) for m in shown)
-        cells = [NOT_AVAILABLE if value is None else f"{value.mean:.4f}" for value in values]
-        kid = [with_interval(None if entry.row.metrics is None else entry.row.metrics.kid, 4)] if shown else []
+        found = entry.estimates
+        cells = [f"{found[m].mean:.4f}" if m in found else NOT_AVAILABLE for m in shown]
+        kid = [with_interval(found.get("kid"), 4)] if shown else []
         rows.append((entry.name, with_interval(entry.row.held_out.error, 5), behind, *cells, *kid))
-    titles = (*(m.title for m in shown), *(["KID (95 %)"] if shown else []))
+    titles = (*(TITLES[m] for m in shown), *(["KID (95 %)"] if shown else []))
     head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *titles)
     below = [notes(contents.evaluation)[0]]
     if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:

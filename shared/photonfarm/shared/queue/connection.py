@@ -21,8 +21,6 @@ USER = "photonfarm"
 """The user of a URL without a name, if the password comes from a file."""
 
 
-
-
 class RefusedError(QueueError):
     """A Redis refuses what it would refuse again."""
 

@@ -13,7 +13,7 @@ from redis import Redis
 from redis.client import Pipeline
 from rq import Queue, Retry
 from rq.exceptions import DeserializationError, NoSuchJobError
-from rq.executions import Execution
+from rq.executions import Execution as Execution
 from rq.job import Job
 from rq.job_lifecycle import record_job_failure
 from rq.results import Result

@@ -197,12 +197,11 @@ def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
     """
     from photonfarm.shared import queue
     from photonfarm.shared.cli import show
-    from photonfarm.shared.queue import reconciliation
     from photonfarm.shared.store import Store
 
     opened = Store(store)
     with queue.connect(redis_url) as connection:
-        show.queued(reconciliation.reconcile(opened, connection), as_json)
+        show.queued(queue.reconcile(opened, connection), as_json)
 
 
 @click.command("redis")

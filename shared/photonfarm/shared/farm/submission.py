@@ -147,11 +147,9 @@ def queue_missing(
     With `retry` also jobs that were set aside. Raises QueueError; its message says what
     is `stored` nevertheless, and that --no-queue {verb} without Redis.
     """
-    from photonfarm.shared.queue.reconciliation import reconcile
-
     try:
         connection = queue.connect(redis_url)
-        return reconcile(store, connection, scene_id=scene_id, retry=retry)
+        return queue.reconcile(store, connection, scene_id=scene_id, retry=retry)
     except queue.OtherStoreError as error:
         raise QueueError(f"{error}. {stored} in {store.storage.where}") from error
     except QueueError as error:

@@ -7,8 +7,6 @@ rq:photonfarm:reconcile                 lock of the process that fills the queue
 rq:photonfarm:looked:<scene id, or all> what the last look at the store found, for seconds
 rq:photonfarm:store                     the id of the store that this Redis serves, while it is in use
 rq:photonfarm:consumed:<scene id>       samples of a scene that its trainer has used
-
-What imports RQ, which takes its time to load, is imported by name: `rq_adapter` and `reconciliation`.
 """
 
 from photonfarm.shared.queue.connection import (
@@ -23,6 +21,7 @@ from photonfarm.shared.queue.consumption import consumed_samples, report_consume
 from photonfarm.shared.queue.failures import Failure, FailureCause, causes, repeating_command
 from photonfarm.shared.queue.job import QUEUE, TRIES, RenderArguments, is_job_name, job_name
 from photonfarm.shared.queue.kept_failures import keep_failure, keep_retry, kept_failures, times_failed
+from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, look, reconcile
 from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
 from photonfarm.shared.queue.share import Share
 from photonfarm.shared.queue.status import QueueStatus, queue_status
@@ -30,6 +29,7 @@ from photonfarm.shared.queue.workers import Activity, WorkerReport, beat, bury, 
 
 __all__ = [
     "QUEUE",
+    "QUEUE_LIMIT",
     "SERVED",
     "TRIES",
     "Activity",
@@ -53,9 +53,11 @@ __all__ = [
     "keep_failure",
     "keep_retry",
     "kept_failures",
+    "look",
     "queue_error",
     "queue_status",
     "read_workers",
+    "reconcile",
     "redis_errors",
     "release",
     "repeating_command",

@@ -8,8 +8,8 @@ from typing import NamedTuple
 from photonfarm.shared.core.errors import QueueError
 
 QUEUE = "photonfarm"
-QUEUE_KEY, STARTED_KEY, FAILED_KEY = f"rq:queue:{QUEUE}", f"rq:wip:{QUEUE}", f"rq:failed:{QUEUE}"
-"""RQ's list of queued jobs, and its sorted sets of started ones, `<name>:<execution>`, and of failed ones."""
+QUEUE_KEY, STARTED_KEY = f"rq:queue:{QUEUE}", f"rq:wip:{QUEUE}"
+"""RQ's list of queued jobs, and its sorted set of started ones, `<name>:<execution>`."""
 
 FUNCTION = "photonfarm.render"
 """The function that a job in Redis names. A worker renders such jobs, refuses others, and imports neither."""

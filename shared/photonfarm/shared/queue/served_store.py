@@ -39,13 +39,13 @@ def serve(connection: Redis, store: Store) -> None:
 def check_served(connection: Redis, store: Store) -> None:
     """Check that this Redis serves no other store; raises OtherStoreError if it does, QueueError if it fails."""
     with redis_errors("asked which store it serves"):
-        other, left_s = as_text(connection.get(SERVED) or b""), connection.ttl(SERVED)
+        other, left_ms = as_text(connection.get(SERVED) or b""), connection.pttl(SERVED)
     if other and other != store.store_id:
         raise OtherStoreError(
             f"this Redis serves the store with the id {other}, and {store.storage.where} has the id {store.store_id}; "
             "give the store that is meant (--store), or another database of Redis for this one (redis://host/1; with "
             "`photonfarm up`, another --run). If nobody works with the other store any more, wait: this Redis is free "
-            f"by itself in {max(1, left_s)} s"
+            f"by itself in {max(1, -(-left_ms // 1000))} s"
         )
 
 

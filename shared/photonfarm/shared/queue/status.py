@@ -1,4 +1,4 @@
-"""The queue and the workers, as Redis has them; RQ, which takes its time to load, only where jobs have failed."""
+"""The queue and the workers, as Redis has them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from redis import Redis
 
 from photonfarm.shared.queue.connection import redis_errors
 from photonfarm.shared.queue.failures import Failure
-from photonfarm.shared.queue.job import FAILED_KEY, QUEUE_KEY
+from photonfarm.shared.queue.job import QUEUE_KEY
+from photonfarm.shared.queue.rq_adapter import open_queue, read_failures
 from photonfarm.shared.queue.workers import Activity, read_workers, started
 
 
@@ -38,16 +39,8 @@ def queue_status(connection: Redis) -> QueueStatus:
             queued=connection.llen(QUEUE_KEY),
             running=sum(started(connection).values()),
             workers=len(workers),
-            failed=_failed(connection),
+            failed=read_failures(open_queue(connection)),
             paused={name: report.paused for name, report in workers.items() if report.paused},
             left=left,
             activities={name: report.doing for name, report in workers.items() if report.doing},
         )
-
-
-def _failed(connection: Redis) -> dict[str, Failure]:
-    if not connection.zcard(FAILED_KEY):
-        return {}
-    from photonfarm.shared.queue.rq_adapter import open_queue, read_failures
-
-    return read_failures(open_queue(connection))

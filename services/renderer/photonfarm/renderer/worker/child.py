@@ -41,7 +41,10 @@ def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format=LOG_FORMAT)
     threading.Thread(target=_end_with_supervisor, daemon=True).start()
     try:
-        return RenderWorker(settings, Store(settings.store), load, pipe).run()
+        worker = RenderWorker(settings, Store(settings.store), load, pipe)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: worker.stop())
+        return worker.run()
     except redis.RedisError as error:
         ending: PhotonfarmError = queue.queue_error(error)
     except PhotonfarmError as error:
@@ -80,14 +83,16 @@ class RenderWorker:
 
     def run(self) -> int:
         """Work until stopped, complete or due for a successor; returns the exit code, 0 only if all is complete."""
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, lambda *_: self._stop.set())
         with self._source.open():
             while not self._stop.is_set():
                 code = self.step()
                 if code is not None:
                     return code
         return RECYCLED  # asked to stop: for a supervisor that is not to stop itself
+
+    def stop(self) -> None:
+        """End `run` after the job in hand."""
+        self._stop.set()
 
     def step(self) -> int | None:
         """Render a job, or wait for one; an exit code ends the worker."""
@@ -97,7 +102,7 @@ class RenderWorker:
         if job is not None:
             self._render(job)
             return self._outcomes.after_job()
-        if not (paused or self._stop.is_set()) and self._is_complete():
+        if not self._stop.is_set() and self._is_complete(paused):
             return 0
         self._stop.wait(self._settings.idle_s if paused else self._source.pause_s)
         return None
@@ -108,14 +113,14 @@ class RenderWorker:
         self._talk.waiting(waiting)
         return {**waiting, **self._outcomes.left()}
 
-    def _is_complete(self) -> bool:
-        """Whether nothing is left to do or to wait for, after nothing was found to take.
+    def _is_complete(self, paused: str | None) -> bool:
+        """Whether nothing is left to do or to wait for, after nothing was taken.
 
         Raises StoreError if the store is gone: an empty folder in its place would seem to miss nothing.
         """
         self._store.check()
         not_here = self._outcomes.not_here
-        if self._source.has_more(may_leave=bool(not_here)):
+        if self._source.has_more(may_leave=bool(not_here)) or paused:
             return False
         self._store.sweep()
         if not self._settings.until_complete:

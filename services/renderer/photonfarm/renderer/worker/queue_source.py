@@ -18,7 +18,6 @@ from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.core.processes import Stop, repeating
 from photonfarm.shared.queue import Activity, RenderArguments, rq_adapter
-from photonfarm.shared.queue.reconciliation import look
 from photonfarm.shared.store import Store
 
 POLL_S = 0.2
@@ -104,7 +103,7 @@ class QueueSource(JobSource):
 
     def has_more(self, *, may_leave: bool) -> bool:
         """Whether something was missing and is queued now, or is in the hands of others."""
-        found = look(self._store, self._connection, scene_id=self._settings.scene_id, every_s=self._settings.idle_s)
+        found = queue.look(self._store, self._connection, scene_id=self._settings.scene_id, every_s=self._settings.idle_s)
         return found == "queued" or (found == "waits" and not may_leave)
 
     def set_aside(self) -> Mapping[str, str]:

@@ -39,6 +39,7 @@ class Registration:
             return
         with queue.redis_errors(f"told of worker {wanted}"):
             name = queue.take_name(self._connection, wanted, ttl_s=self._ttl_s)
+            fail_of_worker(self._connection, name, "its worker was killed", counts=True)  # that of a predecessor
         try:
             yield name
         finally:

@@ -244,5 +244,5 @@ cli.serve_metrics.main(["--store", {str(store.root)!r}, "--redis", "unix:///none
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded = {name.partition(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
-    assert {"PIL", "torch", "mitsuba", "rq"}.isdisjoint(loaded)
+    assert {"PIL", "torch", "mitsuba"}.isdisjoint(loaded)
     assert "prometheus_client" in loaded

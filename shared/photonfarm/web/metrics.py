@@ -3,7 +3,7 @@
 Counters are what the store and the logs of runs hold, so that they go on where another process serves them. A repair
 takes samples back; Prometheus then believes that a counter has begun anew.
 
-Labels take few values, whatever strangers write into Redis: scenes are those of the store, runs those that the user
+Labels take few values, whatever the messages of failures are: scenes are those of the store, runs those that the user
 names, and failures are grouped by the class of their error.
 """
 

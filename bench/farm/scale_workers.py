@@ -73,7 +73,6 @@ def _work(root: str, redis: str, number: int, looks: Counter[str], ready: thread
     """Be one worker, for as long as the process lives."""
     from photonfarm.renderer.worker.child import RenderWorker
     from photonfarm.renderer.worker.settings import WorkerSettings
-    from photonfarm.shared import queue
     from photonfarm.shared.store import Store
 
     class Played(RenderWorker):

@@ -137,6 +137,8 @@ class RenderWorker:
         with deadline(self._settings, self._pipe, name), self._talk.timing(name):
             try:
                 rendered = self._renderer.render(*job)
+                if not rendered:
+                    self._store.check()  # its scene may be gone with the whole store
             except TakenError:
                 self._talk.given_up(name)
             except Exception as error:

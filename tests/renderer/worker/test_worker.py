@@ -12,7 +12,7 @@ from types import ModuleType
 import pytest
 import queue_samples
 
-from photonfarm.renderer.worker import queue_source
+from photonfarm.renderer.worker import heartbeat
 from photonfarm.renderer.worker.queue_source import QueueSource
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.renderer.worker.supervisor import ChildOutput, ending
@@ -202,7 +202,7 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
 def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
     scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(queue_source, "REPORT_S", 0.02)
+    monkeypatch.setattr(heartbeat, "REPORT_S", 0.02)
     connection, store = connect(redis_server.url), Store(tmp_path / "store")
     queue.reconcile(store, connection)
     settings = WorkerSettings(store=str(store.root), redis_url=redis_server.url, name="ada", idle_s=1)

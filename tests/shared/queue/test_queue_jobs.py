@@ -128,5 +128,6 @@ def test_a_redis_that_forgot_the_job_in_hand_is_told_of_it_again(connection: red
         keep_alive(jobs, execution, pipeline, 60)
         pipeline.execute()
     assert queue_status(connection).running == 1
-    assert not fail(jobs, execution, "broken"), "of its tries nothing is known"
+    fail_of_worker(connection, "worker", "killed", counts=True)  # of its tries nothing is known
     assert queue_status(connection).running == 0
+    assert queued(connection) == []

@@ -101,6 +101,8 @@ def keep_alive(queue: Queue, execution: Execution, pipeline: Pipeline, ttl_s: in
     """Write that an execution goes on; all of it, as Redis may have lost it."""
     execution.save(ttl_s, pipeline)
     queue.started_job_registry.add_execution(execution, pipeline, ttl=ttl_s)
+    pipeline.sadd(execution.worker_executions_key, execution.composite_key)
+    pipeline.expire(execution.worker_executions_key, ttl_s + 60)
 
 
 def finish(queue: Queue, execution: Execution) -> None:

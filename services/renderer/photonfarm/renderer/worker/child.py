@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import contextlib
-import faulthandler
 import logging
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import redis
 
 from photonfarm.renderer.jobs import render as jobs
+from photonfarm.renderer.worker.heartbeat import deadline
 from photonfarm.renderer.worker.log import WorkerLog
 from photonfarm.renderer.worker.outcomes import Outcomes, is_complete, missing_jobs, send_line
 from photonfarm.renderer.worker.queue_source import QueueSource
-from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, LOG_FORMAT, RECYCLED, REFUSED, WorkerSettings
+from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, REFUSED, WorkerSettings
 from photonfarm.renderer.worker.share_source import ShareSource
 from photonfarm.renderer.worker.source import Ending, JobSource, TakenError
 from photonfarm.shared import queue
@@ -27,8 +26,6 @@ from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.queue import Activity, RenderArguments, job_name
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.write.lease import leases
-
-STDERR = 2
 
 log = logging.getLogger(__name__)
 
@@ -156,19 +153,6 @@ class RenderWorker:
 
     def _on_progress(self, phase: str, done: int, total: int) -> None:
         self._source.tell_doing(Activity(phase, done, total, self._in_hand))
-
-
-@contextlib.contextmanager
-def deadline(settings: WorkerSettings, pipe: int | None, name: str) -> Iterator[None]:
-    """Tell the supervisor of a job that the block renders; past the deadline the process ends, and prints where."""
-    if pipe is not None:
-        send_line(pipe, f"{JOB_IN_HAND}{name}")
-    # its watchdog is a thread without Python's lock, so that it also ends native code that never returns
-    faulthandler.dump_traceback_later(settings.deadline_s, exit=True, file=STDERR if pipe is None else pipe)
-    try:
-        yield
-    finally:
-        faulthandler.cancel_dump_traceback_later()
 
 
 if __name__ == "__main__":

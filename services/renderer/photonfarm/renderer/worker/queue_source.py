@@ -12,26 +12,21 @@ from dataclasses import replace
 import redis
 
 from photonfarm.renderer.worker.backpressure import TrainerPace
+from photonfarm.renderer.worker.heartbeat import heartbeat
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.source import Ending, JobSource
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.core.processes import Stop, repeating
+from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.queue import Activity, RenderArguments, rq_adapter
 from photonfarm.shared.store import Store
 
 POLL_S = 0.2
 """The seconds between looks at an empty queue."""
 
-REPORT_S = 2.0
-"""The most seconds between two heartbeats, which also tell what the worker does."""
-
 
 class QueueSource(JobSource):
-    """Takes jobs from the queue, and fills it from the store when it is empty.
-
-    A thread keeps the worker and its job alive in Redis, as RQ's SimpleWorker does not during a job.
-    """
+    """Takes jobs from the queue, and fills it from the store when it is empty."""
 
     def __init__(self, settings: WorkerSettings, store: Store, stop: Stop) -> None:
         """Connect; raises QueueError if there is no Redis."""
@@ -52,7 +47,7 @@ class QueueSource(JobSource):
     def open(self) -> Iterator[None]:
         """Keep the worker and its job alive until the block ends."""
         self._beat()
-        with repeating(min(REPORT_S, self._ttl_s / 5), self._beat):
+        with heartbeat(self._beat, self._ttl_s):
             yield
 
     def _beat(self) -> None:

@@ -14,16 +14,16 @@ if [ ! -s "$password" ]; then
 fi
 digest=$(tr -d '\n' < "$password" | sha256sum | cut -d ' ' -f 1)
 
-# Commands: of RQ 2.12, of redis-py's locks and of photonfarm; keys and values of other kinds are out of reach.
+# Commands: of RQ 3.0, of redis-py's locks and of photonfarm; keys and values of other kinds are out of reach.
 umask 077
 cat > "$data/users.acl" << ACL
 user default off
-user photonfarm on #$digest ~rq:* ~alive:* +@read +@write +@transaction +@connection +@scripting +@blocking -@dangerous +info +client|list +client|setname
+user photonfarm on #$digest ~rq:* +@read +@write +@transaction +@connection +@scripting +@blocking -@dangerous +info
 ACL
 
-# The queue is disposable, but a journal saves the workers a reconcile; nothing may be evicted from a queue. A full one
-# of 10 000 jobs takes 20 MB.
+# The queue is disposable, but a journal saves the workers a reconcile; nothing may be evicted from a queue. 10 000
+# jobs, the most of a scene, take 20 MB.
 exec "${REDIS_SERVER:-redis-server}" \
     --bind "${REDIS_BIND:-*}" --port "${REDIS_PORT:-6379}" --aclfile "$data/users.acl" \
     --dir "$data" --save "" --appendonly yes --appendfsync everysec \
-    --maxmemory 256mb --maxmemory-policy noeviction --proto-max-bulk-len 1mb --daemonize no
+    --maxmemory 256mb --maxmemory-policy noeviction --daemonize no

@@ -101,10 +101,10 @@ def keep_account(pipe: Any, store: Path, url: str) -> None:
     ledger = Ledger()
 
     class Watched(RenderWorker):
-        def execute_job(self, job: Any, queue: Any) -> None:
+        def _render(self, job: queue.RenderArguments) -> None:
             if not ledger.copies:
                 ledger.copy()
-            super().execute_job(job, queue)
+            super()._render(job)
             ledger.copy()
 
     for name in ("radiance", "buffers", "photons"):
@@ -113,9 +113,7 @@ def keep_account(pipe: Any, store: Path, url: str) -> None:
     ledger.watch(jobs.ShardRenderer, "render", "render")
     ledger.watch_threads(WRITER, "writer")
     settings = WorkerSettings(store=str(store), redis_url=url, name="worker-1", until_complete=True, quiet=True)
-    opened = Store(store)
-    jobs.serve(jobs.ShardRenderer(opened, worker=settings.name, load=ledger.load))
-    Watched(settings, opened, queue.connect(url)).run()
+    Watched(settings, Store(store), ledger.load).run()
     pipe.send(ledger.copies)
 
 

@@ -22,7 +22,7 @@ from typing import Any
 from bench.farm.plans import Markers
 from bench.farm.scale_operations import counted
 from bench.harness import results
-from photonfarm.shared.queue.job import QUEUE_KEY
+from photonfarm.shared.queue.job import QUEUE_KEY, STARTED_KEY
 
 PROCESSES = 4
 SHARD_ROWS = 2
@@ -48,24 +48,14 @@ def main() -> int:
 
 def play(store: str, redis: str, first: int, count: int) -> None:
     """Play the workers `first` … `first` + `count` − 1."""
-    from photonfarm.renderer.jobs import render as jobs
     from photonfarm.shared.store.io.local import LocalStorage
 
     _analytic().AnalyticScene.pause_s = JOB_S / SHARD_ROWS / 2
-    own = threading.local()
-
-    class OfThread:
-        """Renders with the calling thread's own renderer: `jobs.serve` takes one for the process."""
-
-        def render(self, scene_id: str, job: int) -> bool:
-            return bool(own.renderer.render(scene_id, job))
-
-    jobs.serve(OfThread())  # type: ignore[arg-type]
     looks: Counter[str] = Counter()
     ready = threading.Semaphore(0)
     with counted(LocalStorage) as operations:
         for number in range(first, first + count):
-            threading.Thread(target=_work, args=(store, redis, number, own, looks, ready), daemon=True).start()
+            threading.Thread(target=_work, args=(store, redis, number, looks, ready), daemon=True).start()
         for _ in range(count):
             ready.acquire()
         print("ready", flush=True)
@@ -79,45 +69,21 @@ def _analytic() -> Any:
     return importlib.import_module("analytic_scene")
 
 
-class _NoLimit:
-    """RQ's time limit of a job, seven days here, is a signal, which only a main thread may set: none."""
-
-    def __init__(self, *given: Any, **named: Any) -> None:
-        """Take RQ's arguments."""
-
-    def __enter__(self) -> None:
-        """Begin no limit."""
-
-    def __exit__(self, *error: object) -> None:
-        """End no limit."""
-
-
-def _work(
-    root: str, redis: str, number: int, own: threading.local, looks: Counter[str], ready: threading.Semaphore
-) -> None:
+def _work(root: str, redis: str, number: int, looks: Counter[str], ready: threading.Semaphore) -> None:
     """Be one worker, for as long as the process lives."""
-    from photonfarm.renderer.jobs.render import ShardRenderer
     from photonfarm.renderer.worker.child import RenderWorker
     from photonfarm.renderer.worker.settings import WorkerSettings
-    from photonfarm.shared import queue
     from photonfarm.shared.store import Store
 
     class Played(RenderWorker):
-        death_penalty_class = _NoLimit
-
-        def _install_signal_handlers(self) -> None:
-            """Leave signals alone: this is not the main thread."""
-
-        def on_idle(self) -> int | None:
+        def _is_complete(self, paused: str | None) -> bool:
             looks["looks"] += 1
-            return super().on_idle()
+            return super()._is_complete(paused)
 
     settings = WorkerSettings(
         store=root, redis_url=redis, name=f"played-{number}", until_complete=True, quiet=True, reserve_bytes=0
     )
-    store = Store(root)
-    own.renderer = ShardRenderer(store, worker=settings.name, load=_analytic().AnalyticScene.load)
-    worker = Played(settings, store, queue.connect(redis))
+    worker = Played(settings, Store(root), _analytic().AnalyticScene.load)
     ready.release()
     worker.run()
 
@@ -145,8 +111,10 @@ def measured(folder: Path, workers: int) -> Costs:
     with EmbeddedRedis(folder / "redis") as server:
         connection = queue.connect(server.url)
         empty = connection.info("memory")["used_memory"]
-        connection.set(queue.ALIVE + held, "elsewhere", ex=3000)  # a job that somebody else renders all the while
         queue.reconcile(store, connection)
+        connection.lrem(QUEUE_KEY, 1, held)
+        connection.zadd(STARTED_KEY, {f"{held}:held": 0})  # a job that somebody else renders all the while
+        connection.set(f"rq:execution:{held}:held", 1, ex=3000)
         with _played(str(folder / "store"), server.url, workers) as done:
             _wait(lambda: connection.llen(QUEUE_KEY) <= workers * (JOBS_EACH - 1))
             busy = [_seen(connection, done(), scene)]

@@ -54,12 +54,14 @@ import contextlib, io, json, sys, traceback
 from pathlib import Path
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import beat, connect, queue_status, reconcile
+from photonfarm.shared.queue import WorkerReport, connect, queue_status, reconcile
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.check.check import check_store
 from photonfarm.shared.plan.top_up import TopUp
 sys.path.append(sys.argv[1])
+sys.path.append(sys.argv[1] + "/../shared")
 import analytic_scene as analytic
+from queue_samples import taken, told
 
 names = dict(globals())
 for line in sys.stdin:

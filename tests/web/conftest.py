@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import pytest
+import queue_samples
 import redis
 import store_samples as samples
 
@@ -41,14 +42,16 @@ def run(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def farm(scene: SceneStore, run: Path, store: Store, connection: redis.Redis, common_redis: EmbeddedRedis) -> FarmWatch:
-    """A farm with a queue, three workers, failures of each state and a run."""
+    """A farm with a queue, three workers, a failure and a run."""
     queue.reconcile(store, connection)
-    name = queue.job_name(scene.scene_id, 2)
-    for worker, job in (("ada", name), ("bob", None), ("eve", None)):
-        queue.beat(connection, worker, "elsewhere", job, ttl_s=60, process=1)
-    queue.report_activity(connection, "ada", queue.Activity("renders samples", 1, 2, name), ttl_s=60)
-    queue.report_idle(connection, "bob", "the disk is full", {scene.scene_id: "room.xml is missing"}, ttl_s=60)
-    for _ in range(queue.FAILURES_ALLOWED):
-        queue.record_failure(connection, name, "ValueError: 7 is odd")
-    queue.record_failure(connection, queue.job_name(scene.scene_id, 3), "StoreError: no")
+    name = queue_samples.taken(connection, "ada").job_id
+    doing = queue.Activity("renders samples", 1, 2, name)
+    left = {scene.scene_id: "room.xml is missing"}
+    for worker, report in (
+        ("ada", {"doing": doing}),
+        ("bob", {"paused": "the disk is full", "left": left}),
+        ("eve", {}),
+    ):
+        queue_samples.told(connection, worker, queue.WorkerReport(host="elsewhere", process=1, **report))
+    queue_samples.failed(connection, "ValueError: 7 is odd")
     return FarmWatch(store, common_redis.url, [run])

@@ -3,7 +3,7 @@
 Counters are what the store and the logs of runs hold, so that they go on where another process serves them. A repair
 takes samples back; Prometheus then believes that a counter has begun anew.
 
-Labels take few values, whatever strangers write into Redis: scenes are those of the store, runs those that the user
+Labels take few values, whatever the messages of failures are: scenes are those of the store, runs those that the user
 names, and failures are grouped by the class of their error.
 """
 
@@ -103,17 +103,16 @@ def _of_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:
     yield _gauge("queue_up", "Whether the queue's Redis answers, 1 or 0.", {(): int(isinstance(queue, StoreQueue))})
     failed = _failures(queue)
     yield _gauge(
-        "failed_jobs", "Failed jobs by the class of their error: deferred for an hour, failed for good until a retry, "
-        "or kept by the store alone.", failed, "error", "state",
+        "failed_jobs", "Failed jobs by the class of their error: set aside until a retry, or kept by the store alone.",
+        failed, "error", "state",
     )  # fmt: skip
     if isinstance(queue, NoQueue):
         return
     status = queue.status
     jobs: dict[Labels, float] = {("waiting",): status.queued, ("started",): status.running}
-    for state in ("deferred", "failed"):
-        jobs[(state,)] = sum(count for (_, of), count in failed.items() if of == state)
+    jobs[("failed",)] = sum(count for (_, state), count in failed.items() if state == "failed")
     yield _gauge("queue_jobs", "Jobs of the queue by state.", jobs, "state")
-    paused = status.idle_reports.paused.keys()
+    paused = status.paused.keys()
     rendering = len(status.activities.keys() - paused)
     idle = max(status.workers - rendering - len(paused), 0)
     workers: dict[Labels, float] = {("rendering",): rendering, ("paused",): len(paused), ("idle",): idle}
@@ -124,8 +123,7 @@ def _failures(queue: StoreQueue | NoQueue) -> dict[Labels, int]:
     """The numbers of failed jobs by error and state; few errors, each the class before a cause's first colon."""
     found: Counter[Labels] = Counter()
     for cause in () if isinstance(queue, NoQueue) else queue.causes:
-        found[_error(cause.cause), "failed"] += cause.set_aside
-        found[_error(cause.cause), "deferred"] += len(cause.jobs) - cause.set_aside
+        found[_error(cause.cause), "failed"] += len(cause.jobs)
     for cause in queue.kept:
         found[_error(cause.cause), "kept"] += len(cause.jobs)
     by_error: Counter[str] = Counter()
@@ -139,7 +137,7 @@ def _failures(queue: StoreQueue | NoQueue) -> dict[Labels, int]:
 
 
 def _error(cause: str) -> str:
-    """The class of an error, by a failure's cause, which strangers may have written."""
+    """The class of an error, by a failure's cause."""
     found = _ERROR.match(cause)
     return found[1] if found else OTHER
 

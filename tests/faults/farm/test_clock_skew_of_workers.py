@@ -11,10 +11,11 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+import queue_samples
 from skewed_clock import SKEWS, YEAR_S, Machine, root_of, rows_read
 
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import beat, connect, hosts, queue_status, reconcile
+from photonfarm.shared.queue import WorkerReport, connect, queue_status, read_workers, reconcile
 from photonfarm.shared.store import SceneStore, Store
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loads a library before a process's own")
@@ -25,15 +26,20 @@ def test_a_heartbeat_ends_by_the_servers_clock(
     machine: Machine, scene: SceneStore, redis_server: EmbeddedRedis, skew_s: int
 ) -> None:
     connection = connect(redis_server.url)
-    code = "beat(connect(url), 'ada', 'elsewhere', 'a-job', ttl_s={ttl_s})"
+    assert reconcile(Store(root_of(scene)), connection) == 4
+    code = "told(connect(url), 'ada', WorkerReport(), ttl_s={ttl_s}); taken(connect(url), 'ada', ttl_s={ttl_s})"
     machine(skew_s, root_of(scene), code.format(ttl_s=60), redis_server.url)
-    assert hosts(connection) == {"elsewhere"}
-    left_ms = [connection.pttl(key) for key in connection.keys("*") if b"a-job" in key or b"ada" in key]
-    assert len(left_ms) == 2
-    assert all(30_000 < left <= 60_000 for left in left_ms)
-    machine(skew_s, root_of(scene), code.format(ttl_s=0.2), redis_server.url)
-    time.sleep(0.3)
-    assert hosts(connection) == set()
+    assert list(read_workers(connection)) == ["ada"]
+    (execution,) = connection.keys("rq:execution:*")
+    assert all(30_000 < connection.pttl(key) <= 60_000 for key in (execution, "rq:worker:ada"))
+    assert queue_status(connection).running == 1
+    machine(skew_s, root_of(scene), code.format(ttl_s=1), redis_server.url)
+    connection.delete(execution)
+    time.sleep(1.1)
+    assert read_workers(connection) == {}
+    assert queue_status(connection).running == 0
+    assert machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", redis_server.url) == "0"
+    assert queue_status(connection).queued == 4, "both jobs are in the queue again"
 
 
 @SKEWS
@@ -46,10 +52,13 @@ def test_who_is_alive_here_is_alive_for_a_machine_with_a_wrong_clock_and_who_is_
     queued = machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", url)
     assert queued == "0"
     connection.flushall()
-    beat(connection, "ada", "here", f"{scene.scene_id}-1", ttl_s=60)
-    beat(connection, "bob", "here", f"{scene.scene_id}-2", ttl_s=0.1)
-    time.sleep(0.2)
-    assert machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", url) == "3"
+    reconcile(Store(root_of(scene)), connection)
+    for worker, ttl_s in (("ada", 60), ("bob", 1)):
+        queue_samples.told(connection, worker, WorkerReport(), ttl_s=ttl_s)
+        queue_samples.taken(connection, worker, ttl_s=ttl_s)
+    time.sleep(1.1)
+    assert machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", url) == "0"
+    assert (queue_status(connection).queued, queue_status(connection).running) == (3, 1)
     told = machine(skew_s, root_of(scene), "print(queue_status(connect(url)).workers)", url)
     assert told == "1"
 

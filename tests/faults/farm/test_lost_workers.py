@@ -15,7 +15,8 @@ import pytest
 
 from photonfarm.renderer.worker.settings import GRACE_S
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import OVERDUE, STARTS, connect, queue_status, reconcile
+from photonfarm.shared.queue import TRIES, connect, kept_failures, queue_status, reconcile
+from photonfarm.shared.queue.rq_adapter import open_queue
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 Bytes = Callable[[SceneStore], dict[str, bytes]]
@@ -111,7 +112,7 @@ def test_a_redis_that_forgets_the_job_in_hand_fails_no_job_and_costs_no_worker(
     scene = planned(3)
     connection = connect(redis_server.url)
     running = start(scene.folder.parent.parent, redis_server.url, analytic.command(0.3))
-    analytic.wait_for(lambda: connection.keys(f"{STARTS}*"), 60)
+    analytic.wait_for(lambda: queue_status(connection).running == 1, 60)
     child = analytic.child_of(running)
     for committed in range(3):
         connection.flushall()
@@ -175,7 +176,7 @@ def test_a_job_that_outlasts_the_grace_is_killed_and_free_at_once(
     scene = planned(2)
     running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60), heartbeat_ttl_s=60.0)
     connection = connect(redis_server.url)
-    analytic.wait_for(lambda: connection.keys(f"{STARTS}*"))
+    analytic.wait_for(lambda: queue_status(connection).running == 1)
     child, told = analytic.child_of(running), time.monotonic()
     running.send_signal(signal.SIGTERM)
     assert running.wait(9) == 0
@@ -184,7 +185,8 @@ def test_a_job_that_outlasts_the_grace_is_killed_and_free_at_once(
     assert scene.committed_jobs() == set()
     status = queue_status(connection)
     assert (status.running, status.workers, status.failed) == (0, 0, {})
-    assert not connection.keys(f"{STARTS}*")
+    jobs = open_queue(connection)
+    assert {jobs.fetch_job(name).retries_left for name in jobs.job_ids} == {TRIES - 1}
     said = running.stderr.read().decode()
     assert said.count("stopping; a job in hand that takes longer than 5 s will be rendered again") == 1
     assert "Traceback" not in said
@@ -220,9 +222,8 @@ def test_a_job_that_hangs_is_ended_at_the_deadline_and_where_it_hung_is_told(
 ) -> None:
     scene = planned(1)
     running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=4.0)
-    connection = connect(redis_server.url)
-    starts = f"rq:photonfarm:starts:{scene.scene_id}-*"
-    analytic.wait_for(lambda: sum(int(connection.get(key) or 0) for key in connection.keys(starts)) >= 2)
+    store = Store(scene.folder.parent.parent)
+    analytic.wait_for(lambda: kept_failures(store))
     running.send_signal(signal.SIGTERM)
     running.wait(20)
     told = running.stderr.read().decode()
@@ -235,33 +236,17 @@ def test_a_job_that_hangs_is_ended_at_the_deadline_and_where_it_hung_is_told(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("overdue", "reason"),
-    [
-        (4, "it was started 5 times, and each time it took longer than --deadline 1 s and was ended"),
-        (
-            0,
-            "each time its worker died or lost Redis, or it took longer than --deadline 1 s and was ended (1 times)",
-        ),
-    ],
-)
-def test_a_job_that_is_given_up_after_its_last_deadline_has_the_deadline_as_its_reason(
-    analytic: ModuleType,
-    planned: Callable[..., SceneStore],
-    redis_server: EmbeddedRedis,
-    start: Starter,
-    overdue: int,
-    reason: str,
+def test_a_job_that_ends_its_worker_again_and_again_is_set_aside(
+    analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, start: Starter
 ) -> None:
-    """Each has been started four times before."""
     scene = planned(1)
-    connection, name = connect(redis_server.url), f"{scene.scene_id}-0"
-    for job in scene.missing_jobs():
-        connection.set(f"{STARTS}{scene.scene_id}-{job}", 4)
-        connection.set(f"{OVERDUE}{scene.scene_id}-{job}", overdue)
     running = start(
-        scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=1.0, until_complete=True
-    )
-    assert running.wait(60) == 7
-    assert reason in queue_status(connection).failed[name].reason
-    assert not connection.exists(f"{OVERDUE}{name}")
+        scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=0.5, until_complete=True,
+        steady_s=0.1,
+    )  # fmt: skip
+    assert running.wait(120) == 7
+    failed = queue_status(connect(redis_server.url)).failed
+    assert len(failed) == scene.jobs()
+    for failure in failed.values():
+        assert "took longer than --deadline 0.5 s and was ended" in failure.reason
+        assert failure.times == TRIES

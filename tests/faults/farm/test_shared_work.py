@@ -13,14 +13,14 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.renderer.worker.child import RenderWorker
 from photonfarm.renderer.worker.settings import WorkerSettings
-from photonfarm.renderer.worker.share_worker import ShareWorker
 from photonfarm.renderer.worker.worker import run_worker
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.farm.submission import submit
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import Share, job_name, jobs_left_alone, kept_failures
+from photonfarm.shared.queue import TRIES, Share, kept_failures
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 
@@ -127,47 +127,50 @@ def test_sigterm_lets_the_job_at_hand_be_finished(
     running.send_signal(signal.SIGTERM)
     assert running.wait(20) == 0
     assert done + 1 <= len(scene.committed_jobs()) <= done + 2
-    assert kept_failures(Store(scene.folder.parent.parent), lambda _: True) == {}
+    assert kept_failures(Store(scene.folder.parent.parent)) == {}
 
 
-def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_the_next_submission(
+def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_a_retry(
     analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter, tmp_path: Path
 ) -> None:
     scene = planned(2)
     store = Store(scene.folder.parent.parent)
     for _ in range(2):  # the second worker finds what the first one has kept
         assert start(scene, "0/1", 0, "broken", until_complete=True).wait(60) == 7
-    kept = kept_failures(store, lambda _: True)
-    assert [failure.times for failure in kept.values()] == [1, 1]
+    assert [failure.times for failure in kept_failures(store).values()] == [TRIES, TRIES]
+    assert "photonfarm submit --retry" in (tmp_path / "worker-0.log").read_text()
 
     named = NamedSpec("analytic", analytic.small_spec(), None)
-    submit(named, store.root, None, Request(modifications=1, views_per_modification=2, passes=2))
+    request = Request(modifications=1, views_per_modification=2, passes=2)
+    submit(named, store.root, None, request)
+    assert start(scene, "0/1", until_complete=True).wait(60) == 7
+    submit(named, store.root, None, request, retry=True)
     assert start(scene, "0/1", until_complete=True).wait(60) == 0
     assert scene.missing_jobs() == []
 
 
-def test_a_job_that_ends_its_process_has_failed_and_the_others_go_on(
+def test_a_job_whose_process_is_killed_comes_last_and_is_tried_again(
     analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter
 ) -> None:
-    scene = planned(2)
-    running = start(scene, "0/2", 0.5, until_complete=True)
+    scene = planned(3)
+    running = start(scene, "0/1", 0.2, until_complete=True)
     analytic.wait_for(lambda: list((scene.folder.parent.parent / "tmp").glob("*.partial")))  # its first rows
     os.kill(analytic.child_of(running), signal.SIGKILL)
-    assert running.wait(60) == 7
-    assert scene.missing_jobs() == [0]
-    store = Store(scene.folder.parent.parent)
-    (failure,) = kept_failures(store, lambda _: True).values()
+    assert running.wait(60) == 0
+    assert scene.missing_jobs() == []
+    committed = sorted((scene.folder / "committed").iterdir(), key=lambda marker: marker.stat().st_mtime_ns)
+    assert int(committed[-1].stem) == 0
+    (failure,) = kept_failures(Store(scene.folder.parent.parent)).values()
     assert "SIGKILL" in failure.reason
-    assert jobs_left_alone(store, time.time()) == {job_name(scene.scene_id, 0)}
 
 
 @pytest.mark.slow
 def test_a_job_that_hangs_has_failed_at_the_deadline(planned: Callable[..., SceneStore], start: Starter) -> None:
-    scene = planned(2)
-    assert start(scene, "0/2", 60, until_complete=True, deadline_s=3.0).wait(60) == 7
-    kept = kept_failures(Store(scene.folder.parent.parent), lambda _: True).values()
-    assert [failure.times for failure in kept] == [1, 1]
-    assert all("took longer than --deadline 3 s" in failure.reason for failure in kept)
+    scene = planned(1)
+    assert start(scene, "0/1", 60, until_complete=True, deadline_s=0.5, steady_s=0.1).wait(120) == 7
+    kept = kept_failures(Store(scene.folder.parent.parent)).values()
+    assert {failure.times for failure in kept} == {TRIES}
+    assert all("took longer than --deadline 0.5 s" in failure.reason for failure in kept)
 
 
 def test_looks_of_a_worker_cost_little_and_the_last_one_sees_all(
@@ -178,7 +181,7 @@ def test_looks_of_a_worker_cost_little_and_the_last_one_sees_all(
     settings = WorkerSettings(
         store=str(store.root), name="one", share=Share.parse("0/1"), until_complete=True, reserve_bytes=0
     )
-    worker = ShareWorker(settings, store, Share.parse("0/1"), analytic.AnalyticScene.load)
+    worker = RenderWorker(settings, store, analytic.AnalyticScene.load)
     looks, plain = [], SceneStore.missing_jobs
 
     def missing(scene: SceneStore, *, followed: bool = False) -> list[int]:
@@ -188,11 +191,11 @@ def test_looks_of_a_worker_cost_little_and_the_last_one_sees_all(
     monkeypatch.setattr(SceneStore, "missing_jobs", missing)
     jobs = scene.jobs()
     for _ in range(jobs):
-        assert worker._step() is None
+        assert worker.step() is None
     assert looks == [True]
     assert plain(scene) == []
     looks.clear()
-    assert worker._step() == 0
+    assert worker.step() == 0
     assert looks == [True, False], "a followed one, and since it found nothing, a whole one"
 
 

@@ -140,7 +140,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     with analytic.start_worker(store.root, redis_server.url, child, log, until_complete=True, ahead=1.5) as running:
         try:
             analytic.wait_for(lambda: len(new.committed_jobs()) == 2, 120)
-            idle = lambda: queue_status(connection).idle_reports  # noqa: E731
+            idle = lambda: queue_status(connection)  # noqa: E731
             analytic.wait_for(lambda: idle().left.keys() == {ahead.scene_id, new.scene_id}, 60)
             report_consumed(connection, new.scene_id, 8)
             analytic.wait_for(lambda: not new.missing_jobs(), 60)
@@ -157,4 +157,4 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     said = log.read_text()
     assert said.count(f"takes no jobs of scene {ahead.scene_id}: {reason}") == 1
     assert said.count(f"takes jobs of scene {ahead.scene_id} again") == 1
-    assert queue_status(connection).idle_reports.left == {}
+    assert queue_status(connection).left == {}

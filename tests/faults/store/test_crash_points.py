@@ -15,8 +15,8 @@ from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, job_name, open_queue, put_back, queue_status, reconcile
-from photonfarm.shared.queue.entries import queued_names, running_names, taken_names
+from photonfarm.shared.queue import connect, job_name, queue_status, reconcile
+from photonfarm.shared.queue.rq_adapter import open_queue
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 
 COMMIT = """
@@ -159,14 +159,14 @@ def test_a_job_whose_worker_dies_before_redis_learns_of_its_end_stays_as_it_was_
     kill_before_acknowledgement(analytic, root, redis_server.url)
     assert scene.committed_jobs() == {0}
     queue, name = open_queue(connection), job_name(scene.scene_id, 0)
-    assert [entry.decode().partition(":")[0] for entry in running_names(queue)] == [name], "RQ holds it to be running"
+    assert queue.started_job_registry.get_job_ids(cleanup=False) == [name], "RQ holds it to be running"
     committed = files_of(scene)
     if comes_again:
-        put_back(queue, name)
+        connection.lpush(queue.key, name)
 
     with analytic.start_worker(root, redis_server.url, analytic.command(), name="next") as worker:
         try:
-            analytic.wait_for(lambda: not (queued_names(queue) or taken_names(queue) or running_names(queue)))
+            analytic.wait_for(lambda: not (queue.job_ids or queue.started_job_registry.get_job_ids(cleanup=False)))
         finally:
             worker.terminate()
         told = worker.stderr.read().decode()

@@ -3,22 +3,24 @@
 import json
 import re
 import sys
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+import queue_samples
 
 from photonfarm.renderer.worker import heartbeat
-from photonfarm.renderer.worker.heartbeat import HeartbeatThread
+from photonfarm.renderer.worker.queue_source import QueueSource
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.renderer.worker.supervisor import ChildOutput, ending
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
 from photonfarm.shared import queue
 from photonfarm.shared.cli.farm_verbs import status
 from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
-from photonfarm.shared.core.processes import process_space
+from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.queue import connect, job_name, queue_status
@@ -93,26 +95,18 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
         tmp_path / "store",
         [job_name(scene.scene_id, j) for j in range(2)],
     )
-    for _ in range(2):  # it has failed before
-        queue.record_failure(connection, names[0], "earlier")
-    queue.forget_failures(connection, set_aside=False)
     with pytest.raises(IncompleteError):
         run_worker(root, redis_server.url, child=analytic.command(0, "broken"), **QUICK)
     failed = queue_status(connection).failed
-    assert {name: (failure.times, failure.set_aside) for name, failure in failed.items()} == {
-        names[0]: (3, True),
-        names[1]: (1, False),
-    }
-    kept = queue.kept_failures(Store(root), lambda _: True)
-    assert {name: failure.times for name, failure in kept.items()} == {names[0]: 1, names[1]: 1}
-    assert kept[names[1]].reason == failed[names[1]].reason
+    assert {name: failure.times for name, failure in failed.items()} == dict.fromkeys(names, queue.TRIES)
+    assert queue.kept_failures(Store(root)) == failed
     command = f"photonfarm work --store {root} --scene {scene.scene_id} --job 0"
     assert command in capfd.readouterr().err
 
     status.callback(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
     assert cause["cause"].startswith("IncompleteError: half A of sample … ")
-    assert (cause["failed"], cause["set_aside"]) == (2, 1)
+    assert (cause["failed"], cause["set_aside"]) == (2, 2)
     assert [job["command"] for job in cause["jobs"]] == [command, command[:-1] + "1"]
     status.callback(root, redis_server.url, as_json=False)
     shown = capfd.readouterr().out
@@ -131,7 +125,7 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
     status.callback(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
     assert [job["name"] for job in cause["jobs"]] == names[1:], "what has been committed since has not failed"
-    assert queue.reconcile(Store(root), connection, retry_failed=True) == 1
+    assert queue.reconcile(Store(root), connection, retry=True) == 1
 
 
 @pytest.mark.parametrize(
@@ -188,50 +182,43 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     assert said.count("leaves scene") == 1
     assert "Traceback" not in said
 
-    assert queue_status(connection).idle_reports.left == {}, "said while it works only"
+    assert queue_status(connection).left == {}, "said while it works only"
 
 
 def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
     scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    connection = connect(redis_server.url)
-    settings = WorkerSettings(store=str(tmp_path / "store"), redis_url=redis_server.url, name="ada")
-    heart = HeartbeatThread(settings, Store(tmp_path / "store"), None)
-    heart.paused, heart.left = "the disk is full", {scene.scene_id: "gone.xml is not there", "ab" * 16: "a stranger"}
-    heart.start()
+    left = {scene.scene_id: "gone.xml is not there", "ab" * 16: "another store's"}
+    queue_samples.told(connect(redis_server.url), "ada", queue.WorkerReport(paused="the disk is full", left=left))
     status.callback(tmp_path / "store", redis_server.url, as_json=False)
     said = capsys.readouterr().out
     assert "gone.xml is not there" in said
     assert "the disk is full" in said
-    assert "stranger" not in said
+    assert "another store's" not in said
     status.callback(tmp_path / "store", redis_server.url, as_json=True)
     assert json.loads(capsys.readouterr().out)["queue"]["paused"] == {"ada": "the disk is full"}
-    heart.end()
-    status.callback(tmp_path / "store", redis_server.url, as_json=False)
-    assert "takes no jobs" not in capsys.readouterr().out
-    queue.bury(connection, "ada")
 
 
 def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
     scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(heartbeat, "REPORT_S", 0.02)
-    connection = connect(redis_server.url)
-    settings = WorkerSettings(store=str(tmp_path / "store"), redis_url=redis_server.url, name="ada")
-    heart = HeartbeatThread(settings, Store(tmp_path / "store"), None)
-    heart.start()
-    name = job_name(scene.scene_id, 0)
-    with heart.working(name):
-        heart.doing("renders samples", 3, 8)
+    connection, store = connect(redis_server.url), Store(tmp_path / "store")
+    queue.reconcile(store, connection)
+    settings = WorkerSettings(store=str(store.root), redis_url=redis_server.url, name="ada", idle_s=1)
+    source = QueueSource(settings, store, Stop())
+    with source.open():
+        job = source.take(None, {})
+        name = job_name(*job)
+        source.tell_doing(queue.Activity("renders samples", 3, 8, name))
         wanted = {"ada": queue.Activity("renders samples", 3, 8, name)}
         assert _once(lambda: queue_status(connection).activities == wanted)
-    assert _once(lambda: not queue_status(connection).activities)
-    heart.paused = "the disk is full"  # told at once, long before the next heartbeat
-    assert _once(lambda: queue_status(connection).idle_reports.paused == {"ada": "the disk is full"})
-    heart.paused = None
-    assert _once(lambda: not queue_status(connection).idle_reports.paused)
-    heart.end()
-    queue.bury(connection, "ada")
+        connection.flushall()
+        assert _once(lambda: queue_status(connection).running == 1), "what Redis has lost is told again"
+        source.end(name, "done", "")
+        assert _once(lambda: not queue_status(connection).activities)
+        assert source.take("the disk is full", {}) is None
+        assert _once(lambda: queue_status(connection).paused == {"ada": "the disk is full"})
 
 
 def _once(look: Callable[[], bool], seconds: float = 10.0) -> bool:
@@ -255,18 +242,44 @@ def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_al
     analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     connection, said = connect(redis_server.url), []
-    queue.beat(connection, "ada", "another-machine", None, ttl_s=60, process=7)
+    queue_samples.told(connection, "ada", queue.WorkerReport(host="another-machine", process=7))
     run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), report=said.append, **QUICK)
     assert scene.missing_jobs() == []
     assert scene.marker(0)["figures"]["worker"] == "ada-2"
     assert "ada-2" in said[0]
     assert re.fullmatch(r"worker ada-2: ended: 2 jobs done, 6 samples, \d+ s", said[1])
-    assert queue.hosts(connection) == {"another-machine"}
+    assert list(queue.read_workers(connection)) == ["ada"]
 
 
 def test_no_redis_is_told_before_anything_is_started(analytic: ModuleType, scene: SceneStore, tmp_path: Path) -> None:
     with pytest.raises(QueueError):
         run_worker(tmp_path / "store", "redis://127.0.0.1:1/0", child=analytic.command())
+
+
+def test_a_redis_that_refuses_for_good_ends_a_worker_with_a_sentence(
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
+) -> None:
+    """Its user loses a right while it works; a new child would meet the same refusal, for ever."""
+    admin = connect(redis_server.url)
+    admin.acl_setuser("ada", enabled=True, passwords=["+secret"], keys=["*"], commands=["+@all"])
+    ended: list[Exception] = []
+
+    def work() -> None:
+        try:
+            run_worker(
+                tmp_path / "store", redis_server.url.replace("://", "://ada:secret@"), child=analytic.command(),
+                idle_s=1, reserve_bytes=0,
+            )  # fmt: skip
+        except QueueError as error:
+            ended.append(error)
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    analytic.wait_for(lambda: not scene.missing_jobs(), 60)
+    admin.acl_setuser("ada", commands=["-lrange"])
+    worker.join(60)
+    assert "docker/redis.sh" in str(ended[0])
+    assert "secret" not in str(ended[0])
 
 
 def test_a_store_that_cannot_be_opened_is_told_before_anything_is_started(tmp_path: Path) -> None:
@@ -291,10 +304,10 @@ def test_a_store_that_refuses_a_commit_ends_the_worker_and_fails_no_job(
 
 def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(redis_server: EmbeddedRedis) -> None:
     connection = connect(redis_server.url)
-    queue.beat(connection, "far", "another-machine", None, ttl_s=60)
+    queue_samples.told(connection, "far", queue.WorkerReport(host="another-machine", process=7))
     with pytest.raises(IncompleteError):
         check(redis_server.url)
-    queue.beat(connection, "near", process_space(), None, ttl_s=60)
+    queue_samples.told(connection, "near", queue.WorkerReport())
     check(redis_server.url)
 
 

@@ -14,7 +14,8 @@ from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.processes import process_space
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, job_name, queue_status
+from photonfarm.shared.queue import connect, job_name, queue_status, read_workers
+from photonfarm.shared.queue.rq_adapter import open_queue
 from photonfarm.shared.store import SceneStore, Store
 
 
@@ -67,9 +68,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     with pytest.raises(StoreError):
         run_worker(root, redis_server.url, child=(sys.executable, "-c", code, *analytic.command()[1:]), **QUICK)
     assert queue_status(connection).failed == {}
-    assert [name.decode() for name in connection.lrange(queue.open_queue(connection).key, 0, -1)] == [
-        job_name(scene.scene_id, job) for job in range(2)
-    ]
+    assert sorted(open_queue(connection).job_ids) == [job_name(scene.scene_id, job) for job in range(2)]
 
 
 def test_a_store_that_is_not_there_is_not_made(
@@ -85,14 +84,14 @@ def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
 ) -> None:
     log, connection = tmp_path / "log", connect(redis_server.url)
     with analytic.start_worker(tmp_path / "later", redis_server.url, analytic.command(), log, name="ada") as running:
-        analytic.wait_for(lambda: queue.hosts(connection), 60)
+        analytic.wait_for(lambda: read_workers(connection), 60)
         time.sleep(3)  # longer than its heartbeat lasts
         check(redis_server.url)
         assert not (tmp_path / "later").exists()
         store = Store(tmp_path / "later", create=True)
         scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=3), shard_rows=3).scene_id)
         analytic.wait_for(lambda: scene.missing_jobs() == [], 60)
-        hosts = queue.hosts(connection)
+        hosts = {report.host for report in read_workers(connection).values()}
         running.terminate()
         assert running.wait(20) == 0
     assert hosts == {process_space()}

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import queue_samples
 import redis
 
 from photonfarm.shared import queue
 from photonfarm.shared.core.processes import process_space
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
-
-NAME = f"{'ab' * 16}-3"
+from photonfarm.shared.queue import WorkerReport
 
 
 @pytest.fixture
@@ -29,30 +29,26 @@ def gone() -> int:
     return ended.pid
 
 
-def test_a_worker_in_another_container_of_the_same_host_name_keeps_its_name_and_its_job(
+def test_a_worker_in_another_container_of_the_same_host_name_keeps_its_name(
     connection: redis.Redis,
 ) -> None:
     """Its process, by a number that nobody has here or that is our own, is alive there."""
     other = f"{os.uname().nodename}-0123abcd4026531836"
     for process in (gone(), os.getpid()):
-        queue.beat(connection, "ada", other, NAME, ttl_s=60, process=process)
-        assert queue.take_name(connection, "ada", process_space(), os.getpid(), ttl_s=60) == "ada-2"
-        assert queue.job_of_worker(connection, "ada") == NAME
-        assert connection.exists(queue.ALIVE + NAME)
+        queue_samples.told(connection, "ada", WorkerReport(host=other, process=process))
+        assert queue.take_name(connection, "ada", ttl_s=60) == "ada-2"
+        assert list(queue.read_workers(connection)) == ["ada", "ada-2"]
         queue.bury(connection, "ada-2")
 
 
-def test_a_worker_that_was_killed_in_this_container_leaves_its_name_at_once(connection: redis.Redis) -> None:
-    queue.beat(connection, "ada", process_space(), NAME, ttl_s=60, process=gone())
-    assert queue.take_name(connection, "ada", process_space(), os.getpid(), ttl_s=60) == "ada"
-    assert not connection.exists(queue.ALIVE + NAME)
-
-
-def test_a_worker_that_was_killed_here_is_not_counted_while_its_heartbeat_lasts(connection: redis.Redis) -> None:
-    queue.beat(connection, "killed", process_space(), NAME, ttl_s=60, process=gone())
-    queue.beat(connection, "alive", process_space(), None, ttl_s=60, process=os.getppid())
-    queue.beat(connection, "elsewhere", "another-machine", None, ttl_s=60, process=gone())
+def test_a_worker_that_was_killed_here_is_not_counted_while_its_heartbeat_lasts_and_leaves_its_name_at_once(
+    connection: redis.Redis,
+) -> None:
+    queue_samples.told(connection, "killed", WorkerReport(process=gone()))
+    queue_samples.told(connection, "alive", WorkerReport(process=os.getppid()))
+    queue_samples.told(connection, "elsewhere", WorkerReport(host="another-machine", process=gone()))
     assert queue.queue_status(connection).workers == 2
+    assert queue.take_name(connection, "killed", ttl_s=60) == "killed"
 
 
 def test_a_process_space_is_the_same_for_every_process_in_it_and_begins_with_the_hosts_name() -> None:

@@ -21,7 +21,7 @@ from photonfarm.shared.farm.status import StoreQueue
 from photonfarm.shared.farm.training import RunFolder
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.queue import Activity, IdleReports, QueueStatus
+from photonfarm.shared.queue import Activity, QueueStatus
 from photonfarm.shared.store import Store
 
 
@@ -41,7 +41,7 @@ def test_further_passes_are_told_apart_from_samples(store: Store, tmp_path: Path
 def test_what_workers_do_and_why_they_do_not_stands_in_the_line(store: Store, tmp_path: Path) -> None:
     scene = store.scene(store.plan(samples.small_spec(), Request(modifications=6), shard_rows=4).scene_id)
     doing = {"ada": Activity("renders samples", 3, 4), "bob": Activity("loads the scene")}
-    status = QueueStatus(1, 2, 2, {}, IdleReports({}, {}), doing)
+    status = QueueStatus(1, 2, 2, {}, activities=doing)
     working = up._Farm(scene, tmp_path, 0, lambda: StoreQueue(status, [])).look()
     assert progress_line(working, 90.0) == (
         "samples 0/6 (+3 in hand), 90 s left  (ada renders samples 3/4; bob loads the scene)"
@@ -49,7 +49,7 @@ def test_what_workers_do_and_why_they_do_not_stands_in_the_line(store: Store, tm
     samples.commit(scene, 0, samples.outputs(scene, 0))
     seconds_later = up._Farm(scene, tmp_path, 0, lambda: StoreQueue(status, [])).look()
     assert (seconds_later.samples, seconds_later.in_hand) == ((4, 6), 2), "no more than are missing"
-    full = replace(status, idle_reports=IdleReports({"ada": "the disk is full"}, {}), activities={})
+    full = replace(status, paused={"ada": "the disk is full"}, activities={})
     waiting = up._Farm(scene, tmp_path, 0, lambda: StoreQueue(full, [])).look()
     assert progress_line(waiting) == "samples 4/6  (worker ada takes no jobs: the disk is full)"
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import queue_samples
 import redis
 import store_samples as samples
 from click.testing import CliRunner
@@ -55,9 +56,8 @@ def test_progress_pace_and_time_left_are_of_what_workers_have_in_hand_too(
     samples.commit(scene, 0, samples.outputs(scene, 0))
     doing = queue.Activity("renders samples", 1, 2, queue.job_name(scene.scene_id, 1))
     stranger = queue.Activity("renders samples", 5, 9, f"{'ab' * 16}-1")
-    queue.beat(connection, "ada", "elsewhere", doing.job, ttl_s=60, process=1)
-    queue.report_activity(connection, "ada", doing, ttl_s=60)
-    queue.report_activity(connection, "eve", stranger, ttl_s=60)
+    for worker, does in (("ada", doing), ("eve", stranger)):
+        queue_samples.told(connection, worker, queue.WorkerReport(host="elsewhere", process=1, doing=does))
     now[0] = STEADY_S * 2
     view = watch.look()
     (found,) = view.scenes
@@ -109,16 +109,18 @@ def test_status_watch_ends_with_exit_code_0_on_ctrl_c(
 def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
     scene: SceneStore, store: Store, common_redis: EmbeddedRedis, connection: redis.Redis
 ) -> None:
+    queue.reconcile(store, connection)
+    queue_samples.failed(connection, "ValueError: 7 is odd")
+    left = {scene.scene_id: "room.xml is missing"}
+    idle = queue.WorkerReport(host="elsewhere", process=1, paused="the disk is full", left=left)
     for worker in ("ada", "bob"):
-        queue.beat(connection, worker, "elsewhere", None, ttl_s=60, process=1)
-        queue.report_idle(connection, worker, "the disk is full", {scene.scene_id: "room.xml is missing"}, ttl_s=60)
-    queue.record_failure(connection, queue.job_name(scene.scene_id, 0), "ValueError: 7 is odd")
+        queue_samples.told(connection, worker, idle)
     found = list(waits.waits(queue_of(store, common_redis.url), {scene.scene_id: "small"}, 8))
     assert [(wait.kind, wait.count) for wait in found] == [("scene_left", 1), ("worker_paused", 2), ("job_failed", 1)]
     assert [str(wait) for wait in found] == [
         "small: left by 2 of 2 workers: room.xml is missing",
         "2 workers take no jobs: the disk is full",
-        "1 job failed: ValueError: … is odd",
+        "1 job failed, 1 of them set aside until `photonfarm submit --retry`: ValueError: … is odd",
     ]
 
 
@@ -129,7 +131,7 @@ def test_samples_that_no_worker_renders_wait_for_one(store: Store, connection: r
 
 def test_failures_outlive_redis_until_their_job_is_committed(scene: SceneStore, store: Store, tmp_path: Path) -> None:
     name = queue.job_name(scene.scene_id, 1)
-    queue.keep_failure(store, name, "ValueError: 7", worker="ada", at_s=time.time())
+    queue.keep_failure(store, name, "ValueError: 7", worker="ada")
     found = queue_of(store, f"unix://{tmp_path}/none")
     assert isinstance(found, NoQueue)
     assert [list(cause.jobs) for cause in found.kept] == [[name]]
@@ -140,9 +142,9 @@ def test_failures_outlive_redis_until_their_job_is_committed(scene: SceneStore, 
 def test_a_failure_that_redis_knows_is_not_told_twice(
     scene: SceneStore, store: Store, common_redis: EmbeddedRedis, connection: redis.Redis
 ) -> None:
-    name = queue.job_name(scene.scene_id, 1)
-    queue.keep_failure(store, name, "ValueError: 7", worker="ada", at_s=time.time())
-    queue.record_failure(connection, name, "ValueError: 7")
+    queue.reconcile(store, connection)
+    name = queue_samples.failed(connection, "ValueError: 7")
+    queue.keep_failure(store, name, "ValueError: 7", worker="ada")
     found = queue_of(store, common_redis.url)
     assert isinstance(found, StoreQueue)
     assert (len(found.causes), found.kept) == (1, [])
@@ -169,7 +171,7 @@ def test_status_finds_the_redis_of_an_up_that_is_at_work_here(
 ) -> None:  # fmt: skip
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
-    queue.beat(connection, "ada", "elsewhere", None, ttl_s=60, process=1)
+    queue_samples.told(connection, "ada", queue.WorkerReport(host="elsewhere", process=1))
     with announced(store, redis_url=common_redis.url, run=tmp_path / "run", web="http://localhost:1/"):
         found = json.loads(CliRunner().invoke(umbrella, ["status", "--json"]).stdout)
         assert found["queue"]["workers"] == 1

@@ -1,91 +1,93 @@
-"""Jobs that fail: how often, what they have in common, and when they are set aside."""
+"""Jobs that failed: what they have in common, in Redis and in the store."""
+
+import json
+import time
 
 import pytest
 import queue_samples
 import redis
 from redis.connection import AbstractConnection as Connection
+from rq.results import Result
 
 from photonfarm.shared import queue
-from photonfarm.shared.queue import FAILED, Failure, job_name, open_queue, queue_status, reconcile
+from photonfarm.shared.queue import TRIES, Failure, job_name, queue_status, reconcile
+from photonfarm.shared.queue.rq_adapter import open_queue
 from photonfarm.shared.store import SceneStore, Store
 
 scene = queue_samples.scene
-SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
+SCENE_ID = queue_samples.SCENE_ID
 
 
-def test_a_job_that_fails_three_times_is_set_aside_until_asked_for(
+def test_what_was_set_aside_is_queued_again_only_when_asked_for(
     connection: redis.Redis, store: Store, scene: SceneStore
 ) -> None:
-    name = job_name(scene.scene_id, 4)
-    for times in (1, 2):
-        assert queue.record_failure(connection, name, "broken") == Failure("broken", times, set_aside=False)
-        assert 0 < connection.ttl(FAILED + name) <= 3600
-        assert reconcile(store, connection, limit=100, retry_failed=True) == (10 if times == 1 else 0)
-        open_queue(connection).delete(delete_jobs=False)
-        assert reconcile(store, connection) == 10
-    assert queue.record_failure(connection, name, "broken").set_aside
-    open_queue(connection).delete(delete_jobs=False)
-    assert connection.ttl(FAILED + name) == -1
-    assert queue_status(connection).failed == {name: Failure("broken", 3, set_aside=True)}
-    assert reconcile(store, connection, retry_failed=True) == 9
-    assert reconcile(store, connection, retry_set_aside=True) == 1
+    assert reconcile(store, connection) == 10
+    name = queue_samples.failed(connection, "broken")
+    assert queue_status(connection).failed == {name: Failure("broken", TRIES)}
+    assert reconcile(store, connection) == 0
+    assert reconcile(store, connection, retry=True) == 1
     assert queue_status(connection).failed == {}
-    assert queue.record_failure(connection, name, "broken").times == 1
+    assert not connection.exists(Result.get_key(name))
+    assert open_queue(connection).fetch_job(name).retries_left == TRIES - 1
 
 
-def test_many_failures_are_read_in_a_few_requests(connection: redis.Redis) -> None:
-    for i in range(1500):
-        connection.set(f"{FAILED}{SCENE_ID}-{i}", f"why {i}", ex=None if i % 2 else 3600)
+def test_many_failures_are_read_in_a_few_requests(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
+    reconcile(store, connection)
+    for number in range(10):
+        queue_samples.failed(connection, f"why {number}")
     requests, plain = [], Connection.send_packed_command
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Connection, "send_packed_command", lambda *args, **how: (requests.append(1), plain(*args, **how)))
         failed = queue_status(connection).failed
-        assert len(requests) < 40
-        requests.clear()
-        queue.forget_failures(connection, set_aside=False)
-        assert len(requests) < 40
-    assert len(failed) == 1500
-    assert failed[f"{SCENE_ID}-1499"] == Failure("why 1499", 1, set_aside=True)
-    assert failed[f"{SCENE_ID}-1498"] == Failure("why 1498", 1, set_aside=False)
-    assert len(connection.keys(f"{FAILED}*")) == 750
-
-
-def test_a_job_that_has_ended_well_has_nothing_counted_against_it(connection: redis.Redis) -> None:
-    for _ in range(3):
-        queue.record_failure(connection, NAME, "broken")
-    queue.forget_failures_of(connection, NAME)
-    assert not connection.keys("rq:photonfarm:*")
+    assert len(requests) < 10
+    assert failed[job_name(scene.scene_id, 9)] == Failure("why 9", TRIES)
 
 
 def test_failures_are_grouped_by_what_they_have_in_common() -> None:
-    def failed(reason: str, times: int = 1) -> Failure:
-        return Failure(reason, times, set_aside=times >= 3)
-
     first, *others = queue.causes(
         {
-            f"{SCENE_ID}-1": failed(f"IncompleteError: half A of sample {'ab' * 16} came out non-finite 3 times"),
-            f"{SCENE_ID}-2": failed(f"IncompleteError: half A of sample {'cd' * 16} came out non-finite 3 times", 3),
-            f"{SCENE_ID}-3": failed(f"IncompleteError: half B of sample {'ab' * 16} came out non-finite 3 times"),
-            f"{SCENE_ID}-4": failed("ValueError: cannot reshape array of size -12 into shape (4,3.5)"),
-            f"{SCENE_ID}-5": failed("ValueError: cannot reshape array of size 7 into shape (4,1e-3)"),
-            f"{SCENE_ID}-6": failed("IncompleteError: half A of sample … came out", 2),
+            f"{SCENE_ID}-1": Failure(f"IncompleteError: half A of sample {'ab' * 16} came out non-finite 3 times", 1),
+            f"{SCENE_ID}-2": Failure(
+                f"IncompleteError: half A of sample {'cd' * 16} came out non-finite 3 times", TRIES
+            ),
+            f"{SCENE_ID}-3": Failure(f"IncompleteError: half B of sample {'ab' * 16} came out non-finite 3 times", 1),
+            f"{SCENE_ID}-4": Failure("ValueError: cannot reshape array of size -12 into shape (4,3.5)", 1),
+            f"{SCENE_ID}-5": Failure("ValueError: cannot reshape array of size 7 into shape (4,1e-3)", 1),
+            f"{SCENE_ID}-6": Failure("IncompleteError: half A of sample … came out", 2),
         }
     )
     assert first.cause == "IncompleteError: half A of sample … came out non-finite … times"
-    assert (list(first.jobs), first.set_aside, first.example) == (
-        [f"{SCENE_ID}-2", f"{SCENE_ID}-1"],
-        1,
-        f"{SCENE_ID}-2",
-    )
+    names = [f"{SCENE_ID}-2", f"{SCENE_ID}-1"]
+    assert (list(first.jobs), first.set_aside, first.example) == (names, 1, names[0])
     assert [len(cause.jobs) for cause in others] == [2, 1, 1]
 
 
-def test_what_a_stranger_writes_as_a_failure_cannot_speak_to_a_terminal(connection: redis.Redis) -> None:
-    connection.set(FAILED + NAME, b"\x1b]0;owned\x07\xff" + b"x" * 1_000_000)
-    connection.set(f"{FAILED}../../etc", "why")
-    connection.set(f"{FAILED}{SCENE_ID}-8; rm -rf ~", "why")
-    ((name, failure),) = queue_status(connection).failed.items()
-    assert name == NAME
-    assert failure.reason.startswith(" ]0;owned")
-    assert failure.reason.isprintable()
-    assert len(failure.reason) <= 2000
+def test_a_failure_is_kept_in_the_store_until_it_is_retried_and_the_last_one_counts(
+    store: Store, scene: SceneStore
+) -> None:
+    name = job_name(scene.scene_id, 1)
+    for reason in ("ValueError: first", "ValueError: second\nand more"):
+        queue.keep_failure(store, name, reason, worker="ada")
+        time.sleep(0.002)  # files are named by milliseconds
+    assert queue.kept_failures(Store(store.root)) == {name: Failure("ValueError: second and more", 2)}
+    assert queue.kept_failures(store, lambda _: False) == {}
+    assert queue.times_failed(store) == {name: 2}
+    queue.keep_retry(store)
+    time.sleep(0.002)
+    assert queue.kept_failures(store) == queue.times_failed(store) == {}
+    queue.keep_failure(store, name, "ValueError: third", worker="ada")
+    assert queue.times_failed(store) == {name: 1}
+
+
+def test_files_that_are_no_failures_do_no_harm(store: Store, scene: SceneStore) -> None:
+    name = job_name(scene.scene_id, 0)
+    queue.keep_retry(store)
+    folder = scene.folder.parent.parent / "failures"
+    assert not folder.exists() or not list(folder.iterdir()), "nothing is to be forgotten"
+    queue.keep_failure(store, name, "ValueError", worker="ada")
+    (folder / f"{scene.scene_id}-007.1.json").write_text("{}")  # no name of a job
+    (folder / "notes.txt").write_text("mine")
+    (kept,) = folder.glob("*-0.*.json")
+    assert json.loads(kept.read_text())["job"] == name
+    kept.write_text("[" * 100_000)
+    assert list(queue.kept_failures(store)) == [name]

@@ -1,168 +1,133 @@
-"""Only our own function runs, whatever Redis says a job is; against a real server."""
+"""Jobs in the queue: what is taken, what a job comes to, and that only our own function runs; against a real server."""
 
+import logging
 import pickle
+import time
 import zlib
-from pathlib import Path
 
 import pytest
 import queue_samples
 import redis
-from rq.job import Callback, Job
+from rq.job import Job
 from rq.serializers import JSONSerializer
-from rq.webhook import Webhook
 
-from photonfarm.renderer.jobs.render import render_shard
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import IncompleteError, QueueError
-from photonfarm.shared.queue import FUNCTION, QUEUE, RenderArguments, RenderJob, open_queue
+from photonfarm.shared.core.errors import QueueError
+from photonfarm.shared.queue import TRIES, RenderArguments, queue_status
+from photonfarm.shared.queue.job import FUNCTION
+from photonfarm.shared.queue.rq_adapter import add, fail, fail_lost, fail_of_worker, finish, keep_alive, open_queue
 
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
-pushed, queued = queue_samples.pushed, queue_samples.queued
-KWARGS = {"scene_id": SCENE_ID, "job": 7}
+OTHER_ID = "ab" * 16
+taken, queued = queue_samples.taken, queue_samples.queued
 
 
-def stored(connection: redis.Redis, function: str = FUNCTION, **more: object) -> Job:
-    """A job of ours, written into Redis by plain RQ as somebody else likes it, and taken by our own code."""
-    job = Job.create(function, id=NAME, connection=connection, serializer=JSONSerializer, **more)
-    job.save()
-    pushed(connection, NAME)
-    taken, strangers = queue.take(open_queue(connection))
-    assert isinstance(taken, RenderJob)
-    assert strangers == 0
-    return taken
-
-
-def assert_is_ours(job: Job) -> None:
-    assert (job.func_name, job.instance, job.args, job.kwargs) == (FUNCTION, None, (), KWARGS)
-    assert job.func is render_shard
-    assert job.success_callback is job.failure_callback is job.stopped_callback is None
-    assert (job.webhooks, job.retries_left, job.repeats_left, job.group_id) == ([], None, None, None)
-    assert (job.result_ttl, job.timeout, job.origin, job.get_status()) == (0, 7 * 86400, QUEUE, "queued")
-
-
-def test_a_job_is_what_its_name_tells(connection: redis.Redis) -> None:
-    assert_is_ours(stored(connection, kwargs=KWARGS))
-
-
-@pytest.mark.parametrize("function", ["os.system", "photonfarm.renderer.jobs.render.serve", "builtins.eval"])
-def test_another_function_in_redis_is_not_looked_at(connection: redis.Redis, function: str) -> None:
-    assert_is_ours(stored(connection, function, args=["true"], kwargs={"command": "true"}))
-
-
-def test_callbacks_webhooks_retries_repetitions_and_groups_in_redis_are_not_looked_at(connection: redis.Redis) -> None:
-    evil = Callback("os.system")
-    webhook = Webhook("http://127.0.0.1:1/", "finished")
-    job = Job.create(
-        "os.system", id=NAME, connection=connection, serializer=JSONSerializer, timeout=1, result_ttl=-1,
-        on_success=evil, on_failure=evil, on_stopped=evil, webhooks=[webhook], group_id="evil", origin="elsewhere",
-    )  # fmt: skip
-    job.repeats_left, job.retries_left = 3, 3
-    job.save()
-    pushed(connection, NAME)
-    assert_is_ours(queue.take(open_queue(connection))[0])
-
-
-@pytest.mark.parametrize("field", ["data", "meta", "result", "status", "webhooks", "created_at"])
-def test_neither_pickles_nor_nonsense_are_read(connection: redis.Redis, field: str, tmp_path: Path) -> None:
-    class Evil:
-        def __reduce__(self) -> tuple[object, ...]:
-            return (Path.touch, (tmp_path / "owned",))
-
-    for evil in (pickle.dumps(Evil()), zlib.compress(pickle.dumps(Evil())), b"\xff" * 100):
-        connection.hset(f"rq:job:{NAME}", field, evil)
-        pushed(connection, NAME)
-        assert_is_ours(queue.take(open_queue(connection))[0])
-    assert not (tmp_path / "owned").exists()
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "os.system",
-        "../../etc/passwd-0",
-        f"../../{SCENE_ID}-7",
-        f"{SCENE_ID}/../x-7",
-        f"{SCENE_ID}--7",
-        f"{SCENE_ID}-07",
-        f"{SCENE_ID}-7\n",
-        f"{SCENE_ID}-٧",
-        f"{SCENE_ID.upper()}-7",
-        f"{SCENE_ID}-{1 << 48}",
-        SCENE_ID,
-        "",
-        "-",
-        "x" * 1_000_000,
-    ],
-)
-def test_what_is_not_named_as_a_job_is_thrown_away_and_what_comes_after_it_taken(
-    connection: redis.Redis, name: str
+@pytest.mark.parametrize("function", ["os.system", "photonfarm.shared.core.errors.QueueError", "builtins.eval"])
+def test_a_foreign_function_in_redis_is_neither_run_nor_imported_and_its_entry_thrown_away(
+    connection: redis.Redis, function: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    pushed(connection, name, NAME)
-    listed = open_queue(connection)
-    job, strangers = queue.take(listed)
-    if job is None:  # well formed, and yet not a name
-        job, more = queue.take(listed)
-        strangers += more
-    assert strangers == 1
-    assert_is_ours(job)
-    assert queue.take(listed) == (None, 0)
-    assert connection.lrange(listed.intermediate_queue_key, 0, -1) == [NAME.encode()]
+    monkeypatch.setattr("rq.job.import_attribute", lambda name: pytest.fail(f"imports {name}"))
+    Job.create(function, id=NAME, args=["true"], connection=connection, serializer=JSONSerializer).save()
+    connection.rpush(open_queue(connection).key, NAME)
+    assert taken(connection) is None
+    assert queued(connection) == []
+    assert "is no job to render" in caplog.text
+
+
+def test_pickles_are_not_loaded(connection: redis.Redis, caplog: pytest.LogCaptureFixture) -> None:
+    add(open_queue(connection), [(SCENE_ID, 7)])
+    connection.hset(Job.key_for(NAME), "data", zlib.compress(pickle.dumps((FUNCTION, None, (), {}))))
+    assert taken(connection) is None
+    assert "is no job to render" in caplog.text
+
+
+def test_a_job_that_redis_has_lost_is_passed_over_in_silence(
+    connection: redis.Redis, caplog: pytest.LogCaptureFixture
+) -> None:
+    add(open_queue(connection), [(SCENE_ID, 7), (SCENE_ID, 8)])
+    connection.delete(Job.key_for(NAME))
+    with caplog.at_level(logging.WARNING):
+        assert taken(connection).job_id == f"{SCENE_ID}-8"
+    assert not caplog.text
+
+
+@pytest.mark.parametrize("name", ["", "nonsense", f"{SCENE_ID}-", f"{SCENE_ID}-07", f"{'A' * 32}-7", f"{SCENE_ID}-٧"])
+def test_what_is_no_name_is_refused(name: str) -> None:
     with pytest.raises(QueueError):
         RenderArguments.of(name)
+    assert RenderArguments.of(NAME) == (SCENE_ID, 7)
 
 
 def test_jobs_of_scenes_to_leave_stay_in_their_order(connection: redis.Redis) -> None:
-    left, listed = [f"{'ab' * 16}-{number}" for number in (7, 8)], open_queue(connection)
-    pushed(connection, left[0], "nonsense", left[1], NAME)
-    job, strangers = queue.take(listed, leave=["ab" * 16])
-    assert_is_ours(job)
-    assert strangers == 1
-    assert queue.take(listed, leave=["ab" * 16]) == (None, 0)
-    assert connection.lrange(listed.key, 0, -1) == [name.encode() for name in left]
-    assert connection.lrange(listed.intermediate_queue_key, 0, -1) == [NAME.encode()]
+    add(open_queue(connection), [(OTHER_ID, 7), (OTHER_ID, 8), (SCENE_ID, 7)])
+    assert taken(connection, leave=[OTHER_ID]).job_id == NAME
+    assert taken(connection, leave=[OTHER_ID]) is taken(connection, scene_id=SCENE_ID) is None
+    assert queued(connection) == [f"{OTHER_ID}-7", f"{OTHER_ID}-8"]
+    assert taken(connection, scene_id=OTHER_ID).job_id == f"{OTHER_ID}-7"
 
 
-def test_a_job_named_in_a_dead_encoding_is_thrown_away(connection: redis.Redis) -> None:
-    pushed(connection, b"\xff\xfe-7", pickle.dumps(NAME))
-    assert queue.take(open_queue(connection)) == (None, 2)
+def test_a_job_that_is_done_leaves_nothing_in_redis(connection: redis.Redis) -> None:
+    jobs = open_queue(connection)
+    add(jobs, [(SCENE_ID, 7)])
+    execution = taken(connection)
+    assert jobs.started_job_registry.get_job_ids(cleanup=False) == [NAME]
+    assert queue_status(connection).running == 1
+    finish(jobs, execution)
+    assert not list(connection.scan_iter(f"*{SCENE_ID}*"))
+    assert not connection.exists(jobs.started_job_registry.key, execution.worker_executions_key)
 
 
-def test_what_redis_holds_of_a_job_stays_there(connection: redis.Redis) -> None:
-    """8 MB under the job's key, a bomb of zeros, and 8 MB in the queue itself."""
-    large = 8 << 20
-    connection.eval(
-        "local large = string.rep(string.rep('x', 1048576), 8) "
-        "redis.call('HSET', KEYS[1], 'data', large) redis.call('RPUSH', KEYS[2], large, ARGV[1])",
-        2, f"rq:job:{NAME}", open_queue(connection).key, NAME,
-    )  # fmt: skip
-    connection.hset(f"rq:job:{NAME}", "meta", zlib.compress(b"0" * large))
-    sent = connection.info("stats")["total_net_output_bytes"]
-    job, strangers = queue.take(open_queue(connection))
-    assert connection.info("stats")["total_net_output_bytes"] - sent < 20_000
-    assert_is_ours(job)
-    assert strangers == 1
+def test_a_job_that_fails_is_tried_again_at_the_end_until_its_tries_are_used_up(connection: redis.Redis) -> None:
+    jobs = open_queue(connection)
+    add(jobs, [(SCENE_ID, 7), (SCENE_ID, 8)])
+    for _ in range(TRIES - 1):
+        assert not fail(jobs, taken(connection, scene_id=SCENE_ID), "ValueError: broken\nby itself")
+        assert queued(connection)[-1] == NAME
+        assert queue_status(connection).failed == {}
+        first = taken(connection)
+        assert first.job_id == f"{SCENE_ID}-8"
+        assert not fail(jobs, first, "stopped", counts=False)  # no try of it
+    last = taken(connection)
+    assert fail(jobs, last, "ValueError: broken\nby itself")
+    assert queued(connection) == [f"{SCENE_ID}-8"]
+    ((name, failure),) = queue_status(connection).failed.items()
+    assert (name, failure.reason, failure.times, failure.set_aside) == (
+        NAME,
+        "ValueError: broken by itself",
+        TRIES,
+        True,
+    )
+    assert Job.fetch(NAME, connection, JSONSerializer).latest_result().exc_string == failure.reason, (
+        "as RQ's tools see it"
+    )
+    assert not fail(jobs, last, "again"), "it is decided once"
 
 
-def test_a_refused_job_does_not_run(connection: redis.Redis) -> None:
-    job = stored(connection)
-    job.refuse("its worker died")
-    with pytest.raises(IncompleteError, match="its worker died"):
-        job.perform()
+def test_a_job_whose_worker_died_is_free_once_it_is_known_or_no_longer_told_of(connection: redis.Redis) -> None:
+    jobs = open_queue(connection)
+    add(jobs, [(SCENE_ID, 7), (SCENE_ID, 8), (SCENE_ID, 9)])
+    taken(connection, "ada")
+    fail_of_worker(connection, "ada", "it was killed", counts=True)
+    assert queued(connection)[-1] == NAME
+    taken(connection, "bob", ttl_s=1)
+    lives = taken(connection, "eve", ttl_s=1)
+    with connection.pipeline() as pipeline:
+        keep_alive(jobs, lives, pipeline, 60)
+        pipeline.execute()
+    time.sleep(1.1)
+    assert queue_status(connection).running == 1
+    fail_lost(jobs)
+    assert queued(connection) == [NAME, f"{SCENE_ID}-8"]
 
 
-def test_a_finished_job_sets_no_dependents_free(connection: redis.Redis) -> None:
-    listed = open_queue(connection)
-    Job.create("os.system", id="evil", connection=connection, serializer=JSONSerializer, origin=QUEUE).save()
-    connection.sadd(Job.dependents_key_for(NAME), "evil")
-    listed.enqueue_dependents(stored(connection))
-    assert listed.get_job_ids() == []
-
-
-def test_a_job_that_is_put_back_is_the_next_one_and_there_once(connection: redis.Redis) -> None:
-    others = [f"{SCENE_ID}-{number}" for number in (1, 2)]
-    pushed(connection, NAME, *others)
-    listed = open_queue(connection)
-    queue.take(listed)
-    for _ in range(2):
-        queue.put_back(listed, NAME)
-    assert queued(connection) == [NAME, *others]
+def test_a_redis_that_forgot_the_job_in_hand_is_told_of_it_again(connection: redis.Redis) -> None:
+    jobs = open_queue(connection)
+    add(jobs, [(SCENE_ID, 7)])
+    execution = taken(connection)
+    connection.flushall()
+    with connection.pipeline() as pipeline:
+        keep_alive(jobs, execution, pipeline, 60)
+        pipeline.execute()
+    assert queue_status(connection).running == 1
+    fail_of_worker(connection, "worker", "killed", counts=True)  # of its tries nothing is known
+    assert queue_status(connection).running == 0
+    assert queued(connection) == []

@@ -8,6 +8,7 @@ import subprocess
 import time
 import traceback
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,8 @@ from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.farm import submission
 from photonfarm.shared.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, open_queue, queue_status, reconcile, with_password_of
+from photonfarm.shared.queue import connect, look, queue_status, reconcile, rq_adapter, with_password_of
+from photonfarm.shared.queue.rq_adapter import open_queue
 from photonfarm.shared.scene.spec_loading import NamedSpec
 from photonfarm.shared.store import SceneStore, Store
 
@@ -108,18 +110,19 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
     port, password = guarded
     with connect(with_password_of(password, f"redis://127.0.0.1:{port}/0")) as limited:
         assert reconcile(store, limited) == 10
-        queue.beat(limited, "worker", "host", "job", ttl_s=60)
-        queue.record_failure(limited, NAME, "broken")
+        assert queue.take_name(limited, "worker", ttl_s=60) == "worker"
+        assert queue.take_name(limited, "worker", ttl_s=60) == "worker-2"
         queue.report_consumed(limited, SCENE_ID, 1)
-        assert queue_status(limited).queued == 10
-        assert queue.take_name(limited, "worker", "host", os.getppid(), ttl_s=60) == "worker-2"
-        queue.report_idle(limited, "worker", "full", {SCENE_ID: "gone"}, ttl_s=60)
+        assert look(store, limited, every_s=60) == "waits"
+        rq_adapter.finish(rq_adapter.open_queue(limited), queue_samples.taken(limited))
+        queue_samples.failed(limited, "broken")
+        rq_adapter.fail_of_worker(limited, queue_samples.taken(limited, "worker").worker_name, "killed", counts=False)
+        status = queue_status(limited)
+        assert (status.queued, status.running, status.workers, len(status.failed)) == (8, 0, 2, 1)
+        assert reconcile(store, limited, retry=True) == 2
         for name in ("worker", "worker-2"):
             queue.bury(limited, name)
-        assert queue.hosts(limited) == set()
         queue.release(limited, store)
-        assert queue.count_start(limited, NAME) == queue.count_overdue(limited, NAME) == 1
-        assert queue.take(open_queue(limited))[0] is not None
         forbidden = (
             ("FLUSHALL",), ("CONFIG", "GET", "dir"), ("KEYS", "*"), ("SHUTDOWN",), ("ACL", "LIST"),
             ("SET", "other", "1"), ("PUBLISH", "rq:pubsub:x", "{}"), ("MODULE", "LIST"), ("REPLICAOF", "h", "1"),
@@ -127,8 +130,26 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
         for command in forbidden:
             with pytest.raises(redis.exceptions.NoPermissionError):
                 limited.execute_command(*command)
-        with pytest.raises(redis.RedisError):
-            limited.set("rq:large", b"x" * (2 << 20))
+
+
+def test_a_cluster_is_refused_with_a_sentence(store: Store, scene: SceneStore, tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    command = [server_binary(), "--port", str(port), "--cluster-enabled", "yes", "--dir", tmp_path, "--save", ""]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
+        try:
+            deadline = time.monotonic() + 60
+            while True:
+                with suppress(QueueError), connect(f"redis://127.0.0.1:{port}/0") as connection:
+                    break
+                assert time.monotonic() < deadline
+            connection.execute_command("CLUSTER", "ADDSLOTSRANGE", "0", "16383")
+            while b"cluster_state:ok" not in connection.execute_command("CLUSTER", "INFO"):
+                assert time.monotonic() < deadline
+            with pytest.raises(queue.RefusedError, match="without cluster mode"):
+                reconcile(store, connection)
+        finally:
+            process.terminate()
 
 
 LENGTH = """

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import queue_samples
 import redis
 
 from photonfarm.shared import queue
@@ -38,7 +39,7 @@ def test_another_store_takes_over_when_the_time_that_it_was_told_is_over(
     """The owner was killed, and its heartbeat and its word stay behind."""
     store, other = (Store(tmp_path / name, create=True) for name in ("store", "other"))
     queue.serve(connection, store)
-    queue.beat(connection, "killed", "elsewhere", None, ttl_s=3600)
+    queue_samples.told(connection, "killed", queue.WorkerReport(host="elsewhere", process=1))
     assert 110 <= seconds_told(refusal(connection, other)) <= 120
     connection.pexpire(queue.SERVED, 1500)
     left_s = seconds_told(refusal(connection, other))

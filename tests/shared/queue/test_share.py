@@ -1,4 +1,4 @@
-"""Shares of the jobs, and what workers without Redis leave alone."""
+"""Shares of the jobs."""
 
 import random
 from itertools import pairwise
@@ -6,11 +6,7 @@ from itertools import pairwise
 import pytest
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.queue import Share, job_name, jobs_left_alone, keep_failure, keep_submission
-from photonfarm.shared.store import Store
-
-NAME = job_name("0" * 32, 7)
-HOUR_S = 3600.0
+from photonfarm.shared.queue import Share
 
 
 @pytest.mark.parametrize("text", ["4/4", "1", "/3", "-1/3", "1/0", "a/b", "1/2/3", "١/٢"])
@@ -39,39 +35,13 @@ def test_helpers_take_what_is_left_in_different_orders() -> None:
     assert orders[0] == Share.parse("0/8").order(left[::-1]), "the order does not depend on how they were listed"
 
 
-def test_a_failed_job_is_left_alone_for_an_hour_and_for_good_after_three_failures(store: Store) -> None:
-    keep_failure(store, NAME, "broken", worker="w", at_s=100.0)
-    assert jobs_left_alone(store, 100.0 + HOUR_S - 1) == {NAME}
-    assert jobs_left_alone(store, 100.0 + HOUR_S + 1) == set()
-    for at_s in (5000.0, 10000.0):
-        keep_failure(store, NAME, "broken", worker="w", at_s=at_s)
-    assert jobs_left_alone(store, 1e6) == {NAME}
-
-
-def test_a_submission_frees_failed_jobs_and_a_retry_those_that_are_set_aside(store: Store) -> None:
-    keep_submission(store, retry=True, at_s=1.0)
-    assert store.storage.names("failures") == [], "as long as there is no failure there is nothing to note"
-    for at_s in (100.0, 200.0):
-        keep_failure(store, NAME, "broken", worker="w", at_s=at_s)
-    keep_submission(store, retry=False, at_s=250.0)
-    assert jobs_left_alone(store, 260.0) == set()
-    keep_failure(store, NAME, "broken", worker="w", at_s=300.0)
-    keep_submission(store, retry=False, at_s=350.0)
-    assert jobs_left_alone(store, 360.0) == {NAME}, "it has failed three times"
-    keep_submission(store, retry=True, at_s=400.0)
-    assert jobs_left_alone(store, 410.0) == set()
-    keep_failure(store, NAME, "broken", worker="w", at_s=500.0)
-    assert jobs_left_alone(store, 501.0) == {NAME}
-    assert jobs_left_alone(store, 501.0 + HOUR_S) == set(), "failures before the retry do not count any more"
-
-
 LOOK_S, GIVEN_UP_S, JOB_S = 30.0, 2.0, 6.0
 
 
 def wasted(workers: int, jobs: int, *, absent: int, seed: int = 0) -> float:
     """The share of all core time that goes into jobs that another worker commits first, of a simulated farm.
 
-    Workers take between half and twice the usual time for a job, and some never come. As `ShareWorker` does, each lists
+    Workers take between half and twice the usual time for a job, and some never come. As `ShareSource` does, each lists
     what is missing every 30 s, looks once more before it renders a job, and gives one up soon after another's commit.
     """
     rng = random.Random(seed)

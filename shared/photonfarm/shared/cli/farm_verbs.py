@@ -192,8 +192,8 @@ def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
     """Queue every job that is planned, and neither committed nor queued, rendered now or failed.
 
     Idle workers do this by themselves. It is for farms that may have no worker: a timer runs it, and workers are
-    started for what is queued. A job whose worker died is queued again once its heartbeat has run out; failed jobs
-    wait for an hour, or for `submit`.
+    started for what is queued. A job whose worker died is queued again once its heartbeat has run out; jobs that
+    failed too often wait for `submit --retry`.
     """
     from photonfarm.shared import queue
     from photonfarm.shared.cli import show

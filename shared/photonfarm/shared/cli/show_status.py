@@ -137,8 +137,8 @@ def _queue_document(found: StoreQueue, store: str | Path) -> dict[str, Any]:
         "queued": status.queued,
         "running": status.running,
         "workers": status.workers,
-        "left": status.idle_reports.left,
-        "paused": status.idle_reports.paused,
+        "left": status.left,
+        "paused": status.paused,
         "doing": {name: asdict(activity) for name, activity in status.activities.items()},
         "failures": _failures_document(found.causes, store),
     }

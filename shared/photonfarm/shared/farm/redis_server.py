@@ -135,7 +135,6 @@ class EmbeddedRedis:
             "appendfsync": "everysec",
             "save": "",
             "maxmemory-policy": "noeviction",
-            "proto-max-bulk-len": "1mb",  # ours are far smaller
             "daemonize": "no",
         }
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -64,9 +63,8 @@ def submit(
     Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
     `halves_from` is a scene of the store by its id or how it begins: jobs take over the halves it has. Without it, that
     is the scene of the same radiance with most of them, if there is one.
-    Failed jobs are queued again; with `retry` also those that were set aside. While somebody has the scene for itself,
-    this waits and says so. Raises SpecError, StoreError, or QueueError; in the last case the plan is kept, and idle
-    workers queue it later.
+    With `retry` also jobs that were set aside. While somebody has the scene for itself, this waits and says so. Raises
+    SpecError, StoreError, or QueueError; in the last case the plan is kept, and idle workers queue it later.
     """
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
@@ -129,8 +127,9 @@ def top_up(
 
 def _queued(store: Store, redis_url: str | None, *, retry: bool) -> int | None:
     """The number of jobs that are queued now; None without Redis. Workers that have none learn it from the store."""
-    with store_errors("note a submission", store.storage.where):
-        queue.keep_submission(store, retry=retry, at_s=time.time())
+    if retry:
+        with store_errors("note a retry", store.storage.where):
+            queue.keep_retry(store)
     return None if redis_url is None else queue_missing(store, redis_url, retry=retry)
 
 
@@ -145,12 +144,12 @@ def queue_missing(
 ) -> int:
     """Queue every missing job of a store, or of one scene; returns how many.
 
-    Failed jobs are queued again; with `retry` also those that were set aside. Raises QueueError; its message says what
+    With `retry` also jobs that were set aside. Raises QueueError; its message says what
     is `stored` nevertheless, and that --no-queue {verb} without Redis.
     """
     try:
         connection = queue.connect(redis_url)
-        return queue.reconcile(store, connection, scene_id=scene_id, retry_failed=True, retry_set_aside=retry)
+        return queue.reconcile(store, connection, scene_id=scene_id, retry=retry)
     except queue.OtherStoreError as error:
         raise QueueError(f"{error}. {stored} in {store.storage.where}") from error
     except QueueError as error:

@@ -52,14 +52,14 @@ def waits(
 
 
 def idle(found: QueueStatus, names: Mapping[str, str]) -> Iterator[Wait]:
-    """Yield why scenes are not rendered, by the workers' reports, which strangers may have written."""
-    for scene_id, reasons in found.idle_reports.left.items():
+    """Yield why scenes are not rendered, by the workers' reports."""
+    for scene_id, reasons in found.left.items():
         if scene_id in names:
             reason = next(iter(reasons.values()))
             why = f"{names[scene_id]}: left by {len(reasons)} of {found.workers} workers: {reason}"
             yield Wait("scene_left", 1, why)
     paused: dict[str, list[str]] = {}
-    for worker, reason in found.idle_reports.paused.items():
+    for worker, reason in found.paused.items():
         paused.setdefault(reason, []).append(worker)
     for reason, workers in list(paused.items())[:IDLE_SHOWN]:
         who = f"worker {workers[0]} takes" if len(workers) == 1 else f"{len(workers)} workers take"

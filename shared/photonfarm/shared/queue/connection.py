@@ -1,13 +1,16 @@
-"""Connections to Redis, whose passwords appear in no message."""
+"""Connections to Redis, whose passwords appear in no message, and its errors as ours."""
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
 import redis
 from redis import Redis
 from redis.backoff import ExponentialBackoff, NoBackoff
+from redis.exceptions import ClusterCrossSlotError, MovedError, NoPermissionError
 from redis.retry import Retry
 
 from photonfarm.shared.core.errors import QueueError
@@ -16,6 +19,33 @@ SOCKET_TIMEOUT_S = 30
 PASSWORD_VARIABLE = "PHOTONFARM_REDIS_PASSWORD_FILE"  # noqa: S105 - the name of a variable
 USER = "photonfarm"
 """The user of a URL without a name, if the password comes from a file."""
+
+
+class RefusedError(QueueError):
+    """A Redis refuses what it would refuse again."""
+
+
+@contextlib.contextmanager
+def redis_errors(what: str) -> Iterator[None]:
+    """Turn an error of Redis, which was `what`, into a QueueError; one that would come again into a RefusedError."""
+    try:
+        yield
+    except redis.RedisError as error:
+        raise queue_error(error, what) from error
+
+
+def queue_error(error: redis.RedisError, what: str = "used") -> QueueError:
+    """The QueueError for an error of Redis, as in `redis_errors`."""
+    said = str(error).rstrip(".")
+    if isinstance(error, redis.AuthenticationError):
+        return RefusedError(f"Redis no longer lets this process in: {said}; check its user and password")
+    if isinstance(error, NoPermissionError):
+        return RefusedError(
+            f"Redis refuses its user a command or key: {said}; `docker/redis.sh` shows the permissions that are needed"
+        )
+    if isinstance(error, MovedError | ClusterCrossSlotError):
+        return RefusedError(f"Redis is a cluster: {said}; the queue needs one server, without cluster mode")
+    return QueueError(f"Redis failed while it was {what}: {said}")
 
 
 def connect(url: str, *, only_s: float | None = None) -> Redis:

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 
 from redis import Redis
 
-from photonfarm.shared.queue.untrusted import beginnings
-
 CONSUMED = "rq:photonfarm:consumed:"
 CONSUMED_TTL_S = 7 * 86400
 """How long workers wait for a trainer that is down or has ended, as the ratio demands."""
@@ -23,8 +21,5 @@ def report_consumed(connection: Redis, scene_id: str, samples: int) -> None:
 
 def consumed_samples(connection: Redis, scene_ids: Sequence[str]) -> dict[str, int]:
     """How many samples of each of these scenes its trainer has used, by its last report; 0 without one."""
-    counts = beginnings(connection, [CONSUMED + scene_id for scene_id in scene_ids], 20)
-    return {
-        scene_id: int(samples) if samples.isdecimal() else 0
-        for scene_id, samples in zip(scene_ids, counts, strict=True)
-    }
+    counts = connection.mget([CONSUMED + scene_id for scene_id in scene_ids]) if scene_ids else []
+    return {scene_id: int(samples or 0) for scene_id, samples in zip(scene_ids, counts, strict=True)}

@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-from pydantic import Field, ValidationError
+import re
+from typing import NamedTuple
 
 from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.core.models import Frozen, sentences
 
 QUEUE = "photonfarm"
-QUEUE_KEY = f"rq:queue:{QUEUE}"
-"""The list in which RQ keeps the names of the queued jobs."""
+QUEUE_KEY, STARTED_KEY = f"rq:queue:{QUEUE}", f"rq:wip:{QUEUE}"
+"""RQ's list of queued jobs, and its sorted set of started ones, `<name>:<execution>`."""
 
-FUNCTION = "photonfarm.renderer.jobs.render.render_shard"
-"""The one function that a job runs; a string, since submitting needs no renderer."""
+FUNCTION = "photonfarm.render"
+"""The function that a job in Redis names. A worker renders such jobs, refuses others, and imports neither."""
 
-FAILURE_TTL_S = 3600
-"""A failed job is not queued for an hour: long enough not to burn cores on it, short enough to heal by itself."""
+TRIES = 5
+"""How often a job is tried that fails or loses its worker, before it is set aside: so often is no accident."""
 
-STARTS = "rq:photonfarm:starts:"
-OVERDUE = "rq:photonfarm:overdue:"
-
-MAX_NAME = 64
-"""The most bytes of a job's name; longer ones are not even fetched."""
+_NAME = re.compile("([0-9a-f]{32})-(0|[1-9][0-9]{0,13})")
 
 
 def job_name(scene_id: str, job: int) -> str:
@@ -31,29 +25,20 @@ def job_name(scene_id: str, job: int) -> str:
     return f"{scene_id}-{job}"
 
 
-class RenderArguments(Frozen):
-    """The valid arguments of a job."""
+class RenderArguments(NamedTuple):
+    """The scene and the number of a job."""
 
-    scene_id: Annotated[str, Field(pattern=r"^[0-9a-f]{32}$", strict=True)]
-    job: Annotated[int, Field(ge=0, lt=1 << 48, strict=True)]
+    scene_id: str
+    job: int
 
     @classmethod
     def of(cls, name: str) -> RenderArguments:
         """The arguments that a job's name stands for; raises QueueError for an invalid name."""
-        scene_id, _, number = name.rpartition("-")
-        try:
-            arguments = cls(scene_id=scene_id, job=int(number) if number.isdecimal() else -1)
-        except ValidationError as error:
-            raise QueueError(f"job {name[:MAX_NAME]!r}: {'; '.join(sentences(error))}") from error
-        if job_name(arguments.scene_id, arguments.job) != name:  # leading zeros, digits of other scripts
-            raise QueueError(f"job {name[:MAX_NAME]!r}: is not written as job {arguments.job}")
-        return arguments
+        if not (found := _NAME.fullmatch(name)):
+            raise QueueError(f"job {name[:64]!r}: a name is <scene id>-<number>")
+        return cls(found[1], int(found[2]))
 
 
 def is_job_name(name: str) -> bool:
     """Whether a text is the name of a job."""
-    try:
-        RenderArguments.of(name)
-    except QueueError:
-        return False
-    return True
+    return _NAME.fullmatch(name) is not None

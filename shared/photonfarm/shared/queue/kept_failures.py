@@ -1,97 +1,75 @@
 """Failures that outlive Redis: a small file in the store for each, written once.
 
-For people, who ask later why a job is missing; and for workers without Redis, who leave a failed job alone by the same
-rule as Redis keeps: for an hour or until the next submission, and for good after FAILURES_ALLOWED failures, until
-`submit --retry`. Files beside the failures say when there were such submissions. All times are those of the writers'
-clocks, so these must agree to within minutes.
+For people, who ask later why a job is missing; and for workers without Redis, who try a failed job as often as the
+queue does, and then leave it alone until `submit --retry`, of which a file beside the failures tells. All times are
+those of the writers' clocks, so these must agree to within minutes.
 """
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+import time
+from collections.abc import Callable
 
-from photonfarm.shared.queue.failures import FAILURES_ALLOWED, REASON_LETTERS, Failure
-from photonfarm.shared.queue.job import FAILURE_TTL_S, is_job_name
-from photonfarm.shared.queue.untrusted import printable
+from photonfarm.shared.queue.failures import Failure, one_line
+from photonfarm.shared.queue.job import is_job_name
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import put_json
 from photonfarm.shared.store.write.store import FAILURES_FOLDER
 
 _FILE = re.compile(r"(.+)\.([0-9]{1,16})\.json")
 
-SUBMITTED, RETRIED = "submitted", "retried"
-"""The names of files that forget failures: those of jobs that are not set aside, or all."""
+RETRIED = "retried"
+"""The name of a file that forgets the failures before it."""
 
 
-def keep_failure(store: Store, name: str, reason: str, *, worker: str, at_s: float) -> None:
-    """Keep why a job failed, at `at_s` seconds since 1970. Raises OSError if the store refuses."""
-    document = {"job": name, "reason": reason[:REASON_LETTERS], "worker": worker, "at_s": round(at_s, 3)}
-    put_json(store.storage, document, f"{FAILURES_FOLDER}/{name}.{int(1000 * at_s)}.json")
+def keep_failure(store: Store, name: str, reason: str, *, worker: str) -> None:
+    """Keep why a job failed just now. Raises OSError if the store refuses."""
+    _keep(store, name, {"job": name, "reason": one_line(reason), "worker": worker})
 
 
-def keep_submission(store: Store, *, retry: bool, at_s: float) -> None:
-    """Keep that failed jobs were submitted again, with `retry` also those that were set aside.
-
-    Nothing is written while no failure is kept. Raises OSError if the store refuses.
-    """
+def keep_retry(store: Store) -> None:
+    """Keep that all failed jobs are to be tried again, if any failure is kept. Raises OSError if the store refuses."""
     if store.storage.names(FAILURES_FOLDER):
-        name = RETRIED if retry else SUBMITTED
-        put_json(store.storage, {"at_s": round(at_s, 3)}, f"{FAILURES_FOLDER}/{name}.{int(1000 * at_s)}.json")
+        _keep(store, RETRIED, {})
 
 
-@dataclass(frozen=True, slots=True)
-class _Times:
-    """What the names of all files say: when, in milliseconds since 1970."""
-
-    failed: dict[str, list[int]] = field(default_factory=dict)  # by job
-    submitted: int = -1
-    retried: int = -1
-
-    @classmethod
-    def of(cls, files: Iterable[str]) -> _Times:
-        failed: dict[str, list[int]] = {}
-        again = {SUBMITTED: -1, RETRIED: -1}
-        for file in files:
-            if not (found := _FILE.fullmatch(file)):
-                continue
-            name, at_ms = found[1], int(found[2])
-            if name in again:
-                again[name] = max(again[name], at_ms)
-            elif is_job_name(name):
-                failed.setdefault(name, []).append(at_ms)
-        return cls(failed, again[SUBMITTED], again[RETRIED])
-
-    def are_left(self, name: str, now_ms: float) -> bool:
-        """Whether a job is left alone."""
-        counted = [at_ms for at_ms in self.failed[name] if at_ms > self.retried]
-        if len(counted) >= FAILURES_ALLOWED:
-            return True
-        return bool(counted) and self.submitted < max(counted) and now_ms - max(counted) < 1000 * FAILURE_TTL_S
+def _keep(store: Store, name: str, document: dict[str, str]) -> None:
+    at_ms = time.time_ns() // 1_000_000
+    put_json(store.storage, {**document, "at_s": at_ms / 1000}, f"{FAILURES_FOLDER}/{name}.{at_ms}.json")
 
 
-def jobs_left_alone(store: Store, now_s: float) -> set[str]:
-    """The jobs that workers without Redis leave alone for now, by the failures that are kept; costs one listing.
+def kept_failures(store: Store, wanted: Callable[[str], bool] = lambda _: True) -> dict[str, Failure]:
+    """The last kept failure of each of the `wanted` jobs since all were retried, by its name.
 
-    `now_s` is the time in seconds since 1970. Raises OSError if the store cannot be read.
+    Raises OSError if the store cannot be read.
     """
-    times = _Times.of(store.storage.names(FAILURES_FOLDER))
-    return {name for name in times.failed if times.are_left(name, 1000 * now_s)}
+    return {
+        name: Failure(_reason(store, name, max(times_ms)), len(times_ms))
+        for name, times_ms in sorted(_times_ms(store).items())
+        if wanted(name)
+    }
 
 
-def kept_failures(store: Store, wanted: Callable[[str], bool]) -> dict[str, Failure]:
-    """The last kept failure of each of the `wanted` jobs, by its name. Raises OSError if the store cannot be read."""
-    by_job = _Times.of(store.storage.names(FAILURES_FOLDER)).failed
-    return {name: _read(store, name, times_ms) for name, times_ms in sorted(by_job.items()) if wanted(name)}
+def times_failed(store: Store) -> dict[str, int]:
+    """How often each job has failed since all were retried, by its name, for one listing. Raises OSError."""
+    return {name: len(times_ms) for name, times_ms in _times_ms(store).items()}
 
 
-def _read(store: Store, name: str, times_ms: list[int]) -> Failure:
-    """The last of a job's failures; one whose file is damaged has no reason."""
+def _times_ms(store: Store) -> dict[str, list[int]]:
+    """When jobs failed, in milliseconds since 1970, as the names of the files tell."""
+    named = [found for file in store.storage.names(FAILURES_FOLDER) if (found := _FILE.fullmatch(file))]
+    retried = max((int(found[2]) for found in named if found[1] == RETRIED), default=-1)
+    failed: dict[str, list[int]] = {}
+    for found in named:
+        if is_job_name(found[1]) and int(found[2]) > retried:
+            failed.setdefault(found[1], []).append(int(found[2]))
+    return failed
+
+
+def _reason(store: Store, name: str, at_ms: int) -> str:
     try:
-        document = json.loads(store.storage.read(f"{FAILURES_FOLDER}/{name}.{max(times_ms)}.json"))
-        reason = str(document["reason"])
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        reason = "the record of the failure cannot be read"
-    return Failure(printable(reason[:REASON_LETTERS]), len(times_ms), set_aside=False)
+        return one_line(json.loads(store.storage.read(f"{FAILURES_FOLDER}/{name}.{at_ms}.json"))["reason"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return "the record of the failure cannot be read"

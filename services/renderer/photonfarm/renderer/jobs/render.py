@@ -95,24 +95,6 @@ def load_scene(spec: SceneSpec) -> SceneRenderer:
     return LoadedScene.load(spec)
 
 
-# ------------------------------------------------------------------------------------------- the function in the queue
-
-_serving: ShardRenderer | None = None
-
-
-def serve(renderer: ShardRenderer) -> None:
-    """Enable `render_shard` in this process; the worker itself chooses the store, which never comes from the queue."""
-    global _serving  # RQ calls a module's function, and a loaded scene lives as long as the process
-    _serving = renderer
-
-
-def render_shard(scene_id: str, job: int) -> None:
-    """Render and commit one job: the one function that RQ calls."""
-    if _serving is None:
-        raise IncompleteError("render_shard runs inside `photonfarm work` only, which says where the store is")
-    _serving.render(scene_id, job)
-
-
 @dataclass(slots=True, eq=False)
 class _Loaded:
     """A loaded scene, and its place in the store."""

@@ -1,7 +1,4 @@
-"""The worker's child: a worker that keeps its scenes loaded, on the queue or, by `share_worker`, without it.
-
-On the queue it adds what RQ lacks: a deadline that also ends native code, recycling, and filling the queue when idle.
-"""
+"""The worker's child: renders one job after the other in a process that keeps its scenes loaded."""
 
 from __future__ import annotations
 
@@ -11,28 +8,24 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Mapping
 
 import redis
-from redis import Redis
 
 from photonfarm.renderer.jobs import render as jobs
-from photonfarm.renderer.worker.backpressure import TrainerPace
-from photonfarm.renderer.worker.heartbeat import HeartbeatThread
+from photonfarm.renderer.worker.heartbeat import deadline
 from photonfarm.renderer.worker.log import WorkerLog
 from photonfarm.renderer.worker.outcomes import Outcomes, is_complete, missing_jobs, send_line
-from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, WorkerSettings
-from photonfarm.renderer.worker.share_worker import ShareWorker
+from photonfarm.renderer.worker.queue_source import QueueSource
+from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, REFUSED, WorkerSettings
+from photonfarm.renderer.worker.share_source import ShareSource
+from photonfarm.renderer.worker.source import Ending, JobSource, TakenError
 from photonfarm.shared import queue
-from photonfarm.shared.core.errors import PhotonfarmError, QueueError
-from photonfarm.shared.queue import QueueWorker, RenderJob
+from photonfarm.shared.core.errors import PhotonfarmError
+from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.queue import Activity, RenderArguments, job_name
 from photonfarm.shared.store import Store
-
-STARTS_ALLOWED = 5
-"""The starts of one job without an end after which it counts as failed: it kills its workers."""
-
-POLL_S = 0.2
-"""The seconds between looks at an empty queue."""
+from photonfarm.shared.store.write.lease import leases
 
 log = logging.getLogger(__name__)
 
@@ -45,18 +38,16 @@ def child(load: jobs.SceneLoader = jobs.load_scene) -> int:
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr, format=LOG_FORMAT)
     threading.Thread(target=_end_with_supervisor, daemon=True).start()
     try:
-        store = Store(settings.store)
-        if settings.share is not None:
-            return ShareWorker(settings, store, settings.share, load, pipe).run()
-        worker = RenderWorker(settings, store, queue.connect(settings.queue_url), pipe)
-        jobs.serve(jobs.ShardRenderer(store, worker=settings.name, load=load, on_progress=worker.doing))
+        worker = RenderWorker(settings, Store(settings.store), load, pipe)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, lambda *_: worker.stop())
         return worker.run()
-    except PhotonfarmError as error:
-        send_line(pipe, str(error))
-        return error.exit_code
     except redis.RedisError as error:
-        send_line(pipe, f"lost Redis: {error}")
-        return QueueError.exit_code
+        ending: PhotonfarmError = queue.queue_error(error)
+    except PhotonfarmError as error:
+        ending = error
+    send_line(pipe, str(ending))
+    return REFUSED if isinstance(ending, queue.RefusedError) else ending.exit_code
 
 
 def _end_with_supervisor() -> None:
@@ -68,139 +59,100 @@ def _end_with_supervisor() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-class RenderWorker(QueueWorker):
-    """A worker that renders, with a heartbeat and a deadline, and fills the queue when idle."""
+class RenderWorker:
+    """Renders jobs, from the queue or of a share, until it is stopped, worn out or done."""
 
-    def __init__(self, settings: WorkerSettings, store: Store, connection: Redis, pipe: int | None = None) -> None:
-        """Prepare without registering; `pipe` is a file descriptor that the supervisor reads, if there is one."""
-        name = f"{settings.name}-{os.getpid()}-{time.time_ns():x}"
-        super().__init__(connection, name, job_ttl_s=int(settings.deadline_s) + 60)
-        self._settings = settings
-        self._store = store
-        self._heart = HeartbeatThread(settings, store, pipe)
-        self.doing = self._heart.doing
-        self._outcomes = Outcomes(
-            settings, store, pipe, record=self._record, put_back=lambda name: queue.put_back(self._queue, name)
+    def __init__(
+        self, settings: WorkerSettings, store: Store, load: jobs.SceneLoader = jobs.load_scene, pipe: int | None = None
+    ) -> None:
+        """Prepare; `pipe` is a file descriptor that the supervisor reads. Raises QueueError if there is no Redis."""
+        self._settings, self._store, self._pipe = settings, store, pipe
+        self._stop = Stop()
+        self._source: JobSource = (
+            QueueSource(settings, store, self._stop)
+            if settings.share is None
+            else ShareSource(settings, store, settings.share)
         )
-        self._pace = (
-            None
-            if settings.ahead is None
-            else TrainerPace(store, connection, settings.ahead, scene_id=settings.scene_id)
-        )
+        self._renderer = jobs.ShardRenderer(store, worker=settings.name, load=load, on_progress=self._on_progress)
+        self._outcomes = Outcomes(settings, store, pipe)
         self._talk = WorkerLog(settings)
+        self._in_hand: str | None = None
 
     def run(self) -> int:
         """Work until stopped, complete or due for a successor; returns the exit code, 0 only if all is complete."""
-        self._heart.start()
-        code = self.work_on()
-        return RECYCLED if code is None else code  # asked to stop: for a supervisor that is not to stop itself
+        with self._source.open():
+            while not self._stop.is_set():
+                code = self.step()
+                if code is not None:
+                    return code
+        return RECYCLED  # asked to stop: for a supervisor that is not to stop itself
 
-    def on_end(self) -> None:
-        """Remove the heartbeat."""
-        self._heart.end()
+    def stop(self) -> None:
+        """End `run` after the job in hand."""
+        self._stop.set()
 
-    # ---------------------------------------------------------------------------------------------------- taking a job
+    def step(self) -> int | None:
+        """Render a job, or wait for one; an exit code ends the worker."""
+        paused, left = self._outcomes.disk.reason(), self._left()
+        self._talk.pausing(paused)
+        job = self._source.take(paused, left)
+        if job is not None:
+            self._render(job)
+            return self._outcomes.after_job()
+        if not self._stop.is_set() and self._is_complete(paused):
+            return 0
+        self._stop.wait(self._settings.idle_s if paused else self._source.pause_s)
+        return None
 
-    def next_job(self) -> RenderJob | None:
-        """Take the next job; None if there was none for a while, or none should be taken."""
-        queue.serve(self.connection, self._store)
-        held_back = self._outcomes.disk.reason()
-        self._talk.pausing(held_back)
-        self._heart.paused = held_back
-        self._heart.left = self._left()
-        until = time.monotonic() + self._settings.idle_s
-        while True:
-            job, strangers = (None, 0) if held_back else self._next()
-            if strangers:
-                log.warning("%d entries of the queue were not names of jobs, and were thrown away", strangers)
-            if job is not None or time.monotonic() >= until:
-                return job
-            time.sleep(self._settings.idle_s if self._heart.left else POLL_S)  # Redis checks each job that is skipped
-
-    def _next(self) -> tuple[RenderJob | None, int]:
-        return queue.take(self._queue, scene_id=self._settings.scene_id, leave=self._heart.left)
-
-    def _left(self) -> dict[str, str]:
+    def _left(self) -> Mapping[str, str]:
         """Why this worker now takes no jobs of some scenes, by their ids."""
-        ahead = self._pace.ahead() if self._pace else {}
-        self._talk.waiting(ahead)
-        return {**ahead, **self._outcomes.left()}
+        waiting = {**self._source.ahead(), **leases(self._store.storage)}
+        self._talk.waiting(waiting)
+        return {**waiting, **self._outcomes.left()}
 
-    def on_idle(self) -> int | None:
-        """Fill the queue; 0 if nothing is left to do."""
-        return 0 if self._fill_or_finish() else None
-
-    def _fill_or_finish(self) -> bool:
-        """Fill the queue from the store, as there is no coordinator; True if there is nothing left to wait for.
+    def _is_complete(self, paused: str | None) -> bool:
+        """Whether nothing is left to do or to wait for, after nothing was taken.
 
         Raises StoreError if the store is gone: an empty folder in its place would seem to miss nothing.
         """
         self._store.check()
-        only = self._settings.scene_id
-        found = queue.look(self._store, self.connection, scene_id=only, every_s=self._settings.idle_s)
-        if found == "queued" or (found == "waits" and not self._outcomes.not_here):  # what is left may not be for it
+        not_here = self._outcomes.not_here
+        if self._source.has_more(may_leave=bool(not_here)) or paused:
             return False
         self._store.sweep()
         if not self._settings.until_complete:
             return False
-        missing, unreadable = missing_jobs(self._store, () if only is None else (only,))
-        failed = queue.queue_status(self.connection).failed
-        reasons = {name: failure.reason for name, failure in failed.items()}
-        return is_complete(missing, unreadable, reasons, self._outcomes.not_here)
+        missing, unreadable = missing_jobs(self._store, self._settings.scenes)
+        return is_complete(missing, unreadable, self._source.set_aside(), not_here)
 
-    # ------------------------------------------------------------------------------------------------------------- jobs
-
-    def on_job(self, job: RenderJob, run: Callable[[], None]) -> None:
-        """Run one job under a heartbeat and a deadline."""
-        self._outcomes.begin()
-        began = time.monotonic()
-        with self._heart.working(job.id), self._talk.timing(job.id):
-            self._count_start(job)
-            run()
-            self._settle(job.id)
-        self._outcomes.count(job.id, time.monotonic() - began)
-
-    def on_done(self) -> int | None:
-        """Raise the error that the next job would meet as well; RECYCLED if a successor should go on."""
-        return self._outcomes.after_job()
-
-    def _count_start(self, job: RenderJob) -> None:
-        """Count a start, and refuse a job that has been started too often."""
-        starts = queue.count_start(self.connection, job.id)
-        if starts > STARTS_ALLOWED:
-            job.refuse(self._given_up(job.id, starts - 1))
-
-    def _given_up(self, name: str, starts: int) -> str:
-        """Why a job is not started again."""
-        overdue = min(queue.overdue(self.connection, name), starts)
-        late = f"it took longer than --deadline {self._settings.deadline_s:g} s and was ended"
-        if overdue == starts:
-            return f"it was started {starts} times, and each time {late}"
-        died = f"it was started {starts} times, and each time its worker died or lost Redis"
-        return f"{died}, or {late} ({overdue} times)" if overdue else died
-
-    def _settle(self, name: str) -> None:
-        """Reset the counts of a job's starts, which has ended; its failures stay."""
-        if self._outcomes.has_failed:
-            queue.forget_starts_of(self.connection, name)
-        else:
-            queue.forget_failures_of(self.connection, name)
-
-    def on_failure(self, name: str, error: BaseException) -> None:
-        """Decide the consequences of a failed job: for the job, for this worker, or none."""
-        self._outcomes.failed(name, error)
-
-    def _record(self, name: str, reason: str) -> None:
-        """Record a failure in Redis, so that the job is left alone for a while, or for good."""
-        failure = queue.record_failure(self.connection, name, reason)
-        if failure.set_aside:
+    def _render(self, job: RenderArguments) -> None:
+        """Render a job under a deadline, and tell what it came to."""
+        name, began = job_name(*job), time.monotonic()
+        self._in_hand, rendered = name, False
+        ending: Ending = "done"
+        reason = ""
+        with deadline(self._settings, self._pipe, name), self._talk.timing(name):
+            try:
+                rendered = self._renderer.render(*job)
+                if not rendered:
+                    self._store.check()  # its scene may be gone with the whole store
+            except TakenError:
+                self._talk.given_up(name)
+            except Exception as error:
+                ending, reason = self._outcomes.failed(name, error), f"{type(error).__name__}: {error}"
+        self._in_hand = None
+        self._outcomes.count(name, time.monotonic() - began, done=rendered, failed=ending != "done")
+        if self._source.end(name, ending, reason):
             log.warning(
                 "job %s has failed %d times and is set aside; photonfarm submit --retry queues it again, and this "
                 "repeats it: %s",
                 name,
-                failure.times,
+                queue.TRIES,
                 queue.repeating_command(self._settings.store, name),
             )
+
+    def _on_progress(self, phase: str, done: int, total: int) -> None:
+        self._source.tell_doing(Activity(phase, done, total, self._in_hand))
 
 
 if __name__ == "__main__":

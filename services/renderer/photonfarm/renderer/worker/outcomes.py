@@ -1,7 +1,4 @@
-"""What the jobs of a child come to: counts for its supervisor, and the consequences of errors for job and worker.
-
-It is the same whether jobs come from Redis or from the store alone; where failures are counted differs.
-"""
+"""What the jobs of a child come to: counts for its supervisor, and the consequences of errors for job and worker."""
 
 from __future__ import annotations
 
@@ -9,14 +6,13 @@ import contextlib
 import logging
 import os
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-
-import redis
 
 from photonfarm.renderer.worker.backpressure import DiskReserve, is_full
 from photonfarm.renderer.worker.log import JobCounts
 from photonfarm.renderer.worker.settings import RECYCLED, WorkerSettings
+from photonfarm.renderer.worker.source import Ending
 from photonfarm.shared import queue
 from photonfarm.shared.core.errors import (
     BackendError,
@@ -29,6 +25,7 @@ from photonfarm.shared.core.errors import (
 )
 from photonfarm.shared.queue import RenderArguments
 from photonfarm.shared.store import Store
+from photonfarm.shared.store.write.lease import LeasedError
 
 NOT_HERE_S = 300.0
 """How long a scene whose files are missing here is left to other workers before its files are looked for again."""
@@ -45,47 +42,32 @@ def send_line(pipe: int, message: str) -> None:
 class Outcomes:
     """What the jobs of a child come to."""
 
-    def __init__(
-        self,
-        settings: WorkerSettings,
-        store: Store,
-        pipe: int | None,
-        *,
-        record: Callable[[str, str], None],
-        put_back: Callable[[str], None],
-    ) -> None:
-        """Take what counts a failure of a job for a reason, and what puts a job back that others may still render."""
+    def __init__(self, settings: WorkerSettings, store: Store, pipe: int | None) -> None:
+        """Begin to count; `pipe` is a file descriptor that the supervisor reads, if there is one."""
         self.disk = DiskReserve(store, settings.reserve_bytes)
         self.not_here: dict[str, SceneNotHereError] = {}  # by scene id, the scenes that this machine leaves to others…
         self._look_again: dict[str, float] = {}  # …and until when
-        self.has_failed = False  # the job in hand
         self._settings, self._store, self._pipe = settings, store, pipe
-        self._record_further, self._put_back = record, put_back
         self._fatal: PhotonfarmError | None = None
         self._tainted = False  # an unexpected error happened, perhaps in the middle of an edit
         self._counts = JobCounts()
-        self._done = 0
+        self._jobs = 0
 
-    def begin(self) -> None:
-        """Note that a job begins."""
-        self.has_failed = False
-
-    def count(self, name: str, seconds: float, *, done: bool = True) -> None:
+    def count(self, name: str, seconds: float, *, done: bool, failed: bool) -> None:
         """Report the jobs so far to the supervisor, which outlives this process, however it ends.
 
-        The job in hand has ended; it counts as done unless it failed, or was left to another worker.
+        The job in hand has ended; one neither done nor failed was left to another worker.
         """
-        done = done and not self.has_failed
-        self._counts += JobCounts(done, self.has_failed, self._samples(name) if done else 0, seconds)
+        self._jobs += 1
+        self._counts += JobCounts(done, failed, self._samples(name) if done else 0, seconds)
         if self._pipe is not None:
             send_line(self._pipe, self._counts.line)
 
     def after_job(self) -> int | None:
         """Raise the error that the next job would meet as well; RECYCLED if a successor should go on."""
-        self._done += 1
         if self._fatal:
             raise self._fatal
-        worn = self._done >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
+        worn = self._jobs >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
         return RECYCLED if worn or self._tainted else None
 
     def left(self) -> dict[str, str]:
@@ -94,29 +76,31 @@ class Outcomes:
             del self.not_here[scene_id], self._look_again[scene_id]
         return {scene_id: str(error) for scene_id, error in self.not_here.items()}
 
-    def failed(self, name: str, error: BaseException) -> None:
-        """Decide the consequences of a failed job: for the job, for this worker, or none."""
+    def failed(self, name: str, error: Exception) -> Ending:
+        """Decide the consequences of a failed job, for this worker, and return those for the job."""
         if self._is_committed(name):
-            log.warning("job %s is committed, and nothing lost; only Redis does not know it: %s", name, error)
-            return
-        self.has_failed = True
-        what = "lost Redis" if isinstance(error, redis.RedisError) else "failed"
-        known = isinstance(error, PhotonfarmError | redis.RedisError)
-        log.warning("job %s %s: %s", name, what, error, exc_info=None if known else error)
+            log.warning("job %s is committed, and nothing lost: %s", name, error)
+            return "done"
+        if isinstance(error, LeasedError):
+            log.info("job %s is left for now: %s", name, error)
+            return "again"
+        log.warning("job %s failed: %s", name, error, exc_info=None if isinstance(error, PhotonfarmError) else error)
         if is_full(error):
             self.disk.refused()
-        elif isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
+            return "again"
+        if isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
             scene_id = name.rpartition("-")[0]
             self.not_here[scene_id] = error
             self._look_again[scene_id] = time.monotonic() + NOT_HERE_S
             log.warning("this worker leaves scene %s to others, and goes on with what else there is", scene_id)
-        elif (fatal := self._fatal_of(error)) is not None:
+            return "again"
+        if (fatal := self._fatal_of(error)) is not None:
             self._fatal = fatal
-            with contextlib.suppress(redis.RedisError):
-                self._put_back(name)
-        elif isinstance(error, Exception) and not isinstance(error, QueueError | redis.RedisError):
-            self._tainted = not isinstance(error, PhotonfarmError)
-            self._record(name, f"{type(error).__name__}: {error}")
+            return "again"
+        if isinstance(error, QueueError):  # the store has no such job
+            return "done"
+        self._tainted = not isinstance(error, PhotonfarmError)
+        return "failed"
 
     def _samples(self, name: str) -> int:
         """The number of samples of a job; 0 if its scene cannot be read any more."""
@@ -125,10 +109,8 @@ class Outcomes:
             return len(self._store.scene(arguments.scene_id).job_rows(arguments.job).samples)
         return 0
 
-    def _fatal_of(self, error: BaseException) -> PhotonfarmError | None:
+    def _fatal_of(self, error: Exception) -> PhotonfarmError | None:
         """The error that the next job would meet as well; if the store is gone, whatever error the job had."""
-        if isinstance(error, redis.RedisError):
-            return None
         try:
             self._store.check()
         except StoreError as gone:
@@ -140,13 +122,6 @@ class Outcomes:
             arguments = RenderArguments.of(name)
             return self._store.scene(arguments.scene_id).is_committed(arguments.job)
         return False
-
-    def _record(self, name: str, reason: str) -> None:
-        """Record a failure: in the store, and where else failures are counted, so that the job is left alone."""
-        with contextlib.suppress(OSError):
-            queue.keep_failure(self._store, name, reason, worker=self._settings.name, at_s=time.time())
-        with contextlib.suppress(redis.RedisError):
-            self._record_further(name, reason)
 
 
 def _resident_bytes() -> int:

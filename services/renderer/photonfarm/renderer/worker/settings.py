@@ -20,6 +20,9 @@ it has no marker, it is rendered again.
 RECYCLED = 75
 """The exit code of a child that wants to be replaced by a new one."""
 
+REFUSED = 76
+"""The exit code of a child whose Redis refuses what it would refuse its successor too."""
+
 JOB_IN_HAND = "job in hand: "
 """The prefix of the line in which a child reports the job that it begins; the job's name follows."""
 
@@ -46,12 +49,17 @@ class WorkerSettings(Frozen):
     max_jobs: Count = 500  # after so many a new child starts, which bounds memory leaks and takes < 1 % of the time
     max_rss_bytes: Count = 8 << 30  # a CPU worker needs about 1 GB; GPU contexts some more
     deadline_s: Positive = 1800.0  # jobs are meant to take 5 to 30 s; a hundred times that is a hang
-    heartbeat_ttl_s: Positive = 90.0  # longer than native code holds Python's lock
+    heartbeat_ttl_s: Positive = 60.0  # after which a worker of another machine, and its job, count as lost
     steady_s: Positive = 30.0  # a child that lived this long was healthy: its successor starts at once
     idle_s: Count = 2  # between checks of the store while the queue is empty
     report_s: Positive = 60.0  # between lines about the progress
     reserve_bytes: Annotated[int, Field(ge=0)] = 10**9  # a few jobs, and room for whatever else needs the disk
     ahead: Annotated[float, Field(ge=1)] | None = None  # the most committed samples for each that the trainer has used
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The ids of the only scenes to render; none: all scenes of the store."""
+        return self.scene_ids if self.scene_id is None else (self.scene_id,)
 
     @property
     def queue_url(self) -> str:

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 from types import FrameType
 
 from photonfarm.renderer.worker.log import JobCounts
-from photonfarm.renderer.worker.registration import Registration, registration
-from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, JOBS_SO_FAR, RECYCLED, WorkerSettings
-from photonfarm.shared.core.errors import BackendError, IncompleteError, StoreError
+from photonfarm.renderer.worker.registration import Registration
+from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, JOBS_SO_FAR, RECYCLED, REFUSED, WorkerSettings
+from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.storage import is_vacant
@@ -80,7 +80,7 @@ class Supervisor:
         if vacant and self._settings.until_complete:
             raise StoreError(f"{self._settings.store}: there is no store; `photonfarm submit` makes one")
         store = None if vacant else Store(self._settings.store)
-        with self._signals(), registration(self._settings) as known:
+        with self._signals(), contextlib.closing(Registration(self._settings)) as known:
             if store is not None:
                 known.serve(store)
             try:
@@ -123,8 +123,9 @@ class Supervisor:
         while not self._stop.is_set():
             started = time.monotonic()
             code, output = self._run_child()
-            if code < 0 and self._stop.is_set():
-                known.stopped(self._settings.name)
+            how = ending(code, output, self._settings.deadline_s)
+            lost = output.job if output.in_hand and not self._stop.is_set() else None
+            known.ended(store, self._settings.name, lost, how)
             if code == 0 or self._stop.is_set():
                 return
             _raise_final(code, output.last)
@@ -134,9 +135,6 @@ class Supervisor:
             failures = 0 if time.monotonic() - started > self._settings.steady_s else failures
             pause = BACKOFF_S[min(failures, len(BACKOFF_S) - 1)]
             failures += 1
-            how = ending(code, output, self._settings.deadline_s)
-            if output.job is not None and output.in_hand:
-                known.lost(store, self._settings.name, output.job, how, overdue=output.timed_out)
             self._report(f"worker {self._settings.name}: {how}; starting again in {pause:g} s")
             self._stop.wait(pause)
 
@@ -221,6 +219,8 @@ def ending(code: int, output: ChildOutput, deadline_s: float) -> str:
 
 def _raise_final(code: int, message: str) -> None:
     """Raise the errors that a new child would meet again."""
+    if code == REFUSED:
+        raise QueueError(message)
     for kind in (StoreError, BackendError, IncompleteError):
         if code == kind.exit_code:
             raise kind(message)

@@ -87,5 +87,6 @@ def check(redis_url: str) -> None:
 
     Raises QueueError without a Redis.
     """
-    if process_space() not in queue.hosts(queue.connect(redis_url)):
+    hosts = {report.host for report in queue.read_workers(queue.connect(redis_url)).values()}
+    if process_space() not in hosts:
         raise IncompleteError(f"no worker of {socket.gethostname()} is alive")

@@ -1,0 +1,45 @@
+"""A worker leaves a scene to whoever has it for itself, says so, and comes back."""
+
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.shared.queue import TRIES, connect, queue_status
+from photonfarm.shared.queue.rq_adapter import open_queue
+from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.write.lease import lease
+
+
+@pytest.mark.parametrize("share", [None, "0/1"])
+def test_a_worker_leaves_a_scene_that_somebody_has_for_itself_until_it_is_free(
+    analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, tmp_path: Path,
+    share: str | None,
+) -> None:  # fmt: skip
+    scene, connection, log = planned(4), connect(redis_server.url), tmp_path / "log"
+    store, url = Store(scene.folder.parent.parent), None if share else redis_server.url
+    with analytic.start_worker(
+        store.root, url, analytic.command(0.3), log, share=share, until_complete=True, name="ada"
+    ) as worker:
+        try:
+            analytic.wait_for(lambda: len(scene.committed_jobs()) == 1, 60)
+            with lease(store.storage, scene.scene_id, "store check --repair", lambda _: None):
+                done = len(scene.committed_jobs())
+                analytic.wait_for(lambda: "takes no jobs of scene" in log.read_text(), 30)
+                if not share:
+                    analytic.wait_for(lambda: queue_status(connection).left)
+                    (reason,) = queue_status(connection).left[scene.scene_id].values()
+                    assert "store check --repair" in reason
+                    jobs = open_queue(connection)
+                    assert {jobs.fetch_job(name).retries_left for name in jobs.job_ids} == {TRIES - 1}
+                assert len(scene.committed_jobs()) == done
+                assert worker.poll() is None
+            assert worker.wait(60) == 0
+        except BaseException:
+            worker.kill()
+            raise
+    assert scene.missing_jobs() == []
+    assert "takes jobs of scene" in log.read_text()
+    assert not store.storage.names("failures")

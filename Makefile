@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
 PROJECTS := shared services/renderer services/trainer
 
-.PHONY: setup demo test test-slow test-compose test-slurm test-kubernetes check docs lock clean
+.PHONY: setup demo test test-slow test-compose test-slurm test-kubernetes check docs stability lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
@@ -74,6 +74,10 @@ bench-render: $(VENV)/.bench-ready
 # bench-moved-lamps is the module bench.trainer.moved_lamps: whichever room of bench/ has it.
 bench-%: $(STAMP)
 	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))
+
+# The integrator on 36 rows of hard scenes, each against its truth: make stability ARGS="--quick --only 13".
+stability: $(STAMP)
+	$(BIN)/python -m bench.stability $(ARGS)
 
 # Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
 experiments-%: $(STAMP)

@@ -1,1 +1,1 @@
-"""How efficient, how right and how fast the integrator is."""
+"""How efficient and how fast the integrator is, and how right on rooms."""

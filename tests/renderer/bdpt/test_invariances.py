@@ -1,4 +1,4 @@
-"""Quick versions of the invariances; the long ones run in `make bench-stability`."""
+"""Quick versions of the invariances; the long ones run in `make stability`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.renderer.invariances import COUNTS, Invariance, checks
+from bench.stability.invariances import COUNTS, Invariance, checks
+from bench.stability.scenes.hard_scenes import HARD_SCENES
 from photonfarm.renderer.bdpt import launches
-from photonfarm.renderer.verify.scenes.hard_scenes import HARD_SCENES
 
 # The oracle's have tests of their own, and more of them: test_oracle.py
 SLOW = ("seed-many-lights", "counts-many-lights", "counts-plastics")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from bench.renderer.weights import weight_check
-from bench.renderer.weights.oracle import F64
-from bench.renderer.weights.weight_check import SCENES, compare_weights
-from photonfarm.renderer.verify.scenes.case import BdptSettings
+from bench.stability.scenes.case import BdptSettings
+from bench.stability.weights import weight_check
+from bench.stability.weights.oracle import F64
+from bench.stability.weights.weight_check import SCENES, compare_weights
 
 LANES = 256
 

@@ -1,4 +1,4 @@
-"""Verbs of a machine that renders: doctor, report stability, work."""
+"""Verbs of a machine that renders: doctor, work."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from typing import Any
 import click
 
 from photonfarm.shared.cli.options import device_option, json_option, redis_option, store_option
-from photonfarm.shared.core.processes import ended_by_ctrl_c
 
 
 @click.command()
@@ -37,34 +36,6 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     if as_json:
         show.print_json([{"name": check.name, "works": check.works, "detail": check.detail} for check in found])
     sys.exit(next((check.exit_code for check in found if not check.works and check.exit_code), 0))
-
-
-@click.command()
-@click.option("--quick", is_flag=True, help="Small images, mostly one pair of settings: about two minutes.")
-@click.option("--only", multiple=True, metavar="ROW", help="This row (1 … 36) or scene alone; may be repeated.")
-@click.option("--seed", type=click.IntRange(0), default=0, show_default=True, help="First seed; 0 is a seed.")
-@click.option("--threads", type=click.IntRange(1), default=1, show_default=True, help="Threads of Dr.Jit.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="stability", show_default=True,
-              help="Folder of stability.md, stability.json, stability.png and, of failures, the renders.")  # fmt: skip
-@device_option
-@ended_by_ctrl_c()
-def report_stability(quick: bool, only: tuple[str, ...], seed: int, threads: int, out: Path) -> None:
-    """Render 36 rows of hard scenes with `bdpt` and compare each with its truth; exit code 1 if one fails."""
-    from photonfarm.renderer.scene import backend
-
-    backend.load(threads)
-    from photonfarm.renderer.verify import report, rows
-
-    try:
-        scenes = rows.chosen(only, quick=quick)
-    except ValueError as error:
-        raise click.BadParameter(str(error), param_hint="--only") from error
-    out.mkdir(parents=True, exist_ok=True)  # now: what cannot be written should not be rendered first
-    found = report.examine(scenes, quick=quick, seed=seed, failures=out / "failures", log=partial(click.echo, err=True))
-    arguments = ["--quick"] * quick + [f"--only {row}" for row in only] + [f"--seed {seed}"] * (seed != 0)
-    report.write(found, out, " ".join(["photonfarm report stability", *arguments]))
-    click.echo(out / "stability.md")
-    sys.exit(0 if found.passed else 1)
 
 
 def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noqa: ARG001

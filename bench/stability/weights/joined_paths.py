@@ -19,7 +19,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.renderer.weights.oracle import F64
+from bench.stability.weights.oracle import F64
 from photonfarm.renderer.bdpt import randomness, weights
 from photonfarm.renderer.bdpt.camera import EyeStart, primary_rays, sample_sensor
 from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness

@@ -7,27 +7,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
-from photonfarm.renderer.cli.machine_verbs import report_stability
-from photonfarm.renderer.verify import report, rows
-from photonfarm.renderer.verify.pictures import FULL_Z, SIDE, of_z, sheet
-from photonfarm.renderer.verify.runner import SceneResult, plus_minus, run
-from photonfarm.renderer.verify.scenes.case import BdptSettings
-from photonfarm.renderer.verify.scenes.truths import known
+from bench.stability import report, rows
+from bench.stability.__main__ import main
+from bench.stability.pictures import FULL_Z, SIDE, of_z, sheet
+from bench.stability.runner import SceneResult, plus_minus, run
+from bench.stability.scenes.case import BdptSettings
+from bench.stability.scenes.truths import known
 
 
-def call(tmp_path: Path, *arguments: str) -> Any:
-    return CliRunner().invoke(report_stability, [*arguments, "--out", str(tmp_path / "out")])
+def call(tmp_path: Path, *arguments: str) -> int:
+    return main([*arguments, "--out", str(tmp_path / "out")])
 
 
 def test_the_report_is_written_as_markdown_json_and_picture(tmp_path: Path) -> None:
-    result = call(tmp_path, "--quick", "--only", "5", "--only", "30")
-    assert result.exit_code == 0, result.output
+    assert call(tmp_path, "--quick", "--only", "5", "--only", "30") == 0
     out = tmp_path / "out"
     text = (out / "stability.md").read_text(encoding="utf-8")
     assert "**2 of 2 rows pass**, 2 of 2 scenes. There are 36 rows; the others were not tried." in text
-    assert "photonfarm report stability --quick --only 5 --only 30" in text
+    assert "python -m bench.stability --quick --only 5 --only 30" in text
     assert "only the box filter is allowed" in text
     assert "smooth vertex normals" in text
     document = json.loads((out / "stability.json").read_text(encoding="utf-8"))
@@ -38,15 +36,15 @@ def test_the_report_is_written_as_markdown_json_and_picture(tmp_path: Path) -> N
 
 
 def test_a_failing_row_gives_exit_code_one_its_command_and_its_renders(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (empty,) = (scene for scene in rows.SCENES if scene.row == 5)
     wrong = replace(empty, truth=known(0.4, "a wrong number"), quick_settings=empty.settings[:1])
     monkeypatch.setattr(rows, "SCENES", (wrong,))
     monkeypatch.setattr(rows, "REFUSALS", ())
-    result = call(tmp_path, "--quick")
-    assert result.exit_code == 1
-    assert "again: python -m bench.renderer.stability --only 05-empty --settings 1,1 --seed 0 --quick" in result.stderr
+    assert call(tmp_path, "--quick", "--settings", "1,1") == 1
+    again = "again: python -m bench.stability --only 05-empty --settings 1,1 --seed 0 --quick"
+    assert again in capsys.readouterr().err
     kept = tmp_path / "out" / "failures" / "05-empty_1,1"
     assert np.load(kept / "bdpt.npy").shape == (12, 16, 16, 3)
     assert (kept / "bdpt_truth_z.png").is_file()
@@ -121,10 +119,13 @@ def test_rows_and_scenes_are_counted_apart_and_refusals_without_a_row_by_themsel
         ("13-glass-caustc", "there is no hard scene '13-glass-caustc'; do you mean '13-glass-caustic'?"),
     ],
 )
-def test_an_unknown_row_is_wrong_usage_and_answered_in_a_sentence(row: str, said: str, tmp_path: Path) -> None:
-    result = call(tmp_path, "--quick", "--only", row)
-    assert result.exit_code == 2
-    assert result.stderr.splitlines()[-1] == f"Error: Invalid value for --only: {said}"
+def test_an_unknown_row_is_wrong_usage_and_answered_in_a_sentence(
+    row: str, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        call(tmp_path, "--quick", "--only", row)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.splitlines()[-1] == f"python -m bench.stability: error: {said}"
 
 
 def test_errors_of_ratios_are_written_with_two_digits() -> None:

@@ -16,8 +16,8 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
-from photonfarm.renderer.verify.scenes.truths import PATH, load, render
+from bench.stability.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
+from bench.stability.scenes.truths import PATH, load, render
 from photonfarm.shared.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
 
 SIGNIFICANCE = 4e-6
@@ -114,7 +114,7 @@ def run(
         integrator = {"type": "bdpt", "max_depth": item.max_depth, "rr_depth": item.rr_depth}
         integrator |= counts.parameters
         bdpt = render(scene, integrator, effort.spp, range(seed, seed + effort.seeds))
-        command = f"python -m bench.renderer.stability --only {item.label} --settings {counts} --seed {seed}"
+        command = f"python -m bench.stability --only {item.label} --settings {counts} --seed {seed}"
         outcome = _judged(item, effort, counts, bdpt, truth, start, command + " --quick" * quick)
         yield replace(outcome, result=replace(outcome.result, path_ratio=path[0], path_ratio_standard_error=path[1]))
         start = time.process_time()
@@ -234,6 +234,6 @@ def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     result = SceneResult(
         refusal.row, refusal.name, text, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
-        f"python -m bench.renderer.stability --only {refusal.label}" + " --quick" * quick,
+        f"python -m bench.stability --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip
     return SceneOutcome(result)

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from photonfarm.renderer.verify.pictures import FULL_Z
-from photonfarm.renderer.verify.rows import ROWS
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneResult, plus_minus
+from bench.stability.pictures import FULL_Z
+from bench.stability.rows import ROWS
+from bench.stability.runner import ROUNDING, SIGNIFICANCE, SceneResult, plus_minus
 from photonfarm.shared.core.statistics import two_sided_limit
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.verify.report import StabilityReport
+    from bench.stability.report import StabilityReport
 
 EYE_ALONE = (
     "Mesh lights with smooth vertex normals: no light path starts there and none is joined to them, hits alone find "

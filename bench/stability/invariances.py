@@ -18,12 +18,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.renderer.weights import weight_check
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, plus_minus
-from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.cameras import scaled
-from photonfarm.renderer.verify.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
-from photonfarm.renderer.verify.scenes.truths import TRUTH_SEEDS, load, render
+from bench.stability.runner import ROUNDING, SIGNIFICANCE, plus_minus
+from bench.stability.scenes import hard_scenes
+from bench.stability.scenes.cameras import scaled
+from bench.stability.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
+from bench.stability.scenes.truths import TRUTH_SEEDS, load, render
+from bench.stability.weights import weight_check
 from photonfarm.shared.core.statistics import BlockTest, block_z_test
 
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
@@ -63,7 +63,7 @@ class Invariance:
     @property
     def command(self) -> str:
         """The command that runs it again."""
-        return f"python -m bench.renderer.stability --invariances {self.name}" + " --quick" * (not self.long)
+        return f"python -m bench.stability --invariances {self.name}" + " --quick" * (not self.long)
 
     def run(self) -> InvarianceResult:
         """Render what the check needs, and judge it."""

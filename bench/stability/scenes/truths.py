@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.verify.scenes.case import Effort, HardScene, Images, SceneDict, Truth
+from bench.stability.scenes.case import Effort, HardScene, Images, SceneDict, Truth
 
 LANES = 1 << 20
 """The largest number of samples of one launch, which bounds the memory of Mitsuba's own integrators."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 
-from photonfarm.renderer.verify.scenes import cameras, closed_form, lights, surfaces
-from photonfarm.renderer.verify.scenes.case import BdptSettings, HardScene, Refusal
+from bench.stability.scenes import cameras, closed_form, lights, surfaces
+from bench.stability.scenes.case import BdptSettings, HardScene, Refusal
 
 SCENES: tuple[HardScene, ...] = tuple(
     sorted((*closed_form.SCENES, *lights.SCENES, *surfaces.SCENES, *cameras.SCENES), key=lambda scene: scene.row)

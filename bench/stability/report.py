@@ -9,16 +9,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from photonfarm.renderer.verify.markdown import markdown as markdown
-from photonfarm.renderer.verify.pictures import keep, sheet, triple
-from photonfarm.renderer.verify.rows import ROWS
-from photonfarm.renderer.verify.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
-from photonfarm.renderer.verify.scenes.case import BdptSettings, HardScene, Refusal
+from bench.stability.markdown import markdown as markdown
+from bench.stability.pictures import keep, sheet, triple
+from bench.stability.rows import ROWS
+from bench.stability.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
+from bench.stability.scenes.case import BdptSettings, HardScene, Refusal
 from photonfarm.shared.core.pictures import Picture
-
-FAILURES = Path(".stability")
-"""The folder for the renders of failures."""
-
 
 Label = TypeVar("Label", int, str)
 
@@ -52,10 +48,15 @@ def _all_passed(results: Iterable[tuple[Label, SceneResult]]) -> dict[Label, boo
 
 
 def examine(
-    items: Iterable[HardScene | Refusal], *, quick: bool, seed: int = 0, settings: Sequence[BdptSettings] = (),
-    failures: Path = FAILURES, log: Callable[[str], None] = lambda _: None,
-) -> StabilityReport:  # fmt: skip
-    """Run the scenes (see `rows.chosen`), keep the renders of failures, and report each scene when it is done."""
+    items: Iterable[HardScene | Refusal],
+    *,
+    quick: bool,
+    seed: int,
+    settings: Sequence[BdptSettings],
+    failures: Path,
+    log: Callable[[str], None],
+) -> StabilityReport:
+    """Run the scenes (see `rows.chosen`), keep the renders of failures in a folder, and log each when it is done."""
     report = StabilityReport()
     for item in items:
         for outcome in run(item, quick=quick, seed=seed, settings=settings):

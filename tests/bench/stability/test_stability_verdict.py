@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.verify import runner
-from photonfarm.renderer.verify.rows import SCENES
-from photonfarm.renderer.verify.runner import SceneOutcome, compare, run, seen_bias
-from photonfarm.renderer.verify.scenes.case import FIRST, QUICK, BdptSettings
-from photonfarm.renderer.verify.scenes.truths import rendered
+from bench.stability import runner
+from bench.stability.rows import SCENES
+from bench.stability.runner import SceneOutcome, compare, run, seen_bias
+from bench.stability.scenes.case import FIRST, QUICK, BdptSettings
+from bench.stability.scenes.truths import rendered
 
 
 def scene(label: str) -> Any:

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.case import (
+from bench.stability.scenes import hard_scenes
+from bench.stability.scenes.case import (
     ALL,
     LONG,
     QUICK,
@@ -21,9 +21,9 @@ from photonfarm.renderer.verify.scenes.case import (
     SceneDict,
     Truth,
 )
-from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
-from photonfarm.renderer.verify.scenes.meshes import grid, octahedron
-from photonfarm.renderer.verify.scenes.truths import PATH, TRUTH_SEEDS, load, render, rendered
+from bench.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
+from bench.stability.scenes.meshes import grid, octahedron
+from bench.stability.scenes.truths import PATH, TRUTH_SEEDS, load, render, rendered
 
 # ------------------------------------------------ Lights at infinity, and edits ------------------------------------
 

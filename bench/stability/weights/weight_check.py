@@ -10,18 +10,18 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from bench.renderer.weights import oracle
-from bench.renderer.weights.joined_paths import Pinhole, TechniqueCounts, walk, weights_of
-from bench.renderer.weights.oracle import Mask, OraclePaths
-from bench.renderer.weights.oracle_paths import stored, usefulness
+from bench.stability.scenes import hard_scenes
+from bench.stability.scenes.case import BdptSettings, SceneDict
+from bench.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
+from bench.stability.scenes.truths import load
+from bench.stability.weights import oracle
+from bench.stability.weights.joined_paths import Pinhole, TechniqueCounts, walk, weights_of
+from bench.stability.weights.oracle import Mask, OraclePaths
+from bench.stability.weights.oracle_paths import stored, usefulness
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, Usefulness
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.bdpt.lights.emission import read_lights
-from photonfarm.renderer.verify.scenes import hard_scenes
-from photonfarm.renderer.verify.scenes.case import BdptSettings, SceneDict
-from photonfarm.renderer.verify.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
-from photonfarm.renderer.verify.scenes.truths import load
 
 TOLERANCE = 1e-3
 """The tolerance for the sum of a path's weights, and for each weight relative to the oracle's."""

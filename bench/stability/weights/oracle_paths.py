@@ -11,8 +11,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.renderer.weights.joined_paths import JoinedPaths, Pinhole, TechniqueCounts, gain, steps
-from bench.renderer.weights.oracle import F64, OraclePaths
+from bench.stability.weights.joined_paths import JoinedPaths, Pinhole, TechniqueCounts, gain, steps
+from bench.stability.weights.oracle import F64, OraclePaths
 from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.lights.emission import Lights
 

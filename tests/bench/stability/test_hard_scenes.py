@@ -1,16 +1,19 @@
-"""The 36 rows of hard scenes, each against its truth: the quick version of `make bench-stability`."""
+"""The 36 rows of hard scenes, each against its truth: the quick version of `make stability`."""
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import pytest
 
-from photonfarm.renderer.verify.pictures import keep
-from photonfarm.renderer.verify.report import FAILURES
-from photonfarm.renderer.verify.rows import REFUSALS, ROWS, SCENES
-from photonfarm.renderer.verify.runner import message_of, run
-from photonfarm.renderer.verify.scenes.case import GUIDED, BdptSettings, HardScene, Refusal
+from bench.stability.pictures import keep
+from bench.stability.rows import REFUSALS, ROWS, SCENES
+from bench.stability.runner import message_of, run
+from bench.stability.scenes.case import GUIDED, BdptSettings, HardScene, Refusal
 
 SLOW = ("18-mask-veils", "25-hundred-lights-at-once")
+FAILURES = Path(os.environ.get("PHOTONFARM_TEST_FAILURES", "test-failures"))
 GUIDED_QUICK = ("07-updated-sun", "10-sphere-light", "22-mirrored-mesh-light", "26-narrow-spot")
 """The rows that are rendered with guided light paths in every run of the tests; the others are slow."""
 QUICK = [scene for scene in SCENES if scene.quick is not None]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from photonfarm.renderer.verify.runner import Renders, SceneOutcome
+from bench.stability.runner import Renders, SceneOutcome
 from photonfarm.shared.core.pictures import Picture, display
 
 SIDE = 96

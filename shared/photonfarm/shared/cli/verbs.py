@@ -1,8 +1,7 @@
 """The verbs of the command line: entry points of the group `photonfarm.commands`, each imported only when it is used.
 
-The entry point "report" is the verb `photonfarm report`, and "report.stability" is a subcommand of it, even if another
-distribution provides the verb. A verb that is a command of its own stays one; a verb whose distribution is not
-installed becomes a group without a command.
+The entry point "scene" is the verb `photonfarm scene`, a group, and "scene.plan" is a subcommand of it, even if another
+distribution provides the verb.
 """
 
 from __future__ import annotations
@@ -11,14 +10,13 @@ import difflib
 from collections.abc import Iterator
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
 
 import click
 
 from photonfarm.shared.core.commands import GROUP
 
 _BARE = {"store": "Look into the sample store, check it, and repair it."}
-"""The help texts of groups that are not verbs themselves."""
+"""The help texts of groups that have no entry point of their own."""
 
 
 @cache
@@ -61,20 +59,11 @@ class Umbrella(Suggesting):
 
 
 class Extended(Suggesting):
-    """A verb with subcommands of other distributions below it."""
+    """A group with subcommands that have entry points of their own."""
 
-    def __init__(self, name: str, own: click.Command | None, below: dict[str, EntryPoint]) -> None:
-        """Take the verb as its own distribution has it, None where that is not installed."""
-        runs_alone = own is not None and not isinstance(own, click.Group)
-        super().__init__(
-            name,
-            help=own.help if own else _BARE.get(name, f"What the installed services have under `{name}`."),
-            params=list(own.params) if own else None,
-            commands=own.commands if isinstance(own, click.Group) else None,
-            callback=_unless_below(own) if own and runs_alone else own and own.callback,
-            invoke_without_command=runs_alone,
-            subcommand_metavar="[COMMAND [ARGS]...]" if runs_alone else None,
-        )
+    def __init__(self, name: str, own: click.Group | None, below: dict[str, EntryPoint]) -> None:
+        """Take the group of the verb's own entry point, None where it has none."""
+        super().__init__(name, help=own.help if own else _BARE[name], commands=own.commands if own else None)
         self._below = below
 
     def list_commands(self, ctx: click.Context) -> list[str]:
@@ -85,23 +74,6 @@ class Extended(Suggesting):
         """The subcommand; that of another distribution is imported only now."""
         entry = self._below.get(cmd_name)
         return super().get_command(ctx, cmd_name) if entry is None else entry.load()
-
-
-def _unless_below(own: click.Command) -> Any:
-    """The verb's own callback, used when no subcommand follows; it refuses options that stand before a subcommand."""
-
-    @click.pass_context
-    def run(ctx: click.Context, /, **options: Any) -> Any:
-        if ctx.invoked_subcommand is None:
-            return ctx.invoke(own.callback, **options) if own.callback else None
-        for parameter in own.params:
-            if ctx.get_parameter_source(str(parameter.name)) is click.core.ParameterSource.COMMANDLINE:
-                raise click.UsageError(
-                    f"{parameter.opts[0]} belongs behind {ctx.invoked_subcommand!r}, if it has this option", ctx
-                )
-        return None
-
-    return run
 
 
 def options_by_command(umbrella: click.Group) -> dict[str, dict[str, str]]:

@@ -42,8 +42,7 @@ def test_what_is_read_without_photonfarm_is_what_the_store_has_to_the_bit(
 
 def check_sample(there: dict[str, Any], sample: Sample, to: str) -> None:
     half = "float32" if to == "parquet" else "float16"  # Python's numbers, as pyarrow gives them, have no type
-    arrays = {"A": sample.radiance[0], "B": sample.radiance[1], "depth": sample.depth, **sample.guides}
-    arrays |= {"albedo": sample.albedo, "normal": sample.normal}
+    arrays = {"A": sample.radiance[0], "B": sample.radiance[1], **sample.images}
     arrays |= {"point_seen": sample.point_cloud.seen, "photon_seen": sample.seen_photons}
     assert set(GUIDES) < set(arrays)
     for name, values in arrays.items():

@@ -38,7 +38,7 @@ class Presence:
     def begin(self, stop: Stop, is_over: Callable[[], bool]) -> bool:
         """Announce it as soon as nobody has the scene for itself; False if it is stopped or over before that."""
         said = ""
-        while not self.is_there and not stop.is_set() and not is_over():
+        while not self.is_there:
             try:
                 self._announced.enter_context(self._source.at_work(self._what))
                 self.is_there = True
@@ -46,7 +46,8 @@ class Presence:
                 if str(error) != said:
                     self._tell(f"training waits: {error}")
                 said = str(error)
-                stop.wait(LOOK_S)
+                if stop.wait(LOOK_S) or is_over():
+                    break
         return self.is_there
 
     def end(self) -> None:

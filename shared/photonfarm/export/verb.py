@@ -65,7 +65,8 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
     from photonfarm.export.settings import ExportRequest
 
     try:
-        result = export_scene(store, scene, out, ExportRequest(**asked), *show.progress())
+        with show.progress() as (log, on_progress):
+            result = export_scene(store, scene, out, ExportRequest(**asked), log, on_progress)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)

@@ -119,8 +119,8 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
         "denoise_4", "light_transport", "oidn", "fill-in",
     ]  # fmt: skip
     assert lines[0].count("|") == lines[-1].count("|")
-    assert [line for line in result.stderr.splitlines() if line.endswith(" is measured")][2:] == [
-        "oidn 1/4 is measured", "fill-in 1/4 is measured",
+    assert [line for line in result.stderr.splitlines() if line.endswith(": 3 samples")][2:] == [
+        "oidn 1/4: 3 samples", "fill-in 1/4: 3 samples",
     ]  # fmt: skip
     documents = [json.loads((run.folder / EVALUATION).read_text()) for run in runs]
     assert documents[0] == documents[1]

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from functools import partial
+from collections.abc import Callable
 from itertools import product
 from pathlib import Path
 from typing import Any, get_args
@@ -13,7 +11,6 @@ from typing import Any, get_args
 import click
 
 from photonfarm.shared.cli.options import json_option, store_option
-from photonfarm.shared.core.waiting import Steps, WorkLog
 from photonfarm.trainer.cli.train_verb import run_option
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
@@ -87,22 +84,6 @@ def _how(
     return {"denoisers": chosen, "references": references, "inception": inception, **others}
 
 
-@contextmanager
-def measuring_progress() -> Iterator[Callable[[str, int, int], None]]:
-    """Yield a callback with what is done, how many of its samples are done, and of how many; 0: it has no parts."""
-    name, samples = "", Steps(0)
-    with WorkLog(partial(click.echo, err=True)) as work:
-
-        def show(what: str, done: int, total: int) -> None:
-            nonlocal name, samples
-            if what != name:
-                name, samples = what, Steps(total)
-                work.begin(f"{what} is measured" if total else what, samples.words if total else None)
-            samples.reach(done)
-
-        yield show
-
-
 @click.command()
 @measuring
 @click.option(
@@ -122,6 +103,8 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
+    from photonfarm.trainer.cli.show_progress import measuring_progress
+
     with measuring_progress() as on_progress:
         found = compare(store, loaded, on_progress=on_progress, **how)
     pictures = write(found, loaded)
@@ -143,6 +126,7 @@ def report(
     from the scene to the image; with references, the worst cases of the first run are found and shown.
     """
     how = _how(**asked)
+    from photonfarm.trainer.cli.show_progress import measuring_progress
     from photonfarm.trainer.report import write_report
 
     with measuring_progress() as on_progress:

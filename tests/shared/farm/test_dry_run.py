@@ -238,7 +238,7 @@ def test_the_command_prints_what_when_and_what_would_be_better(tmp_path: Path, v
     verb()
     first, second, third = run(spec_file(tmp_path), tmp_path / "none").stdout.splitlines()
     assert first.endswith(": 12 samples would be planned, 0 are already")
-    assert second == "at most 0.1 MB before compression; 14 core-seconds: 3.4 s on the 4 cores here"
+    assert second == "at most 0.1 MB before compression; 14 core-seconds: 3 s on the 4 cores here"
     assert third.startswith("suggested at this cost: half_spp = ")
     assert "% less excess error predicted for light_transport" in third
     assert not (tmp_path / "none").exists()

@@ -232,7 +232,7 @@ def test_a_reader_may_wait_for_store_scene_plan_and_samples(tmp_path: Path) -> N
         reader.base()
     scene = store.scene(store.plan(spec, Request()).scene_id)
     assert reader.refresh().size == 0
-    with pytest.raises(StoreError):
+    with pytest.raises(IncompleteError, match=r"row 0 .* is not complete; workers render it"):
         reader.read(0)
     samples.commit_all(scene)
     assert reader.refresh().tolist() == [0]

@@ -76,13 +76,11 @@ def take_name(connection: Redis, wanted: str, *, ttl_s: float) -> str:
         held = connection.hget(WORKER + name, REPORT)
         if held is not None and WorkerReport.of(held).has_ended:
             bury(connection, name)
-        with connection.pipeline() as pipeline:
-            pipeline.hsetnx(WORKER + name, REPORT, json.dumps(asdict(WorkerReport())))
-            pipeline.pexpire(WORKER + name, int(1000 * ttl_s))
-            if pipeline.execute()[0]:
+        if connection.hsetnx(WORKER + name, REPORT, json.dumps(asdict(WorkerReport()))):
+            with connection.pipeline() as pipeline:
                 beat(pipeline, name, WorkerReport(), ttl_s=ttl_s)
                 pipeline.execute()
-                return name
+            return name
     raise AssertionError  # count() does not end
 
 

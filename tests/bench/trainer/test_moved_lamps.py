@@ -109,10 +109,10 @@ def test_a_prediction_that_does_not_change_explains_nothing(views: Views) -> Non
 def test_objects_stay_and_lamps_move(views: Views) -> None:
     shines = lamps(views.spec)
     for first, second in views.pairs:
-        before, after = first.sample.modification.vector, second.sample.modification.vector
+        before, after = first.modification.vector, second.modification.vector
         np.testing.assert_array_equal(before[~shines], after[~shines])
         assert (before[shines] != after[shines]).any(axis=1).all()
-        np.testing.assert_array_equal(first.sample.view.vector, second.sample.view.vector)
+        np.testing.assert_array_equal(first.view.vector, second.view.vector)
     assert 0 < views.change.stays.mean() < 1
     assert all(errors.values.min() > 0 for errors in views.change.there())
 

@@ -12,7 +12,7 @@ from photonfarm.shared.core.errors import CorruptError, IncompleteError
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.read import reader
+from photonfarm.shared.store.format import shards
 from photonfarm.shared.store.read.batch import Batch
 
 WIDE = (5, 6)  # rows with a value beyond float16
@@ -138,7 +138,7 @@ def test_a_bit_that_flips_while_batches_are_read_is_found(scene: SceneStore, sou
 
 def test_no_more_files_stay_open_than_are_allowed(source: SceneReader, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two for each shard: its own, and that of its map."""
-    monkeypatch.setattr(reader, "OPEN_SHARDS", 3)
+    monkeypatch.setattr(shards, "OPEN_SHARDS", 3)
     descriptors = Path("/proc/self/fd")
     before = len(list(descriptors.iterdir()))
     memory = Batch.empty(source.spec, 8)
@@ -153,7 +153,7 @@ def test_threads_that_read_at_once_each_get_their_own_samples(
 ) -> None:
     """Few shards stay open, so that they are closed by one thread while another one reads."""
     expected = source.read_batch(range(8))
-    monkeypatch.setattr(reader, "OPEN_SHARDS", 3)
+    monkeypatch.setattr(shards, "OPEN_SHARDS", 3)
 
     def read(seed: int) -> None:
         rng, memory = np.random.default_rng(seed), Batch.empty(source.spec, 4)

@@ -14,7 +14,9 @@ from __future__ import annotations
 import errno
 import mmap
 import os
+import threading
 import weakref
+from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -252,3 +254,34 @@ def _crc32c(data: bytes | memoryview | NDArray[np.uint8], before: int = 0) -> in
     from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 
     return int(crc32c(data, before))
+
+
+OPEN_SHARDS = 400
+"""The most shards that a reader keeps open, with a file descriptor each, two once mapped; a usual limit is 1024."""
+
+
+class OpenShards:
+    """The most recently used shards, by array and job; a dropped one is closed once its last reader is done."""
+
+    def __init__(self) -> None:
+        self._shards: OrderedDict[tuple[str, int], Shard] = OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: tuple[str, int]) -> Shard | None:
+        """The shard of an array and a job; None if it is not open."""
+        with self._lock:
+            if key in self._shards:
+                self._shards.move_to_end(key)
+            return self._shards.get(key)
+
+    def put(self, key: tuple[str, int], shard: Shard) -> None:
+        """Keep a shard open, instead of the one that was used the longest ago."""
+        with self._lock:
+            self._shards[key] = shard
+            while len(self._shards) > OPEN_SHARDS:
+                self._shards.popitem(last=False)
+
+    def clear(self) -> None:
+        """Keep none."""
+        with self._lock:
+            self._shards.clear()

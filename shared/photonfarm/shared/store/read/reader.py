@@ -8,8 +8,6 @@ are read straight from the shards, every byte checked against its checksum.
 
 from __future__ import annotations
 
-import threading
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import fields
@@ -21,14 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, StoreError, store_errors
-from photonfarm.shared.core.keys import KEY_BYTES, Key, view_key
+from photonfarm.shared.core.keys import KEY_BYTES, Key
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.shared.scene.modification import Modification, modification_keys
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, view_keys
 from photonfarm.shared.store.format import markers, schema
 from photonfarm.shared.store.format.followed_markers import FollowedMarkers
-from photonfarm.shared.store.format.shards import Shard
+from photonfarm.shared.store.format.shards import OpenShards, Shard
 from photonfarm.shared.store.io.storage import FORMAT_FILE, open_storage, renew_copy
 from photonfarm.shared.store.read.batch import Batch, Sample
 from photonfarm.shared.store.write import plans
@@ -39,9 +37,6 @@ from photonfarm.shared.store.write.store import check_format
 
 REPAIR = "`photonfarm store check --repair` sets its job aside, and workers render it again"
 """The remedy for damaged samples."""
-
-OPEN_SHARDS = 400
-"""The most shards that a reader keeps open, with a file descriptor each, two once mapped; a usual limit is 1024."""
 
 
 class SceneReader:
@@ -64,7 +59,7 @@ class SceneReader:
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
-        self._shards = _OpenShards()
+        self._shards = OpenShards()
         self._base: tuple[Geometry, BasePointCloud] | None = None
 
     @property
@@ -241,7 +236,7 @@ class SceneReader:
 
     def modification_key(self, row: int) -> Key:
         """The content key of a sample's configuration, by whose hash samples are held out."""
-        return plans.modification_at(self._plans, self.modification_row(row)).key(self.spec.radiance_id)
+        return self.modification_keys([row])[0]
 
     def modification_keys(self, rows: Sequence[int]) -> list[Key]:
         """The content keys of the configurations of many samples, each hashed once."""
@@ -265,9 +260,7 @@ class SceneReader:
 
     def view_key(self, row: int) -> Key:
         """The content key of a sample's configuration and view: equal for all passes of one view."""
-        modification_key = self.modification_key(row)
-        view = plans.view_at(self._plans, int(self._view_row[row]))
-        return view_key(modification_key, view.vector)
+        return self.view_keys([row])[0]
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud, read once; raises StoreError while they are not there."""
@@ -390,27 +383,3 @@ class SceneReader:
             if not renew_copy(self._storage, file):
                 raise
         return Shard(self._storage.local(file), array, shard_rows)
-
-
-class _OpenShards:
-    """The most recently used shards, by array and job; a dropped one is closed once its last reader is done."""
-
-    def __init__(self) -> None:
-        self._shards: OrderedDict[tuple[str, int], Shard] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: tuple[str, int]) -> Shard | None:
-        with self._lock:
-            if key in self._shards:
-                self._shards.move_to_end(key)
-            return self._shards.get(key)
-
-    def put(self, key: tuple[str, int], shard: Shard) -> None:
-        with self._lock:
-            self._shards[key] = shard
-            while len(self._shards) > OPEN_SHARDS:
-                self._shards.popitem(last=False)
-
-    def clear(self) -> None:
-        with self._lock:
-            self._shards.clear()

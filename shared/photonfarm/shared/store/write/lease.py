@@ -14,6 +14,7 @@ compared.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import time
@@ -36,6 +37,9 @@ SILENT_S = 60.0
 
 LOOK_S = 0.3
 """The seconds between two looks of those who wait."""
+
+_NOT_WRITABLE = (errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT)
+"""The errors of a store that cannot be written to, or has no room."""
 
 OnWait = Callable[[str], object]
 """Called with a sentence when what is waited for changes."""
@@ -149,11 +153,12 @@ def _owner(storage: Storage, name: str) -> str | None:
 @contextmanager
 def _announced(storage: Storage, name: str, what: str) -> Iterator[None]:
     try:
-        _place(storage, name, what, 0)
-    except OSError as error:
-        if isinstance(error, StoreError):
+        with store_errors("announce work in a scene", storage.where):
+            _place(storage, name, what, 0)
+    except StoreError as error:
+        if getattr(error.__cause__, "errno", None) not in _NOT_WRITABLE:
             raise
-        yield  # a store that is only read
+        yield
         return
     with _renewed(storage, name, what):
         yield

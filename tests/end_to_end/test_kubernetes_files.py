@@ -17,8 +17,8 @@ import pytest
 import yaml
 from redis import Redis
 
-from photonfarm.shared import queue
 from photonfarm.shared.farm.running_farm import METRICS_PORT
+from photonfarm.shared.queue.rq_adapter import open_queue
 
 ROOT = Path(__file__).parents[2]
 CHART, KUSTOMIZE = ROOT / "deploy/helm/photonfarm", ROOT / "deploy/kustomize"
@@ -169,7 +169,7 @@ def test_keda_watches_the_queue_and_the_started_jobs_of_the_redis_that_there_is(
     scaled, access = (
         named(*of) for of in (("ScaledObject", "photonfarm-renderer"), ("TriggerAuthentication", "photonfarm-redis"))
     )
-    jobs = queue.open_queue(connection)
+    jobs = open_queue(connection)
     watched = [trigger["metadata"]["listName"] for trigger in scaled["spec"]["triggers"]]
     assert watched == [jobs.key, jobs.started_job_registry.key]
     assert named("Deployment", scaled["spec"]["scaleTargetRef"]["name"])

@@ -155,7 +155,7 @@ def compare(reader: SceneReader, row: int, model: Model) -> bytes:
     """Read a row, and compare it bit for bit with what the model has under its key; the key."""
     sample = reader.read(row, guides=True)
     modification, view = sample.modification.vector.tobytes(), sample.view.vector.tobytes()
-    key = model.key(modification, view, sample.pass_)
+    key = model.key(modification, view, sample.pass_number)
     assert model.complete().get(row, key) == key
     assert model.planned[key].row == row
     np.testing.assert_array_equal(sample.radiance, radiance_of(model.spec, key))

@@ -18,8 +18,8 @@ from photonfarm.shared.core.records import Visibility
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
 from photonfarm.shared.store.format import markers
+from photonfarm.shared.store.write.lease import LeasedError, lease
 
 
 @pytest.fixture
@@ -252,29 +252,22 @@ def test_a_committed_job_is_not_rendered_again(scene: SceneStore, store: Store, 
     assert scene.marker(0)["figures"]["worker"] == "test"
 
 
-@pytest.mark.parametrize("other", ["worker", "repair"])
 def test_a_job_that_is_not_committed_says_who_came_between(
-    scene: SceneStore, store: Store, recorded: type, other: str, monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
-    """Another commits it before we do; a repair then sets that aside, whose files are ours as well."""
+    scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Another commits it before we do."""
     place = markers.place
 
     def meanwhile(*about: Any) -> bool:
         monkeypatch.setattr(markers, "place", place)
         assert ShardRenderer(Store(store.root), worker="other", load=recorded.load).render(scene.scene_id, 0)
-        if other == "repair":
-            (file,) = (scene.folder / "plans/000000/radiance").glob("c.0.*")
-            file.write_bytes(file.read_bytes()[:-1])
-            assert check_store(Store(store.root), when="now", repair=True).scenes[0].set_aside == ("job 0",)
         return place(*about)
 
     monkeypatch.setattr(markers, "place", meanwhile)
     assert not ShardRenderer(store, worker="test", load=recorded.load).render(scene.scene_id, 0)
     (said,) = [record.getMessage() for record in caplog.records]
-    assert scene.is_committed(0) == (other == "worker")
-    assert ("was committed by another worker" in said) == (other == "worker")
-    assert ("set aside by a repair" in said) == (other == "repair")
+    assert scene.is_committed(0)
+    assert "was committed by another worker" in said
 
 
 def test_the_marker_tells_what_the_job_cost_and_which_versions_rendered_it(
@@ -336,12 +329,17 @@ def test_a_scene_file_that_is_not_the_planned_one_is_refused(
     assert jobs.located(spec) == spec
 
 
-def test_a_job_of_another_store_is_refused(store: Store, recorded: type) -> None:
-    with pytest.raises(QueueError):
-        ShardRenderer(store, worker="test", load=recorded.load).render("0" * 32, 0)
+def test_a_job_that_is_not_planned_is_refused_and_one_of_a_forgotten_scene_is_dropped(
+    store: Store, scene: SceneStore, recorded: type
+) -> None:
+    renderer = ShardRenderer(store, worker="test", load=recorded.load)
+    with pytest.raises(QueueError, match="has no job 99"):
+        renderer.render(scene.scene_id, 99)
+    assert not renderer.render("0" * 32, 0)
 
 
-def test_the_queues_function_does_nothing_outside_a_worker(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jobs, "_serving", None)
-    with pytest.raises(IncompleteError, match="photonfarm work"):
-        jobs.render_shard("0" * 32, 0)
+def test_a_leased_scene_is_not_rendered(store: Store, scene: SceneStore, recorded: type) -> None:
+    renderer = ShardRenderer(store, worker="test", load=recorded.load)
+    with lease(store.storage, scene.scene_id, "store join", pytest.fail), pytest.raises(LeasedError):
+        renderer.render(scene.scene_id, 0)
+    assert renderer.render(scene.scene_id, 0)

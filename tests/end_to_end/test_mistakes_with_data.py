@@ -123,7 +123,6 @@ DEPTH = "differs in transport.max_depth (8 there, 6 here)"
         (NOTHING, "preview edited.toml", 4, ["holds no samples of edited.toml", DEPTH]),
         (NOTHING, "top-up edited.toml --spp 8 --no-queue", 3, ["edited.toml", DEPTH]),
         (NOTHING, "train edited.toml --seconds 0.2 --run new", 7, ["which store does not hold yet", DEPTH]),
-        (NOTHING, "train edited.toml --grid --run new", 3, ["holds no scene edited.toml (it holds den"]),
         (NOTHING, "preview cornell", 4, ["no scene has the id or name 'cornell'", "(den)"]),
         (NOTHING, "store find --scene castle", 4, ["'castle'", "(den)"]),
         (NOTHING, "work --scene castle --job 0", 4, ["'castle'", "(den)"]),

@@ -142,7 +142,7 @@ def test_the_verb_writes_nothing_and_says_the_same_as_json(tmp_path: Path, monke
 @pytest.mark.parametrize(
     ("arguments", "exit_code", "said"),
     [
-        (("--dry-run", "--grid"), 2, "exclude each other"),
+        (("--dry-run", "--summary"), 2, "exclude each other"),
         (("--json",), 2, "--json goes with --dry-run alone"),
         (("--film", "64"), 2, "--film goes with --dry-run alone"),
         (("--dry-run", "--film", "20"), 3, "multiple of 8"),

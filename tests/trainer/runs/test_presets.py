@@ -142,25 +142,11 @@ def test_a_pair_without_a_value_is_wrong_usage() -> None:
     assert "KEY=VALUE" in result.output
 
 
-@pytest.mark.parametrize("flags", [("--check", "--grid"), ("--grid", "--summary"), ("--check", "--summary", "--grid")])
+@pytest.mark.parametrize("flags", [("--check", "--dry-run"), ("--check", "--summary", "--dry-run")])
 def test_what_is_done_instead_of_training_is_one_thing(flags: tuple[str, ...], tmp_path: Path) -> None:
     result = CliRunner().invoke(umbrella, ["train", *flags, "--run", str(tmp_path / "run")])
     assert result.exit_code == 2
     assert all(flag in result.output for flag in flags)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_grid_names_the_store_that_is_not_there_and_leaves_no_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for spec in ([], ["room"]):
-        arguments = ["train", *spec, "--grid", "--store", str(tmp_path / "stoer"), "--run", str(tmp_path / "run")]
-        result = CliRunner().invoke(umbrella, arguments)
-        assert isinstance(result.exception, SpecError)
-        assert str(tmp_path / "stoer") in str(result.exception)
-    monkeypatch.setenv("WORLD_SIZE", "2")
-    with pytest.raises(SpecError, match="2 processes"):
-        service.search("room", tmp_path / "stoer", tmp_path / "run", "small", {}, print)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -245,46 +245,6 @@ def _spec_of(spec: str | None, store: str | Path) -> SceneSpec:
     return Store(store).scene(scene_id).spec
 
 
-def search(
-    spec: str | None,
-    store: str | Path,
-    folder: Path,
-    preset_name: str,
-    changes: dict[str, Any],
-    log: Callable[[str], None],
-) -> str:
-    """Run, or resume, a grid search over optimisers, rates and decays on a complete store; returns its table.
-
-    Keys that `changes` sets are not searched. Raises SpecError without a spec, unless the store has one scene, for a
-    store without the scene, and in one of several processes.
-    """
-    from photonfarm.shared.store import SceneReader
-    from photonfarm.trainer.grid_search import AXES, STEPS, run_grid, table
-    from photonfarm.trainer.runs.distributed import processes
-    from photonfarm.trainer.training.loop import stop_on_signals
-
-    if (size := processes()) > 1:
-        raise SpecError(f"torchrun has started {size} processes, and a grid is one's work; start it without torchrun")
-    settings = settings_of(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
-    scene_id = load_spec(spec).scene_id if spec else _only_scene(store)
-    if scene_id is None or is_vacant(store) or not Store(store).has_scene(scene_id):
-        wanted = f" {spec}" if spec else ""
-        there = f" ({scenes_held(Store(store).storage)})" if not is_vacant(store) else ""
-        raise SpecError(f"{store}: holds no scene{wanted}{there}; a grid compares runs over samples that are there")
-    with stop_on_signals() as stop, _sign_of_life(folder):
-        axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
-        if settings.schedule == "cosine":
-            axes["decay"] = (settings.decay,)
-            log("decay is not searched: schedule = 'cosine' has none")
-        elif (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
-            axes["decay"] = (settings.decay,)
-            log(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
-        cells = run_grid(lambda: SceneReader(store, scene_id), settings, folder, axes, stop=stop, log=log)
-        if stop.is_set():
-            log(f"stopped after {len(cells)} cells; the same command goes on")
-        return table(cells)
-
-
 def _begun_on(folder: Path) -> tuple[str | None, float | None]:
     """The scene that a run was begun on, and its exposure then; None for a new run."""
     from photonfarm.trainer.runs import checkpoint

@@ -113,7 +113,6 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 )
 @click.option("--until-complete", is_flag=True,
               help="End with exit code 7, not 0, if a signal stops it, so that schedulers start it again.")  # fmt: skip
-@click.option("--grid", is_flag=True, help="Search optimisers, rates and decays by short runs on a complete store.")
 @click.option("--summary", is_flag=True, help="Only print the network's parameters and work, part by part.")
 @click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
 @click.option("--dry-run", is_flag=True, help="Only estimate work, memory and time here, by a few steps "
@@ -123,7 +122,7 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
 @json_option
 def train(
     spec: str | None, store: str | Path, run: Path, redis_url: str, preset: str, pairs: tuple[str, ...],
-    until_complete: bool, grid: bool, summary: bool, check: bool, dry_run: bool, film: int | None, as_json: bool,
+    until_complete: bool, summary: bool, check: bool, dry_run: bool, film: int | None, as_json: bool,
     **options: Any,
 ) -> None:  # fmt: skip
     """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
@@ -135,7 +134,7 @@ def train(
     from photonfarm.trainer import service
     from photonfarm.trainer.cli import show
 
-    others = (("--grid", grid), ("--summary", summary), ("--check", check), ("--dry-run", dry_run))
+    others = (("--summary", summary), ("--check", check), ("--dry-run", dry_run))
     instead = [name for name, asked in others if asked]
     if len(instead) > 1:
         raise click.UsageError(f"{' and '.join(instead)} exclude each other; give one of them")
@@ -145,8 +144,6 @@ def train(
     changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
     if check:
         service.check(run)
-    elif grid:
-        click.echo(service.search(spec, store, run, preset, changes, log))
     elif summary:
         click.echo(service.summarise(spec, store, preset, changes))
     elif dry_run:

@@ -1,4 +1,4 @@
-"""The optimisers of the supplement's grid search, and the schedules of their rate [supplement 3.1]."""
+"""The optimisers that the supplement compared, and the schedules of their rate [supplement 3.1]."""
 
 from __future__ import annotations
 

@@ -1,5 +1,11 @@
 """The grid search over optimisers, rates and decays [supplement 3.1]: short runs that differ in nothing else.
 
+    python -m bench.trainer.grid_search [SPEC] [--store DIR|URL] [--run DIR] [--preset NAME] [--steps N] …
+
+It takes the options of `photonfarm train` that set something; `--steps` is 1000 by default. The store must be complete.
+What an option sets is not searched, nor is a decay that would not act. The same command continues a search that was
+stopped. The table is printed, and grid.md and grid.json are left in the folder `--run`, beside a folder for each run.
+
 A cell is one combination of the axes. All cells use the same samples in the same order from the same first weights and
 are measured on the same held-out samples, so that they are compared in pairs. The best of many cells looks better than
 it is on the samples that selected it; so it is selected by one half of the held-out configurations, and the reported
@@ -10,30 +16,36 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 from pydantic import ValidationError
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
 from photonfarm.shared.core.estimate import Estimate, group_means, stated
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import Key, make_key
 from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.processes import Stop
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
+from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.shared.store import SceneReader, Store
+from photonfarm.trainer.cli.train_verb import by_key
+from photonfarm.trainer.cli.train_verb import train as train_verb
 from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import held
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings, settings_of
 from photonfarm.trainer.training.learner import DivergedError
-from photonfarm.trainer.training.loop import Hooks, train
+from photonfarm.trainer.training.loop import Hooks, stop_on_signals, train
 
 Axes = Mapping[str, Sequence[Any]]
 """The values of each searched key of the settings."""
@@ -82,16 +94,16 @@ def run_grid(
     axes: Axes = AXES,
     *,
     stop: Stop | None = None,
-    log: Callable[[str], None] | None = None,
+    log: Callable[[str], object] = lambda _: None,
 ) -> list[Cell]:
     """Train and measure every cell; returns the finished ones, which are all unless `stop` was set.
 
     Each cell is a run in a folder of its own below `folder`, where grid.json and grid.md grow with every cell. Finished
     cells are not trained again, and an unfinished one resumes from its last checkpoint; grid.json also keeps cells of
     other values of the axes. `make_source` opens the same complete samples each time; `log` gets a line for every
-    cell. Raises IncompleteError while samples are missing and if fewer than two configurations are held out; SpecError
-    for an axis that the settings do not have, and for a folder that holds a grid over other samples or settings; and
-    the errors of a run, except DivergedError.
+    cell, and whom a cell waits for. Raises IncompleteError while samples are missing and if fewer than two
+    configurations are held out; SpecError for an axis that the settings do not have, and for a folder that holds a grid
+    over other samples or settings; and the errors of a run, except DivergedError.
     """
     stop = stop or Stop()
     wanted = _cells(settings, axes)
@@ -103,14 +115,13 @@ def run_grid(
         for changes, changed in wanted:
             if any(cell.changes == changes for cell in finished):
                 continue
-            cell = _run_cell(make_source, changed, changes, folder / _name(changes), stop)
+            cell = _run_cell(make_source, changed, changes, folder / _name(changes), stop, log)
             if cell is None:
                 break
             known.append(cell)
             finished.append(cell)
             _write(folder, about, known, finished)
-            if log:
-                log(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
+            log(f"{len(finished)} of {len(wanted)}: {_name(changes)}: {_stated(cell.error)}")
         _write(folder, about, known, finished)
     return finished
 
@@ -174,10 +185,11 @@ def _run_cell(
     changes: dict[str, Any],
     run: Path,
     stop: Stop,
+    log: Callable[[str], object],
 ) -> Cell | None:
     """Train a cell to its end and measure it; None if it was stopped early."""
     try:
-        if train(make_source(), settings, run, Hooks(stop=stop)).reason == "stopped":
+        if train(make_source(), settings, run, Hooks(stop=stop, on_wait=log)).reason == "stopped":
             return None
     except DivergedError:
         return Cell(changes, (), ())
@@ -235,3 +247,54 @@ def _write(folder: Path, about: Mapping[str, Any], known: Sequence[Cell], wanted
     with store_errors("write the grid", folder):
         for name, text in ((JSON, document), (MARKDOWN, table(wanted))):
             write_whole(folder / name, text + "\n")
+
+
+# -------------------------------------------------------------------------------------------------------- command line
+
+NOT_SET = ("redis_url", "until_complete", "summary", "check", "dry_run", "film", "as_json")
+"""The options of `photonfarm train` that are not about the settings of a run."""
+
+
+def search(
+    spec: str | None,
+    store: str | Path,
+    folder: Path,
+    preset_name: str,
+    changes: Mapping[str, Any],
+    log: Callable[[str], object],
+) -> str:
+    """Run, or resume, the search on a scene of a store; returns its table. Keys that `changes` sets are not searched.
+
+    Raises SpecError without a spec, unless the store has one scene; StoreError without that store or scene; and the
+    errors of `run_grid`.
+    """
+    settings = settings_of(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
+    scenes = Store(store).scenes(load_spec(spec).scene_id if spec else None)
+    if len(scenes) != 1:
+        raise SpecError(f"{store}: holds {len(scenes)} scenes; name the spec of the one to train on")
+    axes = {key: (changes[key],) if key in changes else values for key, values in AXES.items()}
+    if settings.schedule == "cosine":
+        axes["decay"] = (settings.decay,)
+        log("decay is not searched: schedule = 'cosine' has none")
+    elif (drawn := settings.max_steps * settings.batch) <= settings.epoch_samples:
+        axes["decay"] = (settings.decay,)
+        log(f"decay is not searched: it begins after {settings.epoch_samples} samples, and {drawn} are drawn")
+    with stop_on_signals() as stop:
+        cells = run_grid(lambda: SceneReader(store, scenes[0].scene_id), settings, folder, axes, stop=stop, log=log)
+    if stop.is_set():
+        log(f"stopped after {len(cells)} cells; the same command goes on")
+    return table(cells)
+
+
+@click.command(help=__doc__, params=[option for option in train_verb.params if option.name not in NOT_SET])
+def main(spec: str | None, store: str | Path, run: Path, preset: str, pairs: tuple[str, ...], **options: Any) -> None:
+    changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
+    try:
+        click.echo(search(spec, store, run, preset, changes, lambda sentence: click.echo(sentence, err=True)))
+    except PhotonfarmError as error:
+        click.echo(f"grid_search: {error}", err=True)
+        sys.exit(error.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -9,32 +9,53 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
+from analytic_room import analytic_base, analytic_spec
+from analytic_room_samples import AnalyticSource, commit_job
+from click.testing import CliRunner
 
+from bench.trainer import grid_search
+from bench.trainer.grid_search import Cell, main, run_grid, table
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
-from photonfarm.trainer import grid_search, service
-from photonfarm.trainer.grid_search import Cell, run_grid, table
+from photonfarm.shared.store import Store
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import train
 
 AXES = {"optimiser": ("adam", "rmsprop"), "learning_rate": (1e-4, 2e-3)}
 
 
+def make_source(samples: int, **how: int) -> AnalyticSource:
+    """A source of so many samples of a small analytic room; how: views=, per_look=."""
+    return AnalyticSource(analytic_spec(16, 256), samples, **how)
+
+
+def tiny(**changes: object) -> TrainSettings:
+    """Settings of a tiny network on tiny batches, with changes."""
+    described = {"network": NetworkSettings(width=4), "batch": 3, "hold_out": 0.25, "poll_seconds": 0.01}
+    described |= {"max_steps": 12, "validate_every": 5, "checkpoint_every": 4, "validation_samples": 8}
+    return TrainSettings.model_validate({**described, **changes})
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """The folder of a search."""
+    return tmp_path / "run"
+
+
 @pytest.fixture(scope="module")
-def searched(make_source, tiny, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Cell]]:
+def searched(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Cell]]:
     """The folder of a grid of four cells, and what it found."""
-    torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("searched")
     return folder, run_grid(lambda: make_source(24), tiny(), folder, AXES)
 
 
-def test_every_cell_is_the_run_that_its_settings_make_alone(make_source, tiny, searched, tmp_path) -> None:
+def test_every_cell_is_the_run_that_its_settings_make_alone(searched, tmp_path) -> None:
     run, cells = searched
     assert [cell.changes["optimiser"] for cell in cells] == ["adam", "adam", "rmsprop", "rmsprop"]
     outcome = train(make_source(24), tiny(optimiser="rmsprop", learning_rate=2e-3), tmp_path / "alone")
@@ -52,7 +73,7 @@ def test_all_cells_draw_the_same_samples_in_the_same_order(searched) -> None:
     assert all(state == followed[0] for state in followed)
 
 
-def test_finished_cells_are_kept_and_new_ones_are_added(make_source, tiny, run) -> None:
+def test_finished_cells_are_kept_and_new_ones_are_added(run) -> None:
     opened = []
 
     def make():
@@ -71,9 +92,7 @@ def test_finished_cells_are_kept_and_new_ones_are_added(make_source, tiny, run) 
     assert told[0].startswith("2 of 2: 0.0005: 0.")
 
 
-def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(
-    make_source, tiny, searched, tmp_path
-) -> None:
+def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(searched, tmp_path) -> None:
     _, whole = searched
     stop, broken = threading.Event(), tmp_path / "broken"
 
@@ -95,7 +114,7 @@ def test_a_grid_that_was_stopped_within_a_cell_goes_on_to_the_same_figures(
     assert run_grid(lambda: make_source(24), tiny(), broken, AXES) == whole
 
 
-def test_a_cell_that_diverges_is_a_result(make_source, tiny, run, monkeypatch) -> None:
+def test_a_cell_that_diverges_is_a_result(run, monkeypatch) -> None:
     def diverge(source, settings, folder, hooks):
         if settings.learning_rate == 1e-4:
             raise DivergedError("the loss is inf")
@@ -108,7 +127,7 @@ def test_a_cell_that_diverges_is_a_result(make_source, tiny, run, monkeypatch) -
     assert run_grid(lambda: make_source(24), tiny(), run, {"learning_rate": (1e-4, 5e-4)}) == cells
 
 
-def test_the_files_hold_the_table_and_every_figure(make_source, tiny, run) -> None:
+def test_the_files_hold_the_table_and_every_figure(run) -> None:
     cells = run_grid(lambda: make_source(24), tiny(), run, {"decay": (0.9, 1.0)})
     assert (run / "grid.md").read_text() == table(cells) + "\n"
     written = json.loads((run / "grid.json").read_text())
@@ -136,7 +155,7 @@ def test_an_error_that_is_all_but_infinite_is_told_in_few_digits() -> None:
     assert table(cells).splitlines()[3] == "| 0.95 | 3.2e+30 | 2e+12 ± 1e+12 | 2e+12 ± 1e+12 |"
 
 
-def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, tiny, run) -> None:
+def test_each_held_out_configuration_is_in_one_half_by_what_it_is(run) -> None:
     """Views of one configuration stay together, and the order in which they come does not matter."""
     source = make_source(48, views=2)
     source.refresh()
@@ -158,13 +177,13 @@ def test_each_held_out_configuration_is_in_one_half_by_what_it_is(make_source, t
     assert max(straight[0]) > min(straight[1]), "the halves are not by the order of arrival"
 
 
-def test_a_grid_needs_a_configuration_for_each_half(make_source, tiny, run) -> None:
+def test_a_grid_needs_a_configuration_for_each_half(run) -> None:
     with pytest.raises(IncompleteError):
         run_grid(lambda: make_source(24), tiny(hold_out=0.01), run, AXES)
     assert not run.exists()
 
 
-def test_samples_that_are_missing_are_waited_for_elsewhere(make_source, tiny, run) -> None:
+def test_samples_that_are_missing_are_waited_for_elsewhere(run) -> None:
     with pytest.raises(IncompleteError, match="9 of 24"):
         run_grid(lambda: make_source(24, per_look=9), tiny(), run, AXES)
 
@@ -177,13 +196,13 @@ def test_samples_that_are_missing_are_waited_for_elsewhere(make_source, tiny, ru
         ({}, 27, "samples = 24, now 27"),
     ],
 )
-def test_a_grid_is_not_continued_as_another_one(make_source, tiny, run, change, samples, found) -> None:
+def test_a_grid_is_not_continued_as_another_one(run, change, samples, found) -> None:
     run_grid(lambda: make_source(24), tiny(max_steps=12), run, {"decay": (1.0,)})
     with pytest.raises(SpecError, match=found):
         run_grid(lambda: make_source(samples), tiny(**change), run, {"decay": (1.0,)})
 
 
-def test_a_grid_keeps_what_is_not_asked_for_and_tells_of_what_is(make_source, tiny, run) -> None:
+def test_a_grid_keeps_what_is_not_asked_for_and_tells_of_what_is(run) -> None:
     """Another value of an axis, then both: neither is trained again."""
     (first,) = run_grid(lambda: make_source(24), tiny(decay=0.9), run, {"decay": (0.9,)})
     (second,) = run_grid(lambda: make_source(24), tiny(decay=1.0), run, {"decay": (1.0,)})
@@ -199,31 +218,42 @@ def test_a_grid_keeps_what_is_not_asked_for_and_tells_of_what_is(make_source, ti
 
 
 @pytest.mark.parametrize("text", ["xx", "{}", "[]"])
-def test_a_file_that_no_grid_left_is_named(make_source, tiny, run, text: str) -> None:
+def test_a_file_that_no_grid_left_is_named(run, text: str) -> None:
     run.mkdir()
     (run / "grid.json").write_text(text)
     with pytest.raises(StoreError, match=r"grid\.json"):
         run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0,)})
 
 
-def test_an_axis_that_cannot_be_is_named_before_anything_runs(make_source, tiny, run) -> None:
+def test_an_axis_that_cannot_be_is_named_before_anything_runs(run) -> None:
     with pytest.raises(SpecError, match=r"decay = 1\.5"):
         run_grid(lambda: make_source(24), tiny(), run, {"decay": (1.0, 1.5)})
     assert not run.exists()
 
 
-def test_the_command_searches_what_is_not_set_and_prints_the_table(scene, commit, run, tmp_path) -> None:
-    said = []
+def test_the_command_searches_what_is_not_set_and_prints_the_table(run, tmp_path) -> None:
+    settings = ["--optimiser", "rmsprop", "--steps", "2", "--hold-out", "0.4", "--architecture", "cnn"]
+    settings += ["--set", "width=4", "--set", "schedule=epochs"]
+    command = ["--store", str(tmp_path / "store"), "--run", str(run), *settings]
+    scene = Store(tmp_path / "store", create=True).add(analytic_spec(16, 256))
+    scene.write_base(*analytic_base(scene.spec))
     scene.plan(Request(modifications=16, views_per_modification=1, passes=1), shard_rows=8)
-    with pytest.raises(IncompleteError):
-        service.search(None, tmp_path / "store", run, "small", {}, said.append)
+    refused = CliRunner().invoke(main, command)
+    assert refused.exit_code == IncompleteError.exit_code
+    assert refused.stdout == ""
     for job in scene.missing_jobs():
-        commit(scene, job)
-    changes = {"optimiser": "rmsprop", "max_steps": 2, "width": 4, "hold_out": 0.4, "architecture": "cnn"}
-    changes |= {"schedule": "epochs"}
-    found = service.search(None, tmp_path / "store", run, "small", changes, said.append)
-    assert len(found.splitlines()) == 2 + 4, "a line for each rate"
-    assert "| rmsprop | 0.002 | 0.99 |" in found
-    assert any("decay is not searched" in line for line in said)
-    assert any("4 of 4: rmsprop-0.002-0.99: " in line for line in said)
-    assert (run / "grid.md").read_text() == found + "\n"
+        commit_job(scene, job)
+    found = CliRunner().invoke(main, command)
+    assert found.exit_code == 0, found.output
+    assert len(found.stdout.splitlines()) == 2 + 4, "a line for each rate"
+    assert "| rmsprop | 0.002 | 0.99 |" in found.stdout
+    assert "decay is not searched" in found.stderr
+    assert "4 of 4: rmsprop-0.002-0.99: " in found.stderr
+    assert (run / "grid.md").read_text() == found.stdout
+
+
+def test_a_store_that_is_not_there_or_has_no_scene_is_refused_and_leaves_no_folder(run, tmp_path) -> None:
+    Store(tmp_path / "store", create=True)
+    assert CliRunner().invoke(main, ["--store", str(tmp_path / "store"), "--run", str(run)]).exit_code == 3
+    assert CliRunner().invoke(main, ["room", "--store", str(tmp_path / "none"), "--run", str(run)]).exit_code == 4
+    assert not run.exists()

@@ -206,7 +206,11 @@ def test_wrong_names_raise_with_those_that_exist(scene: Scene, tmp_path: Path) -
         _ = scene[0].albdo
     with pytest.raises(SpecError, match="albedo"):
         scene.torch(fields=["albdo"])
-    assert set(scene.torch(fields=["depth"])[0]) == {"row", "depth"}
+
+
+@pytest.mark.parametrize("fields", [["depth"], ["radiance"], ["modification"], ["radiance", "direct", "view"]])
+def test_any_fields_alone_are_had_as_tensors(scene: Scene, fields: list[str]) -> None:
+    assert set(scene.torch(fields=fields)[0]) == {"row", *fields}
 
 
 def test_reading_needs_neither_torch_nor_mitsuba(scene: Scene, tmp_path: Path) -> None:

@@ -157,8 +157,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
         """
         if self._stored is None or len(self._stored) < len(rows):
             guides = any(name in GUIDES for name in self.tensors.fields)
-            buffers = any(name not in ("radiance", "modification", "view", *GUIDES) for name in self.tensors.fields)
-            self._stored = Batch.empty(self._samples.spec, len(rows), buffers=buffers, guides=guides)
+            self._stored = Batch.empty(self._samples.spec, len(rows), guides=guides)
         memory = self.tensors.empty(len(rows)) if out is None else out
         for place, sample in enumerate(self._samples.read_samples(rows, self._stored)):
             self.tensors.fill(memory, place, sample)

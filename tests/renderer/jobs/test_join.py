@@ -101,6 +101,20 @@ def test_what_is_planned_and_not_rendered_is_filled_in(
     check_holds(scene, stores[0])
 
 
+def test_jobs_here_that_are_not_whole_there_are_left_to_workers_and_counted(
+    stores: tuple[SceneStore, SceneStore], tmp_path: Path, analytic: ModuleType
+) -> None:
+    store = Store(tmp_path / "c", create=True)
+    scene = store.add(analytic.small_spec())
+    scene.plan(Request(modifications=4, passes=2), shard_rows=4)
+    (told,) = join(tmp_path / "c", tmp_path / "a")
+    assert (told.there, told.planned, told.jobs, told.left) == (6, 0, 1, 2)
+    said = CliRunner().invoke(verb, [str(tmp_path / "a"), "--store", str(tmp_path / "c")])
+    assert "2 are left to workers, as their jobs here are not whole there" in said.output
+    analytic.render_missing(store, scene.scene_id)
+    assert len(reader_of(scene).rows) == 8
+
+
 def test_workers_render_what_a_join_that_was_killed_had_planned(
     stores: tuple[SceneStore, SceneStore], tmp_path: Path, analytic: ModuleType
 ) -> None:

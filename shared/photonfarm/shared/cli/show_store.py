@@ -82,7 +82,7 @@ def check(report: StoreReport, as_json: bool) -> None:
     if not wrong:
         click.echo("nothing is wrong")
     elif not report.repaired:
-        click.echo(f"{wrong} findings; --repair sets aside what can be written again")
+        click.echo(f"{'1 finding' if wrong == 1 else f'{wrong} findings'}; --repair sets aside what can be written again")
     elif report.exit_code == StoreError.exit_code:
         click.echo(
             "something is still wrong, and --repair does not help: see above for what does. A plan comes back from a "
@@ -220,7 +220,8 @@ def joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
         known = scene.there - scene.planned
         jobs = "1 job" if scene.jobs == 1 else f"{scene.jobs} jobs"
         said = f"{scene.there} samples there, {scene.planned} planned here now, {known} before; {jobs} copied"
-        click.echo(f"{scene.name} {scene.scene_id}: {said}")
+        left = f"; {scene.left} are left to workers, as their jobs here are not whole there" if scene.left else ""
+        click.echo(f"{scene.name} {scene.scene_id}: {said}{left}")
 
 
 # ------------------------------------------------------------------------------------------- withdraw, forget, waiting

@@ -154,12 +154,13 @@ def merge(
 def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> None:
     """Copy the complete samples of the store OTHER, a folder or bucket, into this one, which may be new.
 
-    Scenes are joined by their ids: samples that are here already are left out, and those that are planned here and not
-    rendered yet are filled in. Every byte is checked on the way. It may be stopped and repeated at any time. It has
-    each scene for itself meanwhile: it waits for the jobs in hand, and workers and trainers of the scene wait for it.
-    OTHER is only read.
+    Scenes are joined by their ids: samples that are here already are left out. Jobs that are planned here and not
+    rendered yet are filled in where OTHER has all of their samples; the others are left to workers, and counted. Every
+    byte is checked on the way. It may be stopped and repeated at any time. It has each scene for itself meanwhile: it
+    waits for the jobs in hand, and workers and trainers of the scene wait for it. OTHER is only read.
 
-    Exit codes: 0 all that OTHER has complete is here; 4 a store cannot be read or written, and what is copied stays.
+    Exit codes: 0 all that OTHER has complete is planned here, and copied but for what is counted; 4 a store cannot be
+    read or written, and what is copied stays.
     """
     from photonfarm.shared.cli import show_store
     from photonfarm.shared.farm.join import join as joined

@@ -33,6 +33,7 @@ class JoinedScene:
     there: int  # complete samples of the other store
     planned: int  # of these, the ones that this store did not know
     jobs: int  # jobs committed, of this join or of an earlier one that was cut off
+    left: int  # samples that are planned here in jobs of which the other store lacks some: workers render them
 
 
 def join(
@@ -65,7 +66,7 @@ def _join_scene(target: Store, source: Store, there: SceneStore, on_progress: On
     reader = SceneReader(source.root, there.scene_id)
     reader.refresh()
     if not len(reader.rows):
-        return JoinedScene(there.scene_id, there.spec.name, 0, 0, 0)
+        return JoinedScene(there.scene_id, there.spec.name, 0, 0, 0, 0)
     here = target.scene(there.scene_id) if target.has_scene(there.scene_id) else target.add(there.spec)
     here.write_base(*reader.base())
     found = there.plans()
@@ -77,12 +78,14 @@ def _join_scene(target: Store, source: Store, there: SceneStore, on_progress: On
     joined = Joined(store=source.store_id, samples=len(reader.rows))
     planned = here.plan(joined, usual_rows=found[0].shard_rows, samples=wanted)
     copies = _Copies(reader, there)
-    missing = [rows for job in here.missing_jobs() if copies.have(rows := here.job_rows(job))]
-    for done, rows in enumerate(missing):
-        on_progress(here.spec.name, done, len(missing))
+    known = [(rows, copies.known(rows)) for rows in map(here.job_rows, here.missing_jobs())]
+    whole = [rows for rows, count in known if count == len(rows.samples)]
+    for done, rows in enumerate(whole):
+        on_progress(here.spec.name, done, len(whole))
         copies.commit(here, rows)
-    on_progress(here.spec.name, len(missing), len(missing))
-    return JoinedScene(there.scene_id, there.spec.name, len(reader.rows), planned.new, len(missing))
+    on_progress(here.spec.name, len(whole), len(whole))
+    left = sum(count for rows, count in known if count < len(rows.samples))
+    return JoinedScene(there.scene_id, there.spec.name, len(reader.rows), planned.new, len(whole), left)
 
 
 class _Copies:
@@ -93,9 +96,9 @@ class _Copies:
         self._rows: dict[Key, int] = reader.rows_by_key()
         self._shard_rows = there.plans()[0].shard_rows
 
-    def have(self, rows: JobRows) -> bool:
-        """Whether the other store has all samples of a job."""
-        return all(sample.key in self._rows for sample in rows.samples)
+    def known(self, rows: JobRows) -> int:
+        """How many samples of a job the other store has."""
+        return sum(sample.key in self._rows for sample in rows.samples)
 
     def commit(self, here: SceneStore, rows: JobRows) -> None:
         """Commit a job."""

@@ -72,7 +72,8 @@ def submit(
     before = opened.scene(named.spec.scene_id).spec if opened.has_scene(named.spec.scene_id) else None
     with at_work(opened.storage, named.spec.scene_id, "submit", log.warning):
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
-    queued = _queued(opened, redis_url, retry=retry)
+    anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten
+    queued = _queued(opened, redis_url, retry=retry or anew)
     return Submission(
         planned.scene_id, planned.plan, planned.new, planned.known, queued,
         note=first_plan_note(opened, named.spec) if planned.plan == 0 else None,
@@ -125,9 +126,9 @@ def top_up(
     )
 
 
-def _queued(store: Store, redis_url: str | None, *, retry: bool) -> int | None:
+def _queued(store: Store, redis_url: str | None, *, retry: bool | str) -> int | None:
     """The number of jobs that are queued now; None without Redis. Workers that have none learn it from the store."""
-    if retry:
+    if retry is True:
         with store_errors("note a retry", store.storage.where):
             queue.keep_retry(store)
     return None if redis_url is None else queue_missing(store, redis_url, retry=retry)
@@ -138,7 +139,7 @@ def queue_missing(
     redis_url: str,
     *,
     scene_id: str | None = None,
-    retry: bool = False,
+    retry: bool | str = False,
     stored: str = "The plan is stored",
     verb: str = "submits",
 ) -> int:

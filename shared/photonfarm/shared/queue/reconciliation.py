@@ -63,13 +63,14 @@ def look(store: Store, connection: Redis, *, scene_id: str | None = None, every_
 
 
 def reconcile(
-    store: Store, connection: Redis, *, scene_id: str | None = None, wait_s: float = 10.0, retry: bool = False
+    store: Store, connection: Redis, *, scene_id: str | None = None, wait_s: float = 10.0, retry: bool | str = False
 ) -> int:
     """Queue every job that is planned, not committed, not queued, not started and not failed; returns how many.
 
     It works on one scene, or on all, and for one caller at a time: while another one is at it, this one waits for
     `wait_s`, and then raises QueueError. Of a scene at most QUEUE_LIMIT jobs are queued; the rest follows later. With
-    `retry` the jobs that failed too often are forgotten first. A scene that cannot be read is skipped with a warning.
+    `retry` the jobs that failed too often are forgotten first, or those of the scene with that id. A scene that cannot
+    be read is skipped with a warning.
     Raises QueueError also if Redis fails or serves another store, StoreError if the store or the one scene cannot be
     read.
     """
@@ -88,7 +89,7 @@ class _Filled(NamedTuple):
 
 
 def _filled(
-    store: Store, connection: Redis, scene_id: str | None, wait_s: float = 0.0, *, retry: bool = False
+    store: Store, connection: Redis, scene_id: str | None, wait_s: float = 0.0, *, retry: bool | str = False
 ) -> _Filled | None:
     """What `reconcile` has done; None if another process still fills the queue after `wait_s`. Raises as that does."""
     serve(connection, store)
@@ -98,7 +99,7 @@ def _filled(
             return None
         try:
             if retry:
-                forget_failures(open_queue(connection))
+                forget_failures(open_queue(connection), retry if isinstance(retry, str) else "")
             return _fill(store, connection, scene_id)
         finally:
             with contextlib.suppress(LockError):  # it took longer than the lock lasts

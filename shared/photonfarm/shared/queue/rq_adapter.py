@@ -164,11 +164,12 @@ def read_failures(queue: Queue) -> dict[str, Failure]:
     return {name: Failure(str(reason), TRIES) for name, reason in zip(names, reasons, strict=True) if is_job_name(name)}
 
 
-def forget_failures(queue: Queue) -> None:
-    """Forget the jobs that are set aside, so that they are queued again as if they were new."""
+def forget_failures(queue: Queue, scene_id: str = "") -> None:
+    """Forget the jobs that are set aside, or those of one scene: they are queued again as if they were new."""
     with queue.connection.pipeline() as pipeline:
         for name in queue.failed_job_registry.get_job_ids(cleanup=False):
-            _forget(queue, name, pipeline)
+            if name.startswith(scene_id):
+                _forget(queue, name, pipeline)
         pipeline.execute()
 
 

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +12,13 @@ import store_samples as samples
 from click.testing import CliRunner
 
 from photonfarm.shared.cli.store_verbs import forget as verb
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.plan.request import Request
+from photonfarm.shared.queue import job_name, keep_failure, times_failed
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
+from photonfarm.shared.store.format import markers
+from photonfarm.shared.store.read import reader as reading
 from photonfarm.shared.store.write.forgetting import forget
 
 FORGET = """
@@ -78,6 +82,67 @@ def test_who_knew_its_plans_takes_no_others_for_them(store: Store, scene: SceneS
     samples.commit_all(scene)
     assert samples.reader_of(scene).rows.tolist() == [0, 1, 2]
     assert check_store(Store(store.root), when="now").exit_code == 0
+
+
+def plan_anew(scene: SceneStore) -> SceneStore:
+    """The scene forgotten, and planned again with other content."""
+    forget(Store(scene.storage.where), scene.scene_id)
+    again = Store(scene.storage.where)
+    return again.scene(again.plan(scene.spec, Request(modifications=4, seed=7), shard_rows=2).scene_id)
+
+
+@pytest.mark.parametrize("when", ["before the commit", "before the marker"])
+def test_a_writer_that_slept_through_it_commits_nothing_of_what_it_rendered(
+    scene: SceneStore, monkeypatch: pytest.MonkeyPatch, when: str
+) -> None:
+    scene.plan(Request(modifications=6))
+    given, place = samples.outputs(scene, 2), markers.place
+
+    def late(*about: Any) -> bool:
+        monkeypatch.undo()
+        plan_anew(scene)
+        return place(*about)
+
+    if when == "before the marker":
+        monkeypatch.setattr(markers, "place", late)
+        assert not samples.commit(scene, 2, given)
+        again = Store(scene.storage.where).scene(scene.scene_id)
+    else:
+        with scene.job_writer(scene.job_rows(2)) as out:
+            for row, photons in given.photons.items():
+                out.photons(row, photons)
+            for row, buffers in given.buffers.items():
+                out.view(row, buffers, given.guides[row], given.visibility[row])
+            for row, halves in given.radiance.items():
+                out.radiance(row, halves)
+            again = plan_anew(scene)
+            assert not out.commit(samples.FIGURES)
+    assert again.missing_jobs() == [0, 1]
+    again.write_base(*samples.base())
+    samples.commit_all(again)
+    assert check_store(Store(scene.storage.where), when="now").exit_code == 0
+
+
+def test_who_read_it_before_reads_nothing_of_what_is_planned_anew(
+    scene: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "REMEMBERED_S", 0.0)
+    reader = samples.reader_of(scene)
+    reader.read(0)
+    again = plan_anew(scene)
+    again.write_base(*samples.base())
+    samples.commit_all(again)
+    for row in range(2, 4):  # of shards that are not open yet
+        with pytest.raises(IncompleteError, match="was forgotten"):
+            reader.read(row)
+
+
+def test_its_failures_are_forgotten_and_those_of_others_are_not(store: Store, scene: SceneStore) -> None:
+    (other,) = (each for each in store.scenes() if each.scene_id != scene.scene_id)
+    for each in (scene, other):
+        keep_failure(store, job_name(each.scene_id, 0), "IncompleteError: no", worker="w1")
+    forget(Store(store.root), scene.scene_id)
+    assert times_failed(store) == {job_name(other.scene_id, 0): 1}
 
 
 @pytest.mark.parametrize("point", range(1, 12))

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.core.processes import process_space
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.local import LocalStorage
@@ -127,6 +128,47 @@ def test_a_lease_of_a_killed_process_ends_with_it(storage: LocalStorage, worker:
     assert leases(storage) == {}
     with lease(storage, SCENE, "store withdraw", pytest.fail):
         pass
+
+
+def test_two_who_find_a_lease_of_the_dead_do_not_both_take_it(storage: LocalStorage) -> None:
+    inside, most = [0], [0]
+    name = Path(storage.where, leasing.LEASES, f"{SCENE}.json")
+    name.parent.mkdir(exist_ok=True)
+    document = {"what": "store join", "space": process_space(), "process": 2**22, "token": "dead", "beat": 0}
+
+    def hold(begun: threading.Barrier) -> None:
+        begun.wait()
+        with lease(storage, SCENE, "store withdraw", lambda _: None):
+            inside[0] += 1
+            most[0] = max(most[0], inside[0])
+            time.sleep(0.01)
+            inside[0] -= 1
+
+    for _ in range(20):
+        name.write_text(json.dumps(document))
+        begun = threading.Barrier(3)
+        threads = [threading.Thread(target=hold, args=(begun,)) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert most == [1]
+    assert leases(storage) == {}
+
+
+def test_who_was_suspended_for_too_long_notices_that_others_went_on(
+    storage: LocalStorage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leasing, "SILENT_S", -1.0)  # everybody counts as dead
+    monkeypatch.setattr(leasing, "BEAT_S", 0.01)
+    with lease(storage, SCENE, "store forget", pytest.fail) as held:
+        held.check()
+        with lease(storage, SCENE, "store join", pytest.fail) as other:
+            with pytest.raises(StoreError, match="store forget was silent for so long that others went on"):
+                held.check()
+            time.sleep(0.1)
+            other.check()
+    assert storage.names(leasing.LEASES) in ([], [SCENE])
 
 
 def test_who_is_silent_on_another_machine_counts_as_dead(

@@ -72,8 +72,7 @@ def is_full(error: BaseException) -> bool:
 class TrainerPace:
     """Keeps a scene's committed samples ≤ ratio × those that its trainer has used, or AHEAD_MINIMUM if that is more.
 
-    Each scene is treated by itself, as a trainer uses the samples of one scene. In a scene with guides, samples without
-    them do not count: a trainer that needs guides cannot use them yet, so it and the workers would wait for each other.
+    Each scene is treated by itself, as a trainer uses the samples of one scene.
     """
 
     def __init__(

@@ -36,7 +36,7 @@ Request = tuple[int, ...] | Callable[[], object] | None
 
 
 class SampleSource(Samples, Keyed[Sequence[int]], Protocol):
-    """The samples of one scene: a `SceneReader`, or anything that behaves like it. Used by one thread at a time."""
+    """The samples of one scene: a `SceneReader`, or anything that behaves like it. One thread at a time reads."""
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """The geometry and the base cloud."""

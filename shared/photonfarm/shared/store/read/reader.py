@@ -8,6 +8,7 @@ are read straight from the shards, every byte checked against its checksum.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import fields
@@ -39,6 +40,9 @@ REPAIR = "`photonfarm store check --repair` sets its job aside, and workers rend
 """The remedy for damaged samples."""
 
 
+REMEMBERED_S = 0.2  # for which a look counts that finds the scene not forgotten: too short to render it anew
+
+
 class SceneReader:
     """Follows one scene of a store. Everything but `refresh` may be called from several threads at once."""
 
@@ -60,6 +64,7 @@ class SceneReader:
         self._complete = np.zeros(0, np.bool_)
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
         self._shards = OpenShards()
+        self._remembered_s = -REMEMBERED_S  # when it was last seen that the scene is not forgotten
         self._base: tuple[Geometry, BasePointCloud] | None = None
 
     @property
@@ -118,9 +123,7 @@ class SceneReader:
     def _load_plans(self) -> None:
         known, found = self._plans, plans.load_all(self._storage, self._name, self._plans)
         if known and (not found or found[0].forgotten != known[0].forgotten):
-            raise IncompleteError(
-                f"{self._storage.where}/{self._name}: the scene was forgotten; open what is there anew"
-            )
+            raise self._forgotten()
         self._plans = found
         if self._plans != known:
             self._committed = set()  # complete rows are to be counted again
@@ -132,6 +135,19 @@ class SceneReader:
                 {"first_row": plan.first_row, "samples": plan.named, "request": plan.request.model_dump(mode="json")}
                 for plan in self._plans
             ]
+
+    def _check_not_forgotten(self) -> None:
+        """Raise IncompleteError if the scene was forgotten: other plans may have the names of the files opened here."""
+        if time.monotonic() - self._remembered_s < REMEMBERED_S:
+            return
+        names = self._storage.names(f"{self._name}/{plans.PLANS}")
+        if sum(name.startswith(plans.FORGOTTEN) for name in names) != self._plans[0].forgotten:
+            raise self._forgotten()
+        self._remembered_s = time.monotonic()
+
+    def _forgotten(self) -> IncompleteError:
+        name = f"{self._storage.where}: scene {self._scene_id}"
+        return IncompleteError(f"{name} was forgotten; if it was submitted again, open it again, or train a new --run")
 
     # ---------------------------------------------------------------------------------------------------------- samples
 
@@ -324,22 +340,19 @@ class SceneReader:
 
     @contextmanager
     def _reading(self, rows: Sequence[int] | NDArray[np.int64], what: str) -> Iterator[None]:
-        """Turn errors of the disk into StoreErrors, and tell of damage with its remedy.
-
-        Raises IncompleteError instead for rows that a repair has set aside since the last look.
-        """
+        """Turn errors of the disk into StoreErrors; of damage, tell the remedy; IncompleteError for rows now gone."""
         with store_errors(what, self._storage.where):
             try:
                 yield
             except CorruptError as error:
                 self._markers.doubt()
-                parts = [
-                    (row, part) for row in rows for part in (row, self._view_row[row], self._modification_row[row])
-                ]
-                for row, part in parts:
-                    marker = markers.name_of(self._name, int(part) // self._plans[0].shard_rows)
-                    if not self._storage.exists(marker):
-                        raise self._incomplete(int(row)) from error
+                self._remembered_s = -REMEMBERED_S
+                self._check_not_forgotten()
+                for row in rows:
+                    for part in (row, self._view_row[row], self._modification_row[row]):
+                        marker = markers.name_of(self._name, int(part) // self._plans[0].shard_rows)
+                        if not self._storage.exists(marker):
+                            raise self._incomplete(int(row)) from error
                 raise CorruptError(f"{error}; {REPAIR}") from error
 
     def _read_from(self, shard: Shard, name: str, row: int, values: NDArray[Any]) -> None:
@@ -370,6 +383,7 @@ class SceneReader:
             if array.kind == "sample" and not self._storage.exists(file):
                 return None, within
             shard = self._open(file, array)
+            self._check_not_forgotten()
             self._shards.put((name, job), shard)
         return shard, within
 

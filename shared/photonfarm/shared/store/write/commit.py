@@ -83,8 +83,11 @@ class CommitTarget(Protocol):
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
 
-    def is_to_do(self, job: int) -> bool:
-        """Whether a job is planned, and neither committed nor withdrawn."""
+    def is_forgotten(self, rows: JobRows) -> bool:
+        """Whether the scene was forgotten since a job was planned with these rows."""
+
+    def is_still_to_do(self, rows: JobRows) -> bool:
+        """Whether a job is planned with these rows, and neither committed nor withdrawn."""
 
 
 class JobWriter:
@@ -202,7 +205,9 @@ class JobWriter:
     # ----------------------------------------------------------------------------------------------------------- commit
 
     def commit(self, figures: Figures, clock: Clock = _utc_now) -> bool:
-        """Make the rows part of the store, all or nothing; False if the job is committed or withdrawn by now.
+        """Make the rows part of the store, all or nothing; False if the job is not to do any more.
+
+        Another worker has committed it, say, or it was withdrawn, or its scene forgotten.
 
         Files that another writer left are kept if every row of the job can be read from them and from the new ones, and
         are replaced otherwise. Raises IncompleteError unless every row of the job has been given, and CorruptError if
@@ -218,7 +223,7 @@ class JobWriter:
         with self._errors():
             ours = {name: shard.finish() for name, shard in self._shards.items()}
             for _ in range(ATTEMPTS):
-                if not self._scene.is_to_do(self._rows.job):
+                if not self._scene.is_still_to_do(self._rows):
                     return False
                 alone = self._adopt_all()
                 if alone is None:
@@ -228,6 +233,10 @@ class JobWriter:
                 if not alone and not (self._is_readable() and self._summaries() == described):
                     continue
                 placed = self._place(described, figures)
+                if self._scene.is_forgotten(self._rows):  # while this process was suspended: nothing here is the plan's
+                    for name in (*map(self._file, described), markers.name_of(self._scene.name, self._rows.job)):
+                        self._storage.delete(name)
+                    return False
                 if (placed and alone) or self._is_marker_right(clock):
                     return placed
             raise CorruptError(

@@ -16,7 +16,7 @@ from photonfarm.shared.store.io.storage import put_json
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.lease import OnWait, lease
 from photonfarm.shared.store.write.scene_store import SCENES, is_there
-from photonfarm.shared.store.write.store import Store
+from photonfarm.shared.store.write.store import FAILURES_FOLDER, Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,19 +33,21 @@ def forget(store: Store, scene_id: str, *, on_wait: OnWait = lambda _: None) -> 
     What a repair has set aside of it stays in the quarantine.
     """
     storage, folder = store.storage, f"{SCENES}/{scene_id}"
-    with lease(storage, scene_id, "store forget", on_wait), store_errors("forget a scene", storage.where):
+    taken = lease(storage, scene_id, "store forget", on_wait)
+    with taken as held, store_errors("forget a scene", storage.where):
         if not is_there(storage, scene_id):
             raise StoreError(f"{storage.where}: holds no scene {scene_id}")
         jobs = len(markers.jobs(storage, folder))
         below = f"{folder}/{plans.PLANS}"
         put_json(storage, {"jobs": jobs}, f"{below}/{plans.FORGOTTEN}{uuid4().hex}.json")
-        storage.delete_folder(f"{folder}/{markers.COMMITTED}")
-        for number in reversed(range(plans.count(storage, folder))):
-            storage.delete_folder(plans.folder(folder, number))
-        for name in storage.names(below):
-            if not name.startswith(plans.FORGOTTEN):
-                storage.delete(f"{below}/{name}")
-        storage.delete_folder(f"{folder}/base")
-        for name in ("base.claim", "spec.json"):
-            storage.delete(f"{folder}/{name}")
+        numbers = reversed(range(plans.count(storage, folder)))
+        folders = [f"{folder}/{markers.COMMITTED}", *(plans.folder(folder, n) for n in numbers), f"{folder}/base"]
+        for each in folders:
+            held.check()
+            storage.delete_folder(each)
+        left = [f"{below}/{name}" for name in storage.names(below) if not name.startswith(plans.FORGOTTEN)]
+        failures = [name for name in storage.names(FAILURES_FOLDER) if name.startswith(f"{scene_id}-")]
+        for each in (*left, *(f"{FAILURES_FOLDER}/{name}" for name in failures), f"{folder}/base.claim"):
+            storage.delete(each)
+        storage.delete(f"{folder}/spec.json")
     return Forgotten(scene_id, jobs)

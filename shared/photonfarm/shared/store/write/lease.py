@@ -20,7 +20,7 @@ import os
 import time
 import uuid
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any
 
 from photonfarm.shared.core.errors import IncompleteError, StoreError, store_errors
@@ -78,20 +78,34 @@ def at_work(storage: Storage, scene_id: str, what: str, on_wait: OnWait | None =
                 return
         sentence = f"scene {scene_id}: {holder} has it for itself"
         if on_wait is None:
-            raise LeasedError(f"{sentence}; go on when that has ended")
+            raise LeasedError(sentence)
         if sentence != said:
             on_wait(f"{sentence}; waiting")
             said = sentence
         time.sleep(LOOK_S)
 
 
+class Lease:
+    """A lease that is held. Whoever was suspended for so long that others took it has lost it."""
+
+    def __init__(self, storage: Storage, scene_id: str, what: str) -> None:
+        self._file = _Presence(storage, f"{LEASES}/{scene_id}.json", what)
+        self._scene_id, self._what = scene_id, what
+
+    def check(self) -> None:
+        """Raise StoreError if the lease is lost: before anything that cannot be undone."""
+        if not self._file.is_own():
+            raise StoreError(
+                f"scene {self._scene_id}: {self._what} was silent for so long that others went on; start it again"
+            )
+
+
 @contextmanager
-def lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterator[None]:
+def lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterator[Lease]:
     """Have a scene alone: wait for others' leases and for all who are at work in it, and hold it during the block.
 
     `what` is in words: "store check --repair". Raises StoreError.
     """
-    name = f"{LEASES}/{scene_id}.json"
     said = ""
 
     def wait_for(others: list[str]) -> None:
@@ -102,16 +116,32 @@ def lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterat
             said = sentence
         time.sleep(LOOK_S)
 
-    with store_errors("take the scene's lease", storage.where):
-        while not _place(storage, name, what, 0):
-            if (holder := _holder(storage, scene_id)) is not None:
-                wait_for([holder])
-            else:
-                storage.delete(name)  # left by the dead
-    with _renewed(storage, name, what):
-        while others := _others_at_work(storage, scene_id):
-            wait_for(others)
-        yield
+    while True:
+        taken = Lease(storage, scene_id, what)
+        with store_errors("take the scene's lease", storage.where):
+            while not taken._file.place():
+                if (holder := _holder(storage, scene_id)) is not None:
+                    wait_for([holder])
+                else:
+                    _remove_dead(storage, scene_id)
+        with taken._file.renewed():
+            while others := _others_at_work(storage, scene_id):
+                wait_for(others)
+            if taken._file.is_own():
+                yield taken
+                return
+
+
+def _remove_dead(storage: Storage, scene_id: str) -> None:
+    """Remove a lease that the dead have left: of those who try, one moves it away; one that is alive is put back."""
+    name, away = f"{LEASES}/{scene_id}.json", f"{LEASES}/{scene_id}/{uuid.uuid4().hex}.json"
+    dead = _seen.get((storage.where, name))
+    with suppress(FileNotFoundError, FileExistsError):
+        storage.move(name, away)
+        if dead is None or storage.read(away) != dead[0]:
+            storage.move(away, name)
+        else:
+            storage.delete(away)
 
 
 def _others_at_work(storage: Storage, scene_id: str) -> list[str]:
@@ -142,47 +172,59 @@ def _owner(storage: Storage, name: str) -> str | None:
         document: dict[str, Any] = json.loads(content)
         what, space, process = str(document["what"]), str(document["space"]), int(document["process"])
     except (ValueError, KeyError, TypeError):
-        what, space, process = "somebody unknown", "", 0
+        what, space, process = f"whoever wrote {name}, which names nobody", "", 0
     silent_s = time.monotonic() - _seen[key][1]
     if silent_s > SILENT_S or (space == process_space() and is_gone(process)):
         return None
-    host = space.rpartition("-")[0]
-    return f"{what} ({host}, process {process}{f', silent for {silent_s:.0f} s' if silent_s > 3 * BEAT_S else ''})"
+    silent = ", silent" if silent_s > 3 * BEAT_S else ""
+    return f"{what} ({space.rpartition('-')[0]}, process {process}{silent})" if space else what
 
 
-@contextmanager
-def _announced(storage: Storage, name: str, what: str) -> Iterator[None]:
+class _Presence:
+    """A file that says that this process is there, and in what it is at work."""
+
+    def __init__(self, storage: Storage, name: str, what: str) -> None:
+        self._storage, self._name, self._what = storage, name, what
+        self._token, self._beat = uuid.uuid4().hex, 0
+
+    def place(self) -> bool:
+        """Place the file; False if there is one."""
+        document = {
+            "what": self._what, "space": process_space(), "process": os.getpid(), "token": self._token,
+            "beat": self._beat,
+        }  # fmt: skip
+        return put_json(self._storage, document, self._name, replace=self._beat > 0)
+
+    def is_own(self) -> bool:
+        """Whether the file is there and this one's."""
+        content = read_or_none(self._storage, self._name)
+        return content is not None and self._token.encode() in content
+
+    def _renew(self) -> None:
+        with suppress(OSError):  # a full disk, say: others wait SILENT_S before they take this process for dead
+            if self.is_own():
+                self._beat += 1
+                self.place()
+
+    @contextmanager
+    def renewed(self) -> Iterator[None]:
+        """Renew the file in a thread of its own, and remove it at the end."""
+        try:
+            with repeating(BEAT_S, self._renew):
+                yield
+        finally:
+            with suppress(OSError):
+                if self.is_own():
+                    self._storage.delete(self._name)
+
+
+def _announced(storage: Storage, name: str, what: str) -> AbstractContextManager[None]:
+    file = _Presence(storage, name, what)
     try:
         with store_errors("announce work in a scene", storage.where):
-            _place(storage, name, what, 0)
+            file.place()
     except StoreError as error:
         if getattr(error.__cause__, "errno", None) not in _NOT_WRITABLE:
             raise
-        yield
-        return
-    with _renewed(storage, name, what):
-        yield
-
-
-@contextmanager
-def _renewed(storage: Storage, name: str, what: str) -> Iterator[None]:
-    """Renew a file in a thread of its own, and remove it at the end."""
-    beat = 0
-
-    def renew() -> None:
-        nonlocal beat
-        beat += 1
-        with suppress(OSError):  # a full disk, say: others wait SILENT_S before they take this process for dead
-            _place(storage, name, what, beat)
-
-    try:
-        with repeating(BEAT_S, renew):
-            yield
-    finally:
-        with suppress(OSError):
-            storage.delete(name)
-
-
-def _place(storage: Storage, name: str, what: str, beat: int) -> bool:
-    document = {"what": what, "space": process_space(), "process": os.getpid(), "beat": beat}
-    return put_json(storage, document, name, replace=beat > 0)
+        return nullcontext()
+    return file.renewed()

@@ -193,6 +193,15 @@ class SceneStore:
         """Whether a job is planned, and neither committed nor withdrawn."""
         return not self.is_committed(job) and job < self.jobs() and job not in self.withdrawn_jobs()
 
+    def is_forgotten(self, rows: JobRows) -> bool:
+        """Whether the scene was forgotten since a job was planned with these rows; it may be planned anew."""
+        found = self.plans()
+        return not found or found[0].forgotten != rows.plan.forgotten
+
+    def is_still_to_do(self, rows: JobRows) -> bool:
+        """Whether a job is to do, and planned with these rows still."""
+        return self.is_to_do(rows.job) and not self.is_forgotten(rows)
+
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
         return self.storage.exists(markers.name_of(self.name, job))

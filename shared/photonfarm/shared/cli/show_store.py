@@ -82,7 +82,9 @@ def check(report: StoreReport, as_json: bool) -> None:
     if not wrong:
         click.echo("nothing is wrong")
     elif not report.repaired:
-        click.echo(f"{'1 finding' if wrong == 1 else f'{wrong} findings'}; --repair sets aside what can be written again")
+        click.echo(
+            f"{'1 finding' if wrong == 1 else f'{wrong} findings'}; --repair sets aside what can be written again"
+        )
     elif report.exit_code == StoreError.exit_code:
         click.echo(
             "something is still wrong, and --repair does not help: see above for what does. A plan comes back from a "

@@ -121,7 +121,7 @@ def fail(queue: Queue, execution: Execution, reason: str, *, counts: bool = True
     """
     if not queue.connection.zrem(queue.started_job_registry.key, execution.composite_key):
         return False
-    job = _job(queue, execution.job_id)
+    job, is_set_aside = _job(queue, execution.job_id), False
     with queue.connection.pipeline() as pipeline:
         execution.delete(job or _unread(queue, execution.job_id), pipeline)
         if job is not None:
@@ -130,8 +130,9 @@ def fail(queue: Queue, execution: Execution, reason: str, *, counts: bool = True
                 job.retry(queue, pipeline)
             else:
                 record_job_failure(job, one_line(reason), pipeline)
+                is_set_aside = True
         pipeline.execute()
-    return job is not None and bool(job.is_failed)
+    return is_set_aside
 
 
 def fail_lost(queue: Queue) -> None:

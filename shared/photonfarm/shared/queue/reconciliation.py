@@ -22,9 +22,9 @@ from photonfarm.shared.store import SceneStore, Store
 QUEUE_LIMIT = 10_000
 """The most jobs of a scene in the queue, at 1.9 kB of Redis memory each; the store holds the rest."""
 
-LOCK_S = 60
-"""How long one process at most fills the queue alone. If it takes longer, another one may queue a job twice, and the
-first commit stays."""
+LOCK_S = 10
+"""How long one process at most fills the queue alone, and how long a killed one holds the others up. If it takes
+longer, another one may queue a job twice, and the first commit stays."""
 
 _LOCK = "rq:photonfarm:reconcile"
 LOOKED = "rq:photonfarm:looked:"

@@ -10,7 +10,7 @@ from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.store import Figures, SceneReader, SceneStore, Store
+from photonfarm.shared.store import Figures, JobWriter, SceneReader, SceneStore, Store
 from photonfarm.shared.store.format.schema import output_arrays
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
@@ -107,13 +107,18 @@ def base() -> tuple[Geometry, BasePointCloud]:
 def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGURES, **options: Any) -> bool:
     """Hand a job's outputs to the store, and commit them."""
     with scene.job_writer(scene.job_rows(job)) as out:
-        for row, photons_ in given.photons.items():
-            out.photons(row, photons_)
-        for row, buffers in given.buffers.items():
-            out.view(row, buffers, given.guides[row], given.visibility[row])
-        for row, halves in given.radiance.items():
-            out.radiance(row, halves)
+        give(out, given)
         return out.commit(figures, **options)
+
+
+def give(out: JobWriter, given: Outputs) -> None:
+    """Hand a job's outputs to its writer."""
+    for row, photons_ in given.photons.items():
+        out.photons(row, photons_)
+    for row, buffers in given.buffers.items():
+        out.view(row, buffers, given.guides[row], given.visibility[row])
+    for row, halves in given.radiance.items():
+        out.radiance(row, halves)
 
 
 def commit_all(scene: SceneStore) -> None:

@@ -31,7 +31,7 @@ from photonfarm.shared.scene.spec import Emitters, SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
-from photonfarm.trainer.networks.inputs import POINTS_ONLY
+from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predict.evaluation import Predictor, constant_predictor
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs.settings import preset
@@ -86,7 +86,7 @@ def views(work: Path) -> Views:
 
 
 def row(views: Views, predict: Predictor) -> ExplainedChange:
-    return views.row(PredictorGroup("made up", (0,), (predict,), POINTS_ONLY))
+    return views.row(PredictorGroup("made up", (0,), (predict,), Needs()))
 
 
 @pytest.mark.slow

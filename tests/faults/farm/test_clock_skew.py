@@ -105,12 +105,7 @@ def test_a_part_stamped_by_a_machine_that_is_hours_behind_is_left_to_its_writer(
     """This holds up to a day, the documented age: clocks of one farm differ by less, or its stamps are the server's."""
     given = samples.outputs(scene, 0)
     with scene.job_writer(scene.job_rows(0)) as out:
-        for row, photons in given.photons.items():
-            out.photons(row, photons)
-        for row, buffers in given.buffers.items():
-            out.view(row, buffers, given.guides[row], given.visibility[row])
-        for row, halves in given.radiance.items():
-            out.radiance(row, halves)
+        samples.give(out, given)
         foreign = scene.storage.part().with_name("another-machine-1a2b3c4d5e-17-0-0.partial")
         foreign.write_bytes(b"half a file")
         for path in (root_of(scene) / "tmp").iterdir():

@@ -109,12 +109,7 @@ def test_a_writer_that_slept_through_it_commits_nothing_of_what_it_rendered(
         again = Store(scene.storage.where).scene(scene.scene_id)
     else:
         with scene.job_writer(scene.job_rows(2)) as out:
-            for row, photons in given.photons.items():
-                out.photons(row, photons)
-            for row, buffers in given.buffers.items():
-                out.view(row, buffers, given.guides[row], given.visibility[row])
-            for row, halves in given.radiance.items():
-                out.radiance(row, halves)
+            samples.give(out, given)
             again = plan_anew(scene)
             assert not out.commit(samples.FIGURES)
     assert again.missing_jobs() == [0, 1]

@@ -181,12 +181,7 @@ def test_a_store_that_goes_under_a_worker_is_told_and_not_begun_anew(
         with scene.job_writer(scene.job_rows(1)) as out:
             if when == "before a row":
                 go(store.root)
-            for row, photons in given.photons.items():
-                out.photons(row, photons)
-            for row, buffers in given.buffers.items():
-                out.view(row, buffers, given.guides[row], given.visibility[row])
-            for row, halves in given.radiance.items():
-                out.radiance(row, halves)
+            samples.give(out, given)
             out._join()
             if when == "before the commit":
                 go(store.root)

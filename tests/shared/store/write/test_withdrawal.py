@@ -74,12 +74,7 @@ def test_what_was_forgotten_is_planned_again_and_nothing_is_there_twice(scene: S
 def test_a_worker_that_was_at_a_withdrawn_job_throws_it_away(scene: SceneStore) -> None:
     given = samples.outputs(scene, 1)
     with scene.job_writer(scene.job_rows(1)) as out:
-        for row, photons in given.photons.items():
-            out.photons(row, photons)
-        for row, buffers in given.buffers.items():
-            out.view(row, buffers, samples.guides(scene.spec, row), given.visibility[row])
-        for row, halves in given.radiance.items():
-            out.radiance(row, halves)
+        samples.give(out, given)
         withdraw(fresh(scene))
         assert not out.commit(samples.FIGURES)
     assert scene.committed_jobs() == {0, 2}

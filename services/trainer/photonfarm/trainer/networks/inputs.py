@@ -37,9 +37,6 @@ class Needs:
         return (*IMAGES, "world_to_camera", *points, *photons, *(GUIDES if self.guides else ()))
 
 
-POINTS_ONLY = Needs()
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class PointInputs:
     """The point cloud of each sample's configuration."""

@@ -26,7 +26,7 @@ from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.findings import Cause, Finding, FindingGroup, Findings, Remedy
-from photonfarm.shared.store.write.lease import Lease, OnWait, lease
+from photonfarm.shared.store.write.lease import Claim, OnWait, lease
 from photonfarm.shared.store.write.quarantine import Quarantine, was_set_aside
 from photonfarm.shared.store.write.scene_store import SCENES, read_spec, scene_ids
 from photonfarm.shared.store.write.store import Store
@@ -157,7 +157,7 @@ class _SceneChecking:
                 done += self._repair(scene, quarantine)
         return self._report(spec.name, done)
 
-    def _alone(self) -> contextlib.AbstractContextManager[Lease]:
+    def _alone(self) -> contextlib.AbstractContextManager[Claim]:
         return lease(self._storage, self._scene_id, "store check --repair", self._on_wait)
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:

@@ -85,23 +85,8 @@ def at_work(storage: Storage, scene_id: str, what: str, on_wait: OnWait | None =
         time.sleep(LOOK_S)
 
 
-class Lease:
-    """A lease that is held. Whoever was suspended for so long that others took it has lost it."""
-
-    def __init__(self, storage: Storage, scene_id: str, what: str) -> None:
-        self._file = _Presence(storage, f"{LEASES}/{scene_id}.json", what)
-        self._scene_id, self._what = scene_id, what
-
-    def check(self) -> None:
-        """Raise StoreError if the lease is lost: before anything that cannot be undone."""
-        if not self._file.is_own():
-            raise StoreError(
-                f"scene {self._scene_id}: {self._what} was silent for so long that others went on; start it again"
-            )
-
-
 @contextmanager
-def lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterator[Lease]:
+def lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterator[Claim]:
     """Have a scene alone: wait for others' leases and for all who are at work in it, and hold it during the block.
 
     `what` is in words: "store check --repair". Raises StoreError.
@@ -117,18 +102,18 @@ def lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterat
         time.sleep(LOOK_S)
 
     while True:
-        taken = Lease(storage, scene_id, what)
+        claim = Claim(storage, f"{LEASES}/{scene_id}.json", what)
         with store_errors("take the scene's lease", storage.where):
-            while not taken._file.place():
+            while not claim.place():
                 if (holder := _holder(storage, scene_id)) is not None:
                     wait_for([holder])
                 else:
                     _remove_dead(storage, scene_id)
-        with taken._file.renewed():
+        with claim.renewed():
             while others := _others_at_work(storage, scene_id):
                 wait_for(others)
-            if taken._file.is_own():
-                yield taken
+            if claim.is_own():
+                yield claim
                 return
 
 
@@ -180,8 +165,8 @@ def _owner(storage: Storage, name: str) -> str | None:
     return f"{what} ({space.rpartition('-')[0]}, process {process}{silent})" if space else what
 
 
-class _Presence:
-    """A file that says that this process is there, and in what it is at work."""
+class Claim:
+    """A lease, or an announcement of work: a file of this process, which it renews."""
 
     def __init__(self, storage: Storage, name: str, what: str) -> None:
         self._storage, self._name, self._what = storage, name, what
@@ -199,6 +184,11 @@ class _Presence:
         """Whether the file is there and this one's."""
         content = read_or_none(self._storage, self._name)
         return content is not None and self._token.encode() in content
+
+    def check(self) -> None:
+        """Raise StoreError if others took the file for that of the dead: before anything that cannot be undone."""
+        if not self.is_own():
+            raise StoreError(f"{self._what} was silent for so long that others went on; start it again")
 
     def _renew(self) -> None:
         with suppress(OSError):  # a full disk, say: others wait SILENT_S before they take this process for dead
@@ -219,7 +209,7 @@ class _Presence:
 
 
 def _announced(storage: Storage, name: str, what: str) -> AbstractContextManager[None]:
-    file = _Presence(storage, name, what)
+    file = Claim(storage, name, what)
     try:
         with store_errors("announce work in a scene", storage.where):
             file.place()

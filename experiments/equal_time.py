@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.rooms import Room
-from photonfarm.trainer.compare.markdown import markdown_table
+from photonfarm.trainer.compare.comparison import markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -30,8 +30,7 @@ from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.trainer.compare.comparison import COMPARISON, GAP, LINE
 from photonfarm.trainer.predict.animation import read_png, write_png
-from photonfarm.trainer.report.pictures import OVERVIEW
-from photonfarm.trainer.report.views import coloured
+from photonfarm.trainer.report.views import OVERVIEW, coloured
 from photonfarm.trainer.report.worst_cases import caption as worst_view
 
 ROOMS = ["static-bathroom", "static-kitchen", "night-living-room-2", "movable-veach-ajar", "fixed-living-room",

@@ -11,11 +11,11 @@ from typing import Any, TypeVar
 import numpy as np
 
 from experiments.rooms import Room, estimate
-from photonfarm.shared.core.estimate import Estimate
-from photonfarm.trainer.compare.markdown import markdown_table
+from photonfarm.shared.core.statistics import Estimate
+from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
-from photonfarm.trainer.report.published import Published, PublishedTable
+from photonfarm.trainer.report.contents import Published, PublishedTable
 from photonfarm.trainer.report.tables import with_interval
 
 T = TypeVar("T")

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 
 from experiments.rooms import Room
-from photonfarm.trainer.compare.markdown import markdown_table
+from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 
 WIDTH = 120  # characters of a line

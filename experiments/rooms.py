@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from experiments.experiment import Experiment, seeded
 from experiments.stages import EVALUATION
 from photonfarm.shared.core.errors import IncompleteError, SpecError
-from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.core.statistics import Estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -18,10 +18,9 @@ from typing import Any
 
 from bench.harness import results
 from experiments.experiment import Experiment, Run
-from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.processes import tied
+from photonfarm.shared.core.processes import command, tied
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.format.markers import COMMITTED

@@ -29,7 +29,7 @@ from experiments.paper_tables import CLOSE, error_table, further_table, lacking,
 from experiments.room_tables import cost_table, descriptions, room_table, said, wrapped
 from experiments.rooms import Room
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError
-from photonfarm.trainer.report.published import FIXED_LIGHTS, MOVABLE_LIGHTS, PublishedTable
+from photonfarm.trainer.report.contents import FIXED_LIGHTS, MOVABLE_LIGHTS, PublishedTable
 
 PARTS: Mapping[Part, tuple[str, PublishedTable]] = {
     "fixed": ("Table 1: movable objects, fixed lights", FIXED_LIGHTS),

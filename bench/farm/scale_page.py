@@ -173,7 +173,7 @@ None of this changes the store's format, or what a commit guarantees; each has a
   for two seconds what it found (`queue.look`). When nothing is left, every worker that ends with its work looks once
   more for itself. (`test_queue_look.py`)
 - **Looks at a bucket.** Each look listed every marker, a request per thousand. Now it asks for the few that are missing
-  among the first ones, and lists what lies behind (`followed_markers`); all are listed again every ten minutes, or when
+  among the first ones, and lists what lies behind (`FollowedMarkers`); all are listed again every ten minutes, or when
   something cannot be read. (`test_followed_markers.py`)
 - **Looks in a folder** still list everything, and so does the arithmetic on all rows after news. Trainers, and workers
   with `--ahead` or `--share`, now wait twenty times as long as a look took, a minute at most: from some 10^6 samples on

@@ -22,14 +22,12 @@ from photonfarm.shared.core.records import (
     Visibility,
     arrays_of,
 )
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import Modification, rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
 from photonfarm.shared.store.format.schema import RowKind, output_arrays
-from photonfarm.shared.store.format.shards import encode
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
+from photonfarm.shared.store.format.shards import NOISY_GUIDES, encode, rounded
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
 

@@ -31,9 +31,9 @@ from torch.nn.functional import avg_pool2d
 
 from bench.harness.results import ROOT
 from experiments.experiment import Experiment, names
-from photonfarm.shared.core.estimate import clean_error
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.statistics import clean_error
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp

@@ -78,8 +78,7 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Modificat
     import drjit as dr
 
     from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
-    from photonfarm.shared.scene.modification import rest, sample_modification
-    from photonfarm.shared.scene.pointcloud import rebuild
+    from photonfarm.shared.scene.modification import rebuild, rest, sample_modification
     from photonfarm.shared.scene.view import sample_view
 
     spec = ready_spec(name)

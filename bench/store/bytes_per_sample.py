@@ -16,7 +16,7 @@ from bench.harness.contents import Contents, Pool, commit, view_row
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format import schema

@@ -66,7 +66,7 @@ def _stratified(spec: SceneSpec) -> Any:
     """The spec's sensor with a stratified sampler: `bdpt`, which has points of its own, does not ask it."""
     import mitsuba as mi
 
-    from photonfarm.renderer.scene.sensor import AimedSensor, describe
+    from photonfarm.renderer.scene.loading import AimedSensor, describe
 
     class Stratified(AimedSensor):
         def __init__(self) -> None:

@@ -27,8 +27,8 @@ from bench.harness import results
 from bench.harness.contents import Contents, commit
 from bench.harness.scenes import square
 from bench.trainer.rounded_convolutions import round_factors
-from photonfarm.shared.core.estimate import Estimate, clean_error
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.statistics import Estimate, clean_error
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, Store

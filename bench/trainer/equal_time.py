@@ -27,7 +27,7 @@ from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics import mssim
-from photonfarm.trainer.metrics.metric_space import metric_space
+from photonfarm.trainer.metrics.image_metrics import metric_space
 from photonfarm.trainer.predict.evaluation import by_turns
 from photonfarm.trainer.runs import settings
 from photonfarm.trainer.runs.settings import TrainSettings

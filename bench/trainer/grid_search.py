@@ -28,17 +28,17 @@ import numpy as np
 from pydantic import ValidationError
 
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.shared.core.estimate import Estimate, group_means, stated
 from photonfarm.shared.core.files import write_whole
 from photonfarm.shared.core.keys import Key, make_key
 from photonfarm.shared.core.models import sentences
 from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.core.statistics import Estimate, group_means, stated
 from photonfarm.shared.plan.hold_out import rows_held_out, units_of
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.trainer.cli.train_verb import by_key
 from photonfarm.trainer.cli.train_verb import train as train_verb
-from photonfarm.trainer.compare.markdown import markdown_table
+from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
 from photonfarm.trainer.predict.trained import TrainedRun

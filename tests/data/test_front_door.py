@@ -27,8 +27,8 @@ from photonfarm.shared.core.keys import seed_of
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.hold_out import are_held_out
 from photonfarm.shared.store import SceneStore, Store
+from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
 from photonfarm.shared.store.read.find import Query, find_samples
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
 
 
 @pytest.fixture(params=["folder", "bucket"])

@@ -15,8 +15,7 @@ import pytest
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.cli.main import main
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.farm.hold_out_check import check_hold_out, chosen_hold_out
-from photonfarm.shared.farm.submission import submit
+from photonfarm.shared.farm.submission import check_hold_out, chosen_hold_out, submit
 from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec

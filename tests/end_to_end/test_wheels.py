@@ -58,7 +58,7 @@ def test_every_verb_and_the_ready_specs_are_there(python: Path, tmp_path: Path) 
         run(python, tmp_path, "-m", "photonfarm.shared.cli", verb, "--help")
     assert "cornell" in run(python, tmp_path, "-m", "photonfarm.shared.cli", "scene", "show", "cornell")
     assert (python.parent / "photonfarm").is_file()
-    script = "from photonfarm.web.routes import STATIC; print((STATIC / 'app.js').is_file())"
+    script = "from photonfarm.web.server import STATIC; print((STATIC / 'app.js').is_file())"
     assert run(python, tmp_path, "-c", script).split() == ["True"]
 
 

@@ -22,7 +22,7 @@ from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.plan.sample_costs import SampleCosts
 from photonfarm.shared.scene.spec import Emitters
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
-from photonfarm.trainer.report.published import MOVABLE_LIGHTS
+from photonfarm.trainer.report.contents import MOVABLE_LIGHTS
 
 ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
 EXPECTED = [*(f"{lights}-{room}" for lights in ("fixed", "movable") for room in ROOMS)]

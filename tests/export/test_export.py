@@ -12,8 +12,8 @@ import store_samples as samples
 from exports import BRIGHT, FORMATS, exported, planned, read, several
 
 from photonfarm.data import Sample, open_scene
+from photonfarm.export.columns import ranges, rows_in, spans
 from photonfarm.export.export import export_scene
-from photonfarm.export.rows import ranges, rows_in, spans
 from photonfarm.export.settings import ExportRequest
 from photonfarm.shared.cli.main import main
 from photonfarm.shared.store import SceneStore

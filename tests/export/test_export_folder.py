@@ -10,7 +10,7 @@ import pytest
 import store_samples as samples
 from exports import FORMATS, commit, exported, planned, read, several
 
-from photonfarm.export.rows import rows_in
+from photonfarm.export.columns import rows_in
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, SpecError, StoreError
 from photonfarm.shared.store import SceneStore
 

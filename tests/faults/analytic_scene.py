@@ -25,7 +25,7 @@ from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.format.schema import output_arrays
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES
+from photonfarm.shared.store.format.shards import NOISY_GUIDES
 
 FOLDER = Path(__file__).parent  # on sys.path, it makes this module known to a process of its own
 

@@ -13,7 +13,7 @@ from photonfarm.shared.plan.request import UNUSED, PlannedContent, Request, expa
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
+from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
 
 # ------------------------------------------------------------------------------ what is rendered: a function of content
 

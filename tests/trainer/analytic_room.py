@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from photonfarm.shared.core.keys import Stream, make_key
 from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.pointcloud import rebuild, sample_surface
+from photonfarm.shared.scene.modification import Modification, rebuild, sample_surface
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import Camera, View
 

@@ -20,8 +20,7 @@ from photonfarm.shared.core.records import (
     ViewBuffers,
 )
 from photonfarm.shared.plan.request import sample_key
-from photonfarm.shared.scene.modification import Modification, sample_modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import Modification, rebuild, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
 from photonfarm.shared.store import Figures, Sample, SceneStore

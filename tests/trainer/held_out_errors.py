@@ -7,7 +7,7 @@ from pathlib import Path
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import batches, measure, network_predictor
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.report.baselines import Baselines
+from photonfarm.trainer.report.trained_runs import Baselines
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT
 
 

@@ -25,7 +25,7 @@ from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.watch import FarmView, FarmWatch
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneStore, Store
-from photonfarm.web.kept import Kept
+from photonfarm.web.images import Kept
 from photonfarm.web.metrics import MOST_ERRORS, OTHER, FarmMetrics
 
 ROOT = Path(__file__).parents[2]

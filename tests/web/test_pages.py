@@ -29,15 +29,13 @@ from photonfarm.shared.farm.training import PROGRESS, WAITS
 from photonfarm.shared.farm.watch import FarmWatch
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.sample_costs import relative_variance
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import rebuild
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.web import images
 from photonfarm.web.farm_pages import FarmPages
-from photonfarm.web.images import POINT
-from photonfarm.web.kept import Kept
-from photonfarm.web.routes import page_routes
+from photonfarm.web.images import POINT, Kept
 from photonfarm.web.samples import SceneSamples
-from photonfarm.web.server import PageServer
+from photonfarm.web.server import PageServer, page_routes
 
 EVIL = "<img src=x onerror=alert(1)>"
 """A name that a page must show as it is."""

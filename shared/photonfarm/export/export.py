@@ -11,11 +11,10 @@ from typing import Any
 import numpy as np
 
 from photonfarm.export import card, configurations, folder, manifest
-from photonfarm.export.columns import GUIDES, Column, Contents, buffers_named, columns
+from photonfarm.export.columns import GUIDES, Column, Contents, buffers_named, columns, ranges, spans
 from photonfarm.export.folder import Files, Planned
 from photonfarm.export.formats.format import Exported, Format, format_named
 from photonfarm.export.manifest import Manifest, SceneName
-from photonfarm.export.rows import ranges, spans
 from photonfarm.export.settings import ExportRequest, ExportSettings
 from photonfarm.export.snapshot import Snapshot, Values, constants
 from photonfarm.shared.core.errors import IncompleteError, SpecError

@@ -10,8 +10,8 @@ from itertools import count
 from pathlib import Path
 
 from photonfarm.export import manifest
+from photonfarm.export.columns import ranges, rows_in
 from photonfarm.export.manifest import MANIFEST, Manifest, Part
-from photonfarm.export.rows import ranges, rows_in
 from photonfarm.shared.core.errors import StoreError, store_errors
 
 LOCK = ".lock"

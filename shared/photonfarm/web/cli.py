@@ -48,7 +48,7 @@ def web(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any)
     """
     from photonfarm.shared.core.processes import free_port
     from photonfarm.web.farm_pages import FarmPages
-    from photonfarm.web.routes import page_routes
+    from photonfarm.web.server import page_routes
 
     pages = FarmPages(store, _watch(store, redis_url, runs))
     _serve(page_routes(pages), "", **where | {"port": free_port(where["port"])})
@@ -62,8 +62,8 @@ def serve_metrics(store: str | Path, redis_url: str, runs: tuple[Path, ...], **w
 
     `web` serves the same beside its pages. Ends on Ctrl-C.
     """
-    from photonfarm.web.kept import Kept
-    from photonfarm.web.routes import metric_routes
+    from photonfarm.web.images import Kept
+    from photonfarm.web.server import metric_routes
 
     _serve(metric_routes(Kept(_watch(store, redis_url, runs).look).get), "metrics", **where)
 

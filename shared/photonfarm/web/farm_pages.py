@@ -14,7 +14,7 @@ from photonfarm.shared.farm.training import VIEWS, RunFolder
 from photonfarm.shared.farm.watch import FarmView, FarmWatch
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.write.plans import plan_of
-from photonfarm.web.kept import Kept
+from photonfarm.web.images import Kept
 from photonfarm.web.samples import SceneSamples
 from photonfarm.web.server import NotThereError
 

@@ -16,7 +16,7 @@ from click.testing import CliRunner
 from bench.trainer import grid_search
 from bench.trainer.grid_search import Cell, main, run_grid, table
 from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.core.statistics import Estimate
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import Store

@@ -12,7 +12,7 @@ from bench.trainer.projection_oracle import in_camera, sees, triangles
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import Camera

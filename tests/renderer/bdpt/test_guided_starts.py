@@ -12,7 +12,7 @@ import pytest
 from bench.stability.scenes import hard_scenes
 from bench.stability.weights.weight_check import ball_light, bulb_room, random_usefulness
 from photonfarm.renderer.bdpt import randomness
-from photonfarm.renderer.bdpt.guiding import learning, squares
+from photonfarm.renderer.bdpt.guiding import grid, learning
 from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
 from photonfarm.renderer.bdpt.guiding.learning import LightGuide
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
@@ -87,7 +87,7 @@ def test_positions_are_guided_on_rectangles_alone() -> None:
     assert np.ptp(by_direction[:, 0]) > 0.1
 
 
-@pytest.mark.parametrize("towards", [(1, 2, 3), squares._AXIS, (0, 0, 1)], ids=str)
+@pytest.mark.parametrize("towards", [(1, 2, 3), grid._AXIS, (0, 0, 1)], ids=str)
 def test_a_light_in_any_direction_has_a_frame(towards: tuple[float, float, float]) -> None:
     """The frame once had no directions for (1, 2, 3), so that all light paths of such a sun were lost."""
     description = hard_scenes.cove(16) | {"sun": {"type": "directional", "direction": [-x for x in towards]}}
@@ -97,7 +97,7 @@ def test_a_light_in_any_direction_has_a_frame(towards: tuple[float, float, float
     lights = plain.guided_by(at_random(Layout.of(plain.count)), scene)
     start = started(lights, 1024)
     assert np.array(start.valid).all()
-    frame = squares.frame_about(dr.normalize(mi.Vector3f(*towards)))
+    frame = grid.frame_about(dr.normalize(mi.Vector3f(*towards)))
     lengths = [float(np.linalg.norm(np.array(v))) for v in (frame.s, frame.t)]
     np.testing.assert_allclose(lengths, 1, rtol=1e-4)
     assert np.isfinite(np.array(start.ray.o)).all()

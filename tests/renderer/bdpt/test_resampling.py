@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.bdpt.resampling import resampled
+from photonfarm.renderer.bdpt.recording import resampled
 
 IMAGES, PATHS = 3, 1000
 

@@ -15,13 +15,13 @@ from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import IncompleteError, SpecError
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.camera_path import Frames
 from photonfarm.shared.scene.modification import rest
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.format.schema import output_arrays
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
+from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
 
 
 @pytest.fixture

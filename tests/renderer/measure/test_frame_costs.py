@@ -13,13 +13,19 @@ from click.testing import CliRunner
 
 from photonfarm.renderer.cli.sample_verbs import measure_frames
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.renderer.measure.frame_costs import WARM_UPS, TimedFrame, frame_costs, in_turn
-from photonfarm.renderer.measure.partial_film import PartialFilm, part_of
-from photonfarm.renderer.measure.surfaces import surface_kinds
+from photonfarm.renderer.measure.frame_costs import (
+    WARM_UPS,
+    PartialFilm,
+    TimedFrame,
+    frame_costs,
+    in_turn,
+    part_of,
+    surface_kinds,
+)
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Surface
+from photonfarm.shared.core.files import PARTS, FrameCosts, Surface
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import SceneSpec

@@ -10,8 +10,7 @@ from photonfarm.renderer.scene.tessellation import triangles_of
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.keys import make_key
 from photonfarm.shared.core.records import STATIC
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import rebuild, sample_modification
 from photonfarm.shared.scene.spec_loading import load_spec
 
 CHECKS = {

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.commands import command
+from photonfarm.shared.core.processes import command
 from photonfarm.shared.core.statistics import block_z_test
 from photonfarm.shared.farm.devices import cards_here
 from photonfarm.shared.plan.request import Request

@@ -16,7 +16,7 @@ from photonfarm.shared.core.records import Guides, arrays_of
 from photonfarm.shared.scene.modification import rest
 from photonfarm.shared.scene.spec import GuideSpec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES
+from photonfarm.shared.store.format.shards import NOISY_GUIDES
 
 backend.load(threads=1)
 

@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.jobs.render import visibility_of
 from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.gbuffer import seen_points
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.visibility import seen_points
 from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry, Photons, Visibility
-from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import Modification, rebuild, rest, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
 from photonfarm.shared.scene.view import View, sample_view

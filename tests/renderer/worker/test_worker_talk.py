@@ -2,7 +2,7 @@
 
 import pytest
 
-from photonfarm.renderer.worker.log import JobCounts, WorkerLog
+from photonfarm.renderer.worker.outcomes import JobCounts, WorkerLog
 from photonfarm.renderer.worker.settings import WorkerSettings
 
 

@@ -8,9 +8,9 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli import verbs
+from photonfarm.shared.cli import main
 from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.commands import command
+from photonfarm.shared.core.processes import command
 
 
 @click.command()
@@ -49,10 +49,10 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Install:
         commands = {"report": report, "store.check": plan, "scene": scene, "scene.plan": plan}
         found = {}
         for name in names:
-            entry = EntryPoint(name, f"{__name__}:{name}", verbs.GROUP)
+            entry = EntryPoint(name, f"{__name__}:{name}", main.GROUP)
             monkeypatch.setattr(EntryPoint, "load", lambda self: commands[self.name])
             found[name] = entry
-        monkeypatch.setattr(verbs, "_installed", lambda: found)
+        monkeypatch.setattr(main, "_installed", lambda: found)
 
     return of
 

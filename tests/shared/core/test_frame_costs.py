@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds, Surface
+from photonfarm.shared.core.files import PARTS, FrameCosts, Seconds, Surface
 
 
 def made() -> FrameCosts:

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from photonfarm.shared.cli.main import umbrella
+from photonfarm.shared.cli.main import options_by_command, umbrella
 from photonfarm.shared.cli.settings import file_defaults
-from photonfarm.shared.cli.verbs import options_by_command
 from photonfarm.shared.core import errors
 from photonfarm.shared.scene import spec as scene_spec
 from photonfarm.shared.scene.free_space import FreeSpace

@@ -3,8 +3,8 @@
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.farm import job_size, submission
-from photonfarm.shared.farm.job_size import rows_per_job, sample_seconds
+from photonfarm.shared.farm import submission
+from photonfarm.shared.farm.submission import rows_per_job, sample_seconds
 from photonfarm.shared.plan.request import SHARD_ROWS, Request
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import NamedSpec
@@ -17,7 +17,7 @@ def spec_of(side: int, half_spp: int) -> SceneSpec:
 
 def test_thirty_two_costly_samples_give_every_worker_several_jobs() -> None:
     spec = spec_of(256, 64)
-    assert sample_seconds(spec) > job_size.MOST_S
+    assert sample_seconds(spec) > submission.MOST_S
     assert rows_per_job(spec, Request(modifications=32), workers=2) == 1
 
 
@@ -25,13 +25,13 @@ def test_jobs_of_a_large_plan_take_some_seconds() -> None:
     for side, half_spp in ((64, 4), (128, 8), (256, 16), (512, 64)):
         spec = spec_of(side, half_spp)
         rows = rows_per_job(spec, Request(modifications=100_000), workers=8)
-        assert rows == 1 or rows * sample_seconds(spec) <= 1.5 * job_size.MOST_S
-        assert rows in (1, SHARD_ROWS) or rows * sample_seconds(spec) >= job_size.LEAST_S
+        assert rows == 1 or rows * sample_seconds(spec) <= 1.5 * submission.MOST_S
+        assert rows in (1, SHARD_ROWS) or rows * sample_seconds(spec) >= submission.LEAST_S
 
 
 def test_cheap_samples_of_a_small_plan_do_not_make_tiny_jobs() -> None:
     spec = spec_of(8, 1)
-    assert rows_per_job(spec, Request(modifications=32), workers=8) * sample_seconds(spec) >= 0.9 * job_size.LEAST_S
+    assert rows_per_job(spec, Request(modifications=32), workers=8) * sample_seconds(spec) >= 0.9 * submission.LEAST_S
 
 
 def test_a_configuration_is_not_split_over_jobs_if_one_holds_it() -> None:

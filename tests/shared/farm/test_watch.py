@@ -19,7 +19,7 @@ from photonfarm.shared import queue
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.cli.show_watch import drawn, lines
 from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.farm import running_farm, waits
+from photonfarm.shared.farm import running_farm, status
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.running_farm import announced
 from photonfarm.shared.farm.status import RECENT_S, NoQueue, StoreQueue, queue_of, since_commit_s
@@ -115,7 +115,7 @@ def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
     idle = queue.WorkerReport(host="elsewhere", process=1, paused="the disk is full", left=left)
     for worker in ("ada", "bob"):
         queue_samples.told(connection, worker, idle)
-    found = list(waits.waits(queue_of(store, common_redis.url), {scene.scene_id: "small"}, 8))
+    found = list(status.waits(queue_of(store, common_redis.url), {scene.scene_id: "small"}, 8))
     assert [(wait.kind, wait.count) for wait in found] == [("scene_left", 1), ("worker_paused", 2), ("job_failed", 1)]
     assert [str(wait) for wait in found] == [
         "small: left by 2 of 2 workers: room.xml is missing",
@@ -125,8 +125,8 @@ def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
 
 
 def test_samples_that_no_worker_renders_wait_for_one(store: Store, connection: redis.Redis, common_redis: Any) -> None:
-    assert len(list(waits.waits(queue_of(store, common_redis.url), {}, 8))) == 1
-    assert list(waits.waits(queue_of(store, common_redis.url), {}, 0)) == []
+    assert len(list(status.waits(queue_of(store, common_redis.url), {}, 8))) == 1
+    assert list(status.waits(queue_of(store, common_redis.url), {}, 0)) == []
 
 
 def test_failures_outlive_redis_until_their_job_is_committed(scene: SceneStore, store: Store, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from photonfarm.shared.core.errors import SpecError, StoreError
 from photonfarm.shared.core.records import Guides, Photons, arrays_of
 from photonfarm.shared.farm.configuration import named_configuration
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.camera_path import Frames
 from photonfarm.shared.scene.modification import Modification, rest, sample_modification
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import View

@@ -8,8 +8,7 @@ from click.testing import CliRunner
 
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.scene.plausibility import doubts, warnings
-from photonfarm.shared.scene.spec_lines import lines_of
-from photonfarm.shared.scene.spec_loading import NamedSpec, find_spec, parse_with_lights
+from photonfarm.shared.scene.spec_loading import NamedSpec, find_spec, lines_of, parse_with_lights
 
 ROOM: dict[str, Any] = {
     "name": "checked",

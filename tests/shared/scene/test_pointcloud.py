@@ -6,8 +6,7 @@ from scipy import stats
 
 from photonfarm.shared.core.keys import Stream, make_key
 from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.scene.pointcloud import draw, rebuild, sample_surface
+from photonfarm.shared.scene.modification import draw, rebuild, sample_modification, sample_surface
 from photonfarm.shared.scene.spec import SceneSpec
 
 COUNT = 40_000

@@ -13,8 +13,7 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.trainer.dry_run import dry_run
 from photonfarm.trainer.dry_run.dry_run import DryRun, rehearse
-from photonfarm.trainer.dry_run.live_memory import LiveMemory
-from photonfarm.trainer.dry_run.made_up import MadeUpScene
+from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
 from photonfarm.trainer.dry_run.printed import document, text
 from photonfarm.trainer.networks import ARCHITECTURES, image_of
 from photonfarm.trainer.networks.network import Network

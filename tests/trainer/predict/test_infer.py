@@ -18,8 +18,7 @@ from photonfarm.shared.core.pictures import display
 from photonfarm.shared.core.records import LIT_POINTS, Guides, arrays_of
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.camera_path import orbit
-from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.camera_path import Frames, orbit
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, SceneStore, Store

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.frame_costs import PARTS, FrameCosts, Seconds
-from photonfarm.trainer.predict.ready import ReadyPredictor
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.shared.core.files import PARTS, FrameCosts, Seconds
+from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.frame_times import frame_time, points_used
 

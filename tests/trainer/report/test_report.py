@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from read_batches import batch_of
 
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.frame_costs import Seconds
+from photonfarm.shared.core.files import Seconds
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request
@@ -30,10 +30,9 @@ from photonfarm.trainer.compare.evaluate import PredictorRow
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report as report_of
-from photonfarm.trainer.report.contents import gathered
+from photonfarm.trainer.report.contents import MOVABLE_LIGHTS, gathered
 from photonfarm.trainer.report.frame_times import FrameTime
 from photonfarm.trainer.report.plots import Plot, plots
-from photonfarm.trainer.report.published import MOVABLE_LIGHTS
 from photonfarm.trainer.report.tables import Table
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.runs import checkpoint

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from chromium import chromium, needs_chromium
 
-from photonfarm.shared.core.estimate import Estimate, group_means
 from photonfarm.shared.core.records import Guides
+from photonfarm.shared.core.statistics import Estimate, group_means
 from photonfarm.shared.store import SceneReader
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun

@@ -12,9 +12,9 @@ from photonfarm.trainer import service
 from photonfarm.trainer.cli import train_verb as cli
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, held
 from photonfarm.trainer.runs.settings import NetworkSettings
-from photonfarm.trainer.runs.stored_settings import read_settings
 from photonfarm.trainer.training.loop import train
 
 

@@ -25,8 +25,7 @@ from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Geometry
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import rebuild, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.spec_loading import load_spec
 from photonfarm.shared.scene.view import View, sample_view

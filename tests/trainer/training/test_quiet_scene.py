@@ -17,13 +17,13 @@ import torch
 from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.write.forgetting import forget
 from photonfarm.shared.store.write.lease import lease
+from photonfarm.shared.store.write.withdrawal import forget
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.distributed import leading, ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training import presence
+from photonfarm.trainer.training import other_ranks
 from photonfarm.trainer.training.loop import Hooks, stop_on_signals, train
 from photonfarm.trainer.training.other_ranks import assist
 
@@ -35,7 +35,7 @@ FORK = multiprocessing.get_context("fork")
 @pytest.fixture
 def committed(scene: SceneStore, commit, monkeypatch: pytest.MonkeyPatch) -> SceneStore:
     """Eight jobs of two samples, all there; and trainers that look for a lease at every step."""
-    monkeypatch.setattr(presence, "LOOK_S", 0.01)
+    monkeypatch.setattr(other_ranks, "LOOK_S", 0.01)
     scene.plan(Request(modifications=4, views_per_modification=4), shard_rows=2)
     for job in range(scene.jobs()):
         commit(scene, job)

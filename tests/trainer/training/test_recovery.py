@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.core.estimate import Estimate, group_means
+from photonfarm.shared.core.statistics import Estimate, group_means
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun

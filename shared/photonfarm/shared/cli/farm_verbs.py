@@ -74,7 +74,7 @@ def submit(
     from photonfarm.shared.cli import show
     from photonfarm.shared.farm import dry_run as dry
     from photonfarm.shared.farm import submission
-    from photonfarm.shared.farm.hold_out_check import hold_out_warning
+    from photonfarm.shared.farm.submission import hold_out_warning
     from photonfarm.shared.scene.plausibility import warnings
     from photonfarm.shared.scene.spec_loading import NamedSpec
 

@@ -12,9 +12,8 @@ import click
 from photonfarm.shared.cli.show import print_json, print_table
 from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.farm.running_farm import RunningFarm
-from photonfarm.shared.farm.status import RECENT_S, NoQueue, StoreQueue, lost_plan, unread_markers
+from photonfarm.shared.farm.status import RECENT_S, NoQueue, StoreQueue, idle, lost_plan, unread_markers
 from photonfarm.shared.farm.training import TrainingProgress
-from photonfarm.shared.farm.waits import idle
 from photonfarm.shared.store import SceneStatus
 
 if TYPE_CHECKING:

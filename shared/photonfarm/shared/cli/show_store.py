@@ -23,8 +23,7 @@ from photonfarm.shared.store.check.check import CheckProgress, SceneReport, Stor
 from photonfarm.shared.store.read.find import FoundSample, Matches
 from photonfarm.shared.store.read.merge import WrittenView
 from photonfarm.shared.store.write.findings import Finding, FindingGroup, Remedy
-from photonfarm.shared.store.write.forgetting import Forgotten
-from photonfarm.shared.store.write.withdrawal import Withdrawal
+from photonfarm.shared.store.write.withdrawal import Forgotten, Withdrawal
 
 
 @contextlib.contextmanager

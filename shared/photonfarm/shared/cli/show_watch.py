@@ -11,8 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from photonfarm.shared.core.waiting import in_words
-from photonfarm.shared.farm.status import NoQueue
-from photonfarm.shared.farm.waits import failed
+from photonfarm.shared.farm.status import NoQueue, failed
 from photonfarm.shared.farm.watch import FarmView, FarmWatch, SceneView
 
 LOOK_S = 2.0

@@ -148,8 +148,7 @@ def _planned(
     options: dict[str, Any],
 ) -> list[Submission]:
     """Plan a request for each spec, and queue all that is missing if there is a queue."""
-    from photonfarm.shared.farm.hold_out_check import hold_out_warning
-    from photonfarm.shared.farm.submission import queue_missing, submit
+    from photonfarm.shared.farm.submission import hold_out_warning, queue_missing, submit
     from photonfarm.shared.scene.plausibility import warnings
     from photonfarm.shared.store import Store
 

@@ -205,7 +205,7 @@ def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
     from photonfarm.shared.cli import show_store
     from photonfarm.shared.store import Store
     from photonfarm.shared.store.read.find import scene_named
-    from photonfarm.shared.store.write.forgetting import forget as forgotten
+    from photonfarm.shared.store.write.withdrawal import forget as forgotten
 
     opened = Store(store)
     scene_id = scene_named(opened, scene)

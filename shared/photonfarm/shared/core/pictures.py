@@ -1,15 +1,19 @@
-"""Arrays as pictures that a person can look at. For display only: nothing here is on the way to the store.
+"""Arrays as pictures that a person can look at, and HTML pages from Jinja2 templates, each a file that needs no other.
 
-Shape letters: H W image.
+For display only: nothing here is on the way to the store. Shape letters: H W image.
 """
 
 from __future__ import annotations
 
 import base64
 import io
-from typing import TypeVar
+from base64 import b64encode
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from photonfarm.shared.core.records import F32
@@ -75,3 +79,21 @@ def data_uri(picture: Picture, most: int | None = None) -> str:
 
 def _bytes(unit: NDArray[np.floating]) -> Picture:
     return np.round(255 * unit).astype(np.uint8)
+
+
+HERE = Path(__file__).parent
+
+
+def rendered(template: Path, **values: Any) -> str:
+    """The page of a template; `page.html.j2`, which it may extend, lies beside this module. Text is escaped."""
+    environment = Environment(
+        loader=FileSystemLoader([template.parent, HERE]), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters |= {"uri": data_uri, "breakable": breakable, "base64": lambda data: b64encode(data).decode()}
+    return environment.get_template(template.name).render(**values)
+
+
+def breakable(text: str) -> Markup:
+    """A text whose names may break after an underscore."""
+    return Markup(str(escape(text)).replace("_", "_<wbr>"))  # noqa: S704 - it is escaped

@@ -1,4 +1,7 @@
-"""Child processes that end with their parent, requests to stop, and the scope of process numbers."""
+"""Child processes that end with their parent, requests to stop, and the scope of process numbers.
+
+Verbs of `photonfarm` run as child processes, whichever distribution provides them.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from importlib.metadata import entry_points
 from pathlib import Path
 
 _LAUNCH = """
@@ -146,3 +150,17 @@ def process_space() -> str:
     except OSError:  # not Linux, hence no containers: the host's name must do
         space = "0"
     return f"{socket.gethostname()}-{space}"
+
+
+GROUP = "photonfarm.commands"
+"""The group of entry points that holds all verbs."""
+
+
+def is_installed(name: str) -> bool:
+    """Whether a verb such as "buffers" or "scene.cost" is installed, by any service."""
+    return bool(entry_points(group=GROUP, name=name))
+
+
+def command(*arguments: str | Path) -> list[str]:
+    """The command line of a verb with its arguments, for a child process: this Python runs it, whatever is on PATH."""
+    return [sys.executable, "-m", "photonfarm.shared.cli", *map(str, arguments)]

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import BackendError, StoreError
-from photonfarm.shared.core.processes import usable_cores
+from photonfarm.shared.core.processes import command, is_installed, usable_cores
 from photonfarm.shared.farm.submission import Submission
 from photonfarm.shared.plan.allocation import Allocation, CostModel
 from photonfarm.shared.plan.request import Extent, Request

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.shared.core.errors import SpecError, StoreError
-from photonfarm.shared.core.estimate import stated
+from photonfarm.shared.core.statistics import stated
 from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Store

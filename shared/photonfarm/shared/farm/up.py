@@ -15,17 +15,14 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol
 
-from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
-from photonfarm.shared.core.processes import free_port, tied
+from photonfarm.shared.core.processes import command, free_port, tied
 from photonfarm.shared.farm.devices import CPU
-from photonfarm.shared.farm.hold_out_check import check_hold_out, chosen_hold_out
 from photonfarm.shared.farm.redis_server import EmbeddedRedis
 from photonfarm.shared.farm.running_farm import WEB_PORT, announced
-from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now
-from photonfarm.shared.farm.submission import submit, top_up
+from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now, waits
+from photonfarm.shared.farm.submission import check_hold_out, chosen_hold_out, submit, top_up
 from photonfarm.shared.farm.training import RunFolder, TrainingProgress, check_run, hold_out_of
-from photonfarm.shared.farm.waits import waits
 from photonfarm.shared.plan.hold_out import HOLD_OUT
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp, spp_per_pass

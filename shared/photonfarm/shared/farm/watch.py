@@ -13,9 +13,8 @@ from pathlib import Path
 
 from photonfarm.shared.core.errors import StoreError
 from photonfarm.shared.farm.running_farm import RunningFarm, running_farm
-from photonfarm.shared.farm.status import NoQueue, StoreQueue, queue_now
+from photonfarm.shared.farm.status import NoQueue, StoreQueue, Wait, queue_now, waits
 from photonfarm.shared.farm.training import RunFolder, TrainingProgress
-from photonfarm.shared.farm.waits import Wait, waits
 from photonfarm.shared.queue import Activity, RenderArguments
 from photonfarm.shared.store import SceneStore, Store
 

@@ -17,15 +17,35 @@ from photonfarm.shared.queue.connection import (
     redis_errors,
     with_password_of,
 )
-from photonfarm.shared.queue.consumption import consumed_samples, report_consumed
-from photonfarm.shared.queue.failures import Failure, FailureCause, causes, repeating_command
+from photonfarm.shared.queue.failures import (
+    Failure,
+    FailureCause,
+    causes,
+    keep_failure,
+    keep_retry,
+    kept_failures,
+    repeating_command,
+    times_failed,
+)
 from photonfarm.shared.queue.job import QUEUE, TRIES, RenderArguments, is_job_name, job_name
-from photonfarm.shared.queue.kept_failures import keep_failure, keep_retry, kept_failures, times_failed
 from photonfarm.shared.queue.reconciliation import QUEUE_LIMIT, look, reconcile
-from photonfarm.shared.queue.served_store import SERVED, OtherStoreError, check_served, release, serve
+from photonfarm.shared.queue.rq_adapter import QueueStatus, queue_status
 from photonfarm.shared.queue.share import Share
-from photonfarm.shared.queue.status import QueueStatus, queue_status
-from photonfarm.shared.queue.workers import Activity, WorkerReport, beat, bury, read_workers, take_name
+from photonfarm.shared.queue.workers import (
+    SERVED,
+    Activity,
+    OtherStoreError,
+    WorkerReport,
+    beat,
+    bury,
+    check_served,
+    consumed_samples,
+    read_workers,
+    release,
+    report_consumed,
+    serve,
+    take_name,
+)
 
 __all__ = [
     "QUEUE",

@@ -15,8 +15,7 @@ from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.queue.connection import redis_errors
 from photonfarm.shared.queue.job import job_name
 from photonfarm.shared.queue.rq_adapter import add, fail_lost, forget_failures, open_queue
-from photonfarm.shared.queue.served_store import serve
-from photonfarm.shared.queue.workers import started
+from photonfarm.shared.queue.workers import serve, started
 from photonfarm.shared.store import SceneStore, Store
 
 QUEUE_LIMIT = 10_000

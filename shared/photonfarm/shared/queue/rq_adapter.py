@@ -7,7 +7,8 @@ keeps scenes loaded, and beats during a job, as RQ's SimpleWorker does not.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 
 from redis import Redis
 from redis.client import Pipeline
@@ -19,9 +20,10 @@ from rq.job_lifecycle import record_job_failure
 from rq.results import Result
 from rq.serializers import JSONSerializer
 
+from photonfarm.shared.queue.connection import redis_errors
 from photonfarm.shared.queue.failures import Failure, one_line
-from photonfarm.shared.queue.job import FUNCTION, QUEUE, TRIES, is_job_name, job_name
-from photonfarm.shared.queue.workers import as_text, started
+from photonfarm.shared.queue.job import FUNCTION, QUEUE, QUEUE_KEY, TRIES, is_job_name, job_name
+from photonfarm.shared.queue.workers import Activity, as_text, read_workers, started
 
 AT_ONCE = 500
 """The names of queued jobs in one request."""
@@ -184,3 +186,35 @@ def _unread(queue: Queue, name: str) -> Job:
     job = Job(name, connection=queue.connection, serializer=JSONSerializer)
     job.origin = QUEUE
     return job
+
+
+@dataclass(frozen=True, slots=True)
+class QueueStatus:
+    """The queue and the workers, as Redis has them."""
+
+    queued: int
+    running: int  # jobs whose workers are alive
+    workers: int  # alive; those of this machine only if their process is
+    failed: dict[str, Failure]  # those set aside, by job name
+    paused: Mapping[str, str] = field(default_factory=dict)  # by worker: why it takes no jobs
+    left: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # by scene id and worker: why it skips it
+    activities: Mapping[str, Activity] = field(default_factory=dict)  # by worker
+
+
+def queue_status(connection: Redis) -> QueueStatus:
+    """Jobs queued, running and failed, and workers; raises QueueError if Redis fails."""
+    with redis_errors("asked for its status"):
+        workers = read_workers(connection)
+        left: dict[str, dict[str, str]] = {}
+        for name, report in workers.items():
+            for scene_id, reason in report.left.items():
+                left.setdefault(scene_id, {})[name] = reason
+        return QueueStatus(
+            queued=connection.llen(QUEUE_KEY),
+            running=sum(started(connection).values()),
+            workers=len(workers),
+            failed=read_failures(open_queue(connection)),
+            paused={name: report.paused for name, report in workers.items() if report.paused},
+            left=left,
+            activities={name: report.doing for name, report in workers.items() if report.doing},
+        )

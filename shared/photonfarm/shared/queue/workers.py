@@ -2,6 +2,13 @@
 
 Redis drops a hash by its own clock unless it is written again. Beside RQ's fields it has one of ours, a JSON document;
 what it says is for people, and no decision depends on it but whether a name is taken.
+
+A Redis serves one store at a time, as its workers take any queued job: a worker for another store would drop the jobs
+that it does not know. So every process that queues or works registers its store, and is refused while another store is
+registered. A registration ends soon after the last worker.
+
+A trainer reports how many samples it has used, so that workers need not run far ahead. It does so repeatedly: a Redis
+that lost the number has it again within seconds.
 """
 
 from __future__ import annotations
@@ -9,7 +16,7 @@ from __future__ import annotations
 import json
 import os
 import socket
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from itertools import count
@@ -17,8 +24,11 @@ from itertools import count
 from redis import Redis
 from redis.client import Pipeline
 
+from photonfarm.shared.core.errors import QueueError
 from photonfarm.shared.core.processes import is_gone, process_space
+from photonfarm.shared.queue.connection import redis_errors
 from photonfarm.shared.queue.job import QUEUE, STARTED_KEY
+from photonfarm.shared.store import Store
 
 WORKER = "rq:worker:"
 ALL_WORKERS, WORKERS = "rq:workers", f"rq:workers:{QUEUE}"
@@ -131,3 +141,61 @@ def started(connection: Redis) -> dict[str, bool]:
         for entry in entries:
             pipeline.exists(f"rq:execution:{entry}")
         return dict(zip(entries, map(bool, pipeline.execute()), strict=True))
+
+
+SERVED = "rq:photonfarm:store"
+
+SERVED_TTL_S = 120
+"""How long a registration lasts unless it is renewed; workers renew it with every heartbeat."""
+
+
+class OtherStoreError(QueueError):
+    """A Redis serves another store than the caller's."""
+
+
+def serve(connection: Redis, store: Store) -> None:
+    """Register for a while that this Redis serves a store.
+
+    Raises OtherStoreError if it serves another, and QueueError if it fails.
+    """
+    with redis_errors("told which store it serves"):
+        if connection.set(SERVED, store.store_id, ex=SERVED_TTL_S, nx=True):
+            return
+    check_served(connection, store)
+    with redis_errors("told which store it serves"):
+        connection.set(SERVED, store.store_id, ex=SERVED_TTL_S)
+
+
+def check_served(connection: Redis, store: Store) -> None:
+    """Check that this Redis serves no other store; raises OtherStoreError if it does, QueueError if it fails."""
+    with redis_errors("asked which store it serves"):
+        other, left_ms = as_text(connection.get(SERVED) or b""), connection.pttl(SERVED)
+    if other and other != store.store_id:
+        raise OtherStoreError(
+            f"this Redis serves the store with the id {other}, and {store.storage.where} has the id {store.store_id}; "
+            "give the store that is meant (--store), or another database of Redis for this one (redis://host/1; with "
+            "`photonfarm up`, another --run). If nobody works with the other store any more, wait: this Redis is free "
+            f"by itself in {max(1, -(-left_ms // 1000))} s"
+        )
+
+
+def release(connection: Redis, store: Store) -> None:
+    """End the registration of a store when its last worker has ended. Raises redis.RedisError."""
+    if not read_workers(connection) and connection.get(SERVED) == store.store_id.encode():
+        connection.delete(SERVED)
+
+
+CONSUMED = "rq:photonfarm:consumed:"
+CONSUMED_TTL_S = 7 * 86400
+"""How long workers wait for a trainer that is down or has ended, as the ratio demands."""
+
+
+def report_consumed(connection: Redis, scene_id: str, samples: int) -> None:
+    """Report how many samples of a scene have been used, each counted once."""
+    connection.set(CONSUMED + scene_id, samples, ex=CONSUMED_TTL_S)
+
+
+def consumed_samples(connection: Redis, scene_ids: Sequence[str]) -> dict[str, int]:
+    """How many samples of each of these scenes its trainer has used, by its last report; 0 without one."""
+    counts = connection.mget([CONSUMED + scene_id for scene_id in scene_ids]) if scene_ids else []
+    return {scene_id: int(samples or 0) for scene_id, samples in zip(scene_ids, counts, strict=True)}

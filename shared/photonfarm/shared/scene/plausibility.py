@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from photonfarm.shared.scene.spec import Box, SceneSpec
-from photonfarm.shared.scene.spec_lines import SpecLines
-from photonfarm.shared.scene.spec_loading import NamedSpec
+from photonfarm.shared.scene.spec_loading import NamedSpec, SpecLines
 
 USUAL_FOV = (10.0, 130.0)
 """Fields of view between which nothing is said, in degrees."""

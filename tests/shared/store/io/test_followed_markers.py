@@ -12,7 +12,7 @@ import store_samples as samples
 from obstore.store import from_url
 
 from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.format.followed_markers import WHOLE_S, FollowedMarkers
+from photonfarm.shared.store.format.markers import WHOLE_S, FollowedMarkers
 from photonfarm.shared.store.io.local import LocalStorage
 from photonfarm.shared.store.io.objects import ObjectStorage
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from photonfarm.shared.cli.main import umbrella
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.estimate import clean_error
+from photonfarm.shared.core.statistics import clean_error
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import SceneReader, SceneStore, Store

@@ -9,7 +9,7 @@ import zarr
 
 from photonfarm.shared.core.errors import CorruptError
 from photonfarm.shared.store import SceneStore
-from photonfarm.shared.store.format import vectors
+from photonfarm.shared.store.format import schema
 
 scene = samples.scene
 TURN = {"name": "turn", "unit": "degrees", "rest": 0.0, "zero": "as modelled"}
@@ -31,8 +31,8 @@ def test_a_plan_describes_its_vectors(scene: SceneStore) -> None:
 
 def test_a_plan_that_lacks_a_field_has_it_at_rest(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
     before = scene.plans()[0].rows.modification
-    fields = (*vectors.FIELDS["modification"], TURN, POWER)
-    monkeypatch.setitem(vectors.FIELDS, "modification", fields)
+    fields = (*schema.FIELDS["modification"], TURN, POWER)
+    monkeypatch.setitem(schema.FIELDS, "modification", fields)
     after = SceneStore(scene.storage, scene.scene_id).plans()[0].rows.modification
     np.testing.assert_array_equal(after[..., :4], before)
     unused = np.isnan(before[..., 0])
@@ -41,9 +41,9 @@ def test_a_plan_that_lacks_a_field_has_it_at_rest(scene: SceneStore, monkeypatch
 
 
 def test_columns_are_found_by_name_in_any_order() -> None:
-    known: Any = vectors.FIELDS["modification"]
+    known: Any = schema.FIELDS["modification"]
     values = np.arange(8, dtype=np.float32).reshape(1, 2, 4)
-    np.testing.assert_array_equal(vectors.by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values)
+    np.testing.assert_array_equal(schema.by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values)
 
 
 def test_a_field_of_a_newer_program_is_refused(scene: SceneStore) -> None:

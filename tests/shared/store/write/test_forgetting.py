@@ -19,13 +19,13 @@ from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.read import reader as reading
-from photonfarm.shared.store.write.forgetting import forget
+from photonfarm.shared.store.write.withdrawal import forget
 
 FORGET = """
 import os, signal, sys
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.write.forgetting import forget
+from photonfarm.shared.store.write.withdrawal import forget
 left = int(sys.argv[3])
 for name in ("delete", "delete_folder", "adopt"):
     def dying(*args, plain=getattr(LocalStorage, name), **options):

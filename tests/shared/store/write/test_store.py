@@ -13,7 +13,7 @@ from photonfarm.shared.core.errors import IncompleteError, StoreError
 from photonfarm.shared.core.records import ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES, rounded
+from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
 
 scene, reader_of = samples.scene, samples.reader_of
 

@@ -17,7 +17,7 @@ from photonfarm.shared.core.records import LIT_POINTS, arrays_of
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.spec import Emitters, GuideSpec
 from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
-from photonfarm.shared.store.format import declarations, markers, schema, vectors
+from photonfarm.shared.store.format import declarations, markers, schema
 from photonfarm.shared.store.io.local import LocalStorage
 
 DOCUMENT = Path(__file__).parents[4] / "docs/store-format.md"
@@ -88,8 +88,8 @@ def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) ->
         attributes = dict(about["attributes"])
         exponent = attributes.pop("radiance_exponent", None)
         assert (exponent is not None) == array.name.startswith("radiance")
-        if array.name in vectors.FIELDS:
-            assert attributes.pop("fields") == list(vectors.FIELDS[array.name])
+        if array.name in schema.FIELDS:
+            assert attributes.pop("fields") == list(schema.FIELDS[array.name])
         assert attributes.pop("groups", None) == (["object"] if array.name == "modification" else None)
         assert attributes == {"unit": array.unit, "convention": array.convention}
         assert about["data_type"] == np.dtype(array.dtype).name

@@ -15,7 +15,7 @@ from photonfarm.shared.plan.request import Request
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.store import SceneStore, Store
 from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.format import withdrawn
+from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.write.lease import at_work
 from photonfarm.shared.store.write.status import scene_status
 from photonfarm.shared.store.write.withdrawal import withdraw
@@ -149,7 +149,7 @@ def test_processes_that_follow_see_each_withdrawal_of_a_plan(scene: SceneStore) 
     reader, other = samples.reader_of(scene), fresh(scene)
     other.plans()
     for jobs in ({1}, {1, 3}, {3}):
-        withdrawn.write(scene.storage, f"{scene.name}/plans/000000", jobs)
+        markers.write_withdrawn(scene.storage, f"{scene.name}/plans/000000", jobs)
         reader.refresh()
         assert reader.planned == 8 - 2 * len(jobs)
         assert other.missing_jobs() == sorted({1, 3} - jobs)

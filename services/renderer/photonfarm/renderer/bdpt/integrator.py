@@ -10,12 +10,10 @@ import drjit as dr
 import mitsuba as mi
 
 from photonfarm.renderer.bdpt import randomness
-from photonfarm.renderer.bdpt.camera import check_sensor, primary_rays
+from photonfarm.renderer.bdpt.camera import ImageStack, Splat, Sums, check_sensor, primary_rays
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
-from photonfarm.renderer.bdpt.film import ImageStack, Splat, Sums
-from photonfarm.renderer.bdpt.guiding.grid import Grid
+from photonfarm.renderer.bdpt.guiding.grid import Grid, SparseLanes
 from photonfarm.renderer.bdpt.guiding.learning import Effort, LightGuide, learned
-from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally, Totals
 from photonfarm.renderer.bdpt.guiding.usefulness import SIDE, Usefulness

@@ -4,7 +4,7 @@ A connection reads all of a vertex, so one record is a few cache lines where col
 The surface is kept as it was found. To find it again would take longer than to read it.
 
 Connections find the vertices in slots, as many as there are paths, in which paths were drawn in proportion to their
-weights (see `resampling`). So none goes to a path that left the scene.
+weights (see `recording`). So none goes to a path that left the scene.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.resampling import resampled
+from photonfarm.renderer.bdpt.recording import resampled
 
 Record: TypeAlias = "tuple[mi.Vector4f, ...]"
 """What is read and written at once."""

@@ -22,8 +22,7 @@ import drjit as dr
 import mitsuba as mi
 
 from photonfarm.renderer.bdpt import weights
-from photonfarm.renderer.bdpt.camera import sample_sensor
-from photonfarm.renderer.bdpt.film import Splat
+from photonfarm.renderer.bdpt.camera import Splat, sample_sensor
 from photonfarm.renderer.bdpt.guiding.tally import TalliedSplat
 from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, Record, empty_record

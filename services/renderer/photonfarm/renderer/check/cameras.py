@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.arrays import floats, points
-from photonfarm.renderer.scene.gbuffer import reflects_here
+from photonfarm.renderer.scene.gbuffer import reflects_here, sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import LEAVING, NONE
-from photonfarm.renderer.scene.visibility import sight_shares
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.scene.spec import Film, SceneSpec
 from photonfarm.shared.scene.view import Camera, View

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.check.orthographic import Projection, whole
-from photonfarm.renderer.check.placements import Placed, group_vertices
+from photonfarm.renderer.check.shapes import Placed, group_vertices
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32, Geometry
 from photonfarm.shared.scene.spec import Box, SceneSpec

@@ -17,9 +17,8 @@ from photonfarm.renderer.check.scene_check import SceneCheck
 from photonfarm.renderer.check.shapes import ShapeFacts
 from photonfarm.renderer.measure.exposure import TARGET
 from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.pages import rendered
-from photonfarm.shared.core.pictures import Picture, display_values
-from photonfarm.shared.scene.spec_lines import SpecLines
+from photonfarm.shared.core.pictures import Picture, display_values, rendered
+from photonfarm.shared.scene.spec_loading import SpecLines
 
 TEMPLATE = Path(__file__).with_name("check.html.j2")
 

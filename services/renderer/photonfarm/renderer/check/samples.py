@@ -16,8 +16,7 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.pictures import Picture, display
 from photonfarm.shared.core.records import BasePointCloud
 from photonfarm.shared.core.waiting import Steps, WorkLog
-from photonfarm.shared.scene.modification import Modification, sample_modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import Modification, rebuild, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
 

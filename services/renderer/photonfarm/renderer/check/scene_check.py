@@ -10,8 +10,7 @@ import numpy as np
 from photonfarm.renderer.check import drawings, samples, shape_pictures
 from photonfarm.renderer.check.drawings import Drawing
 from photonfarm.renderer.check.findings import Finding, Measured, findings
-from photonfarm.renderer.check.placements import placements
-from photonfarm.renderer.check.shapes import ShapeFacts, facts_of, groups_by_shape
+from photonfarm.renderer.check.shapes import ShapeFacts, facts_of, groups_by_shape, placements
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.pictures import Picture
 from photonfarm.shared.core.records import F32

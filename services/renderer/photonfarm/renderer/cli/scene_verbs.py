@@ -68,8 +68,7 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
         raise click.BadParameter(f"{str(out)!r}: it is a page; name it like check.html", param_hint="--out")
     from photonfarm.renderer.scene import backend
     from photonfarm.shared.cli import show
-    from photonfarm.shared.scene.spec_lines import SpecLines
-    from photonfarm.shared.scene.spec_loading import NamedSpec
+    from photonfarm.shared.scene.spec_loading import NamedSpec, SpecLines
 
     named = NamedSpec.load(spec)
     backend.load()

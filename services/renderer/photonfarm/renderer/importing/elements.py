@@ -1,12 +1,20 @@
-"""Elements of Mitsuba's XML, made of values and read."""
+"""Elements of Mitsuba's XML, made of values and read.
+
+Spots that fade as a profile says are made here too: Mitsuba has them by an image on a cone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
-from photonfarm.shared.scene.located_xml import Located, line_of
+import numpy as np
+
+from photonfarm.renderer.importing import images
+from photonfarm.renderer.importing.meshes import Floats
+from photonfarm.shared.scene.files import Located, line_of
 
 
 def scene() -> Element:
@@ -107,3 +115,24 @@ def copied(node: Element) -> Element:
 def write(root: Element, file: Path) -> None:
     """Write a document."""
     file.write_text(text(root), encoding="utf-8")
+
+
+Profile = Callable[[Floats, Floats], Floats]
+"""The share of a spot's intensity at tangents (x, y) off its axis."""
+
+WIDEST = math.radians(89.5)
+"""The widest half angle of a spot, whose image is flat."""
+
+
+def cone_image(profile: Profile, cut: float, file: Path) -> Path:
+    """The image of a spot within an angle; `profile`: its share at tangents (x, y) off the axis."""
+    texels = 1024 if cut < math.radians(80) else 2048  # as tangents are large there
+    y, x = np.meshgrid(*[math.tan(cut) * (2 * (np.arange(texels) + 0.5) / texels - 1)] * 2, indexing="ij")
+    return images.save(profile(x, y).astype(np.float32), file)
+
+
+def put_cone(spot: Element, cut: float, file: Path) -> None:
+    """Let a spot end at an angle and fade as an image says."""
+    put_value(spot, "cutoff_angle", math.degrees(cut))
+    put_value(spot, "beam_width", math.degrees(cut) * 0.999)
+    put_value(put_bitmap(spot, "texture", file, raw=True), "wrap_mode", "clamp")

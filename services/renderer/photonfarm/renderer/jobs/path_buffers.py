@@ -20,10 +20,8 @@ from photonfarm.shared.core.errors import IncompleteError
 from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import BasePointCloud, Guides, arrays_of
 from photonfarm.shared.farm.configuration import named_configuration
-from photonfarm.shared.scene.camera_path import CameraPath, kept_clear, orbit
-from photonfarm.shared.scene.frames import Frames
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.camera_path import CameraPath, Frames, kept_clear, orbit
+from photonfarm.shared.scene.modification import Modification, rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import Store

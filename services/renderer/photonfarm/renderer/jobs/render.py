@@ -13,15 +13,15 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.jobs.estimates import Estimator, halves_of, photons_of
-from photonfarm.renderer.jobs.other_halves import OtherHalves
 from photonfarm.renderer.scene import backend
-from photonfarm.shared.core.errors import IncompleteError, QueueError, SceneNotHereError, SpecError
+from photonfarm.shared.core.errors import CorruptError, IncompleteError, QueueError, SceneNotHereError, SpecError
 from photonfarm.shared.core.keys import Key, view_key
 from photonfarm.shared.core.records import (
     F32,
@@ -34,12 +34,11 @@ from photonfarm.shared.core.records import (
     Visibility,
     arrays_of,
 )
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import Modification, rebuild
 from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
 from photonfarm.shared.scene.spec_loading import parse_spec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore, Store
+from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
 from photonfarm.shared.store.write.lease import at_work
 
 SCENES_KEPT = 2
@@ -355,3 +354,35 @@ def _check_finite(arrays: Mapping[str, NDArray[np.generic]], sample: SampleRow) 
         if not np.isfinite(values.astype(np.float32)).all():
             what = f"view {sample.view_row} (sample {sample.key.hex()})"
             raise IncompleteError(f"{name} of {what} came out non-finite")
+
+
+class OtherHalves:
+    """The complete samples of a scene with the same radiance id, by their content keys.
+
+    What is damaged there, or gone meanwhile, is not found, and so it is rendered.
+    """
+
+    def __init__(self, store: str | Path, scene_id: str) -> None:
+        """Take the scene; `refresh` looks what is complete."""
+        self._scene_id, self._reader = scene_id, SceneReader(store, scene_id)
+        self._rows: dict[Key, int] = {}
+
+    def refresh(self) -> None:
+        """Look what is complete now."""
+        try:
+            if len(self._reader.refresh()):
+                self._rows = self._reader.rows_by_key()
+        except (CorruptError, IncompleteError) as error:
+            self._rows = {}
+            log.warning("no halves are taken over from scene %s: %s", self._scene_id, error)
+
+    def find(self, key: Key) -> F32 | None:
+        """The halves of a sample, (2, H, W, 3) linear, unscaled, every byte checked; None if they are not there."""
+        row = self._rows.get(key)
+        if row is None:
+            return None
+        try:
+            return self._reader.read_radiance(row)
+        except (CorruptError, IncompleteError) as error:
+            log.warning("halves of sample %s are rendered: %s", key.hex(), error)
+            return None

@@ -15,10 +15,9 @@ from photonfarm.renderer.jobs.estimates import halves_of
 from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
 from photonfarm.renderer.scene import backend
 from photonfarm.shared.core import pictures
-from photonfarm.shared.core.archives import write_arrays
 from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
 from photonfarm.shared.core.exr import write_layers
-from photonfarm.shared.core.files import whole_file
+from photonfarm.shared.core.files import whole_file, write_arrays
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import block_z_test
@@ -30,10 +29,8 @@ from photonfarm.shared.scene.spec_loading import scene_folder
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store import SceneReader, SceneStore, Store
 from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.read.find import is_spec_file, scene_or_spec
-from photonfarm.shared.store.read.query import Query
-from photonfarm.shared.store.read.scene_match import SceneMatch
-from photonfarm.shared.store.write.rounding import as_stored
+from photonfarm.shared.store.format.shards import as_stored
+from photonfarm.shared.store.read.find import Query, SceneMatch, is_spec_file, scene_or_spec
 
 SUFFIXES = (".npz", ".exr", ".png")
 """The kinds of files that a pass is written as."""

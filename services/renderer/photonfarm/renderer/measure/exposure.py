@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.estimate import Estimate
 from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.statistics import Estimate
 from photonfarm.shared.core.waiting import Steps, WorkLog
 from photonfarm.shared.scene.modification import sample_modification
 from photonfarm.shared.scene.spec import Film, SceneSpec

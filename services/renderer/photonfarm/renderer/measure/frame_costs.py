@@ -1,6 +1,17 @@
 """`photonfarm measure-frames`: the cost of the parts of one frame on this machine, and the surfaces in its pixels.
 
 A part is timed on the wall clock until its result is in numpy's memory, in a process whose thread pool is one thread.
+
+*Images of 1/k of the pixels* tell the cost of rendering only the pixels that a method keeps. They stand for some pixels
+of the whole image: the same field of view on a smaller film, with as many light paths as the whole image has, since
+their splats cannot be limited to some of its pixels. The integrator allows 64 light paths per eye path at most, so that
+the cost of an image that would need more is too low. Sides are rounded to whole pixels, so that the image may have a
+few more or fewer than 1/k.
+
+*The kind of the first surface* at each pixel's centre goes by the lobes that its BSDF has. Flags describe a whole BSDF
+and not a point on it: a blend or a `principled` whose glossy part is textured away somewhere is glossy there too, and a
+two-sided surface has the lobes of both sides. A null lobe, which masks have beside the lobes of what they mask, lets
+light pass unchanged, and does not count as a coat.
 """
 
 from __future__ import annotations
@@ -10,27 +21,79 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import cycle, islice
+from math import sqrt
 from pathlib import Path
 from typing import Any, TypeVar
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, located
-from photonfarm.renderer.measure.partial_film import PartialFilm
-from photonfarm.renderer.measure.surfaces import surface_kinds
-from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.gbuffer import first_surfaces
+from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
+from photonfarm.renderer.scene.loading import AimedSensor
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.frame_costs import PARTS, FrameCosts
+from photonfarm.shared.core.files import PARTS, FrameCosts, Surface
 from photonfarm.shared.core.keys import Key, view_key
-from photonfarm.shared.core.records import BasePointCloud, Guides, arrays_of
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.pointcloud import rebuild
-from photonfarm.shared.scene.view import View
+from photonfarm.shared.core.records import F32, BasePointCloud, Guides, arrays_of
+from photonfarm.shared.scene.modification import Modification, rebuild, rest
+from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.shared.scene.view import Camera, View
 from photonfarm.shared.store import SceneReader, Store
 from photonfarm.shared.store.read.find import scene_named
+
+
+def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:
+    """The kind of surface at each pixel's centre, (H, W) of `Surface`, between the view's clipping planes."""
+    camera = Camera.of(view, spec)
+    si = first_surfaces(scene, camera, camera.rays(), spec)
+    kind = dr.select(si.shape.is_emitter(), mi.UInt32(Surface.EMITTER), _by_lobes(si.bsdf().flags()))
+    found = np.array(dr.select(si.is_valid(), kind, int(Surface.NOTHING)))
+    return found.astype(np.uint8).reshape(camera.height, camera.width)
+
+
+def _by_lobes(flags: Any) -> Any:
+    """The kind DIFFUSE, SPECULAR or MIRROR (UInt32), by a BSDF's flags."""
+    diffuse = mi.has_flag(flags, mi.BSDFFlags.Diffuse)
+    glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy)
+    delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+    specular = glossy | (diffuse & delta)
+    unmixed = dr.select(diffuse, mi.UInt32(Surface.DIFFUSE), mi.UInt32(Surface.MIRROR))
+    return dr.select(specular, mi.UInt32(Surface.SPECULAR), unmixed)
+
+
+MOST_LIGHT_PATHS = 64.0
+"""The most light paths per eye path that the integrator allows."""
+
+
+class PartialFilm:
+    """About 1/k of the pixels of a spec's film, and their integrator; k = 1 gives the spec's own images."""
+
+    def __init__(self, spec: SceneSpec, k: int) -> None:
+        self.spec = part_of(spec, k)
+        self._sensor = AimedSensor(self.spec)
+        self._integrator = integrator_of(self.spec.transport)
+
+    def render(self, scene: Any, view: View, seed: int) -> F32:
+        """One half-estimate of linear radiance of a Mitsuba scene, (h, w, 3)."""
+        half_spp = self.spec.transport.half_spp
+        images = self._integrator.render_seeds(scene, self._sensor.aim(view), (seed,), half_spp)
+        return np.array(images, np.float32)[0]
+
+
+def part_of(spec: SceneSpec, k: int) -> SceneSpec:
+    """The spec with about 1/k of the pixels, in about the same proportions, and as many light paths in all."""
+    pixels = spec.film.width * spec.film.height
+    height = max(1, round(spec.film.height / sqrt(k)))
+    width = max(1, round(pixels / (k * height)))
+    light_ratio = min(spec.transport.light_ratio * pixels / (width * height), MOST_LIGHT_PATHS)
+    film = spec.film.model_copy(update={"width": width, "height": height})  # sides need not be divisible by 8
+    transport = spec.transport.model_copy(update={"light_ratio": light_ratio})
+    return spec.model_copy(update={"film": film, "transport": transport})
+
 
 WARM_UPS = 2
 """The untimed first frames: the first compiles kernels, the second is the first to replay recorded launches."""

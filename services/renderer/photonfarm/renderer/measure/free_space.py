@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.renderer.scene.gbuffer import sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE
-from photonfarm.renderer.scene.visibility import sight_shares
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.waiting import Log

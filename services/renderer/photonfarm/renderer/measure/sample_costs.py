@@ -31,8 +31,7 @@ from photonfarm.shared.core.keys import view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Photons
 from photonfarm.shared.core.waiting import Log, Steps, WorkLog
 from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
-from photonfarm.shared.scene.modification import Modification, sample_modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import Modification, rebuild, sample_modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, sample_view
 

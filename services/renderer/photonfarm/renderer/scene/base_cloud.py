@@ -15,7 +15,7 @@ from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
 from photonfarm.renderer.scene.tessellation import SECTIONS, triangles_of
 from photonfarm.shared.core.keys import Stream, make_key
 from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry
-from photonfarm.shared.scene.pointcloud import sample_surface
+from photonfarm.shared.scene.modification import sample_surface
 
 
 def geometry_of(shapes: list[Any], group_of: Mapping[str, int], sections: int = SECTIONS) -> Geometry:

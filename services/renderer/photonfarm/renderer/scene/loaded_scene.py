@@ -38,8 +38,8 @@ class LoadedScene:
         from photonfarm.renderer.bdpt.recording import Recorder
         from photonfarm.renderer.scene import gbuffer, guides
         from photonfarm.renderer.scene.editing import MovableGroup
+        from photonfarm.renderer.scene.loading import AimedSensor
         from photonfarm.renderer.scene.materials import Materials
-        from photonfarm.renderer.scene.sensor import AimedSensor
         from photonfarm.renderer.scene.start_guides import SceneGuides
         from photonfarm.renderer.scene.surroundings import boxes_of
 
@@ -172,7 +172,7 @@ class LoadedScene:
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether the view sees points (N, 3) of the present configuration, (N,)."""
-        from photonfarm.renderer.scene.visibility import seen_points
+        from photonfarm.renderer.scene.gbuffer import seen_points
 
         return seen_points(self.scene, view, self.spec, position)
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from photonfarm.renderer.bdpt.guiding.learning import Effort
-from photonfarm.renderer.scene.sensor import AimedSensor
+from photonfarm.renderer.scene.loading import AimedSensor
 from photonfarm.shared.core.keys import seed_of
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec

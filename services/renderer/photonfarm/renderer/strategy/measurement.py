@@ -17,7 +17,7 @@ from pydantic import ValidationError
 from photonfarm.renderer.jobs.render import versions
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
-from photonfarm.renderer.scene.sensor import AimedSensor
+from photonfarm.renderer.scene.loading import AimedSensor
 from photonfarm.renderer.strategy import content, pilot
 from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, RANGE, Budget, ImageCost, affordable, time_images
 from photonfarm.renderer.strategy.candidates import DEFAULT, GRID, PLAIN, Candidate, RelativeErrors, Render, present

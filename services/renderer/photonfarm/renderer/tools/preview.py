@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from photonfarm.renderer.tools.plan_view import PlanView, hue
 from photonfarm.shared.core import pictures
 from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.pages import rendered
-from photonfarm.shared.core.pictures import Picture
+from photonfarm.shared.core.pictures import Picture, rendered
 from photonfarm.shared.core.records import Geometry, Photons
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec

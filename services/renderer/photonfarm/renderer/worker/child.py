@@ -14,8 +14,7 @@ import redis
 
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.heartbeat import deadline
-from photonfarm.renderer.worker.log import WorkerLog
-from photonfarm.renderer.worker.outcomes import Outcomes, is_complete, missing_jobs, send_line
+from photonfarm.renderer.worker.outcomes import Outcomes, WorkerLog, is_complete, missing_jobs, send_line
 from photonfarm.renderer.worker.queue_source import QueueSource
 from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, REFUSED, WorkerSettings
 from photonfarm.renderer.worker.share_source import ShareSource

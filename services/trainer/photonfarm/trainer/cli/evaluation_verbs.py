@@ -103,7 +103,7 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
-    from photonfarm.trainer.cli.show_progress import measuring_progress
+    from photonfarm.trainer.cli.show import measuring_progress
 
     with measuring_progress() as on_progress:
         found = compare(store, loaded, on_progress=on_progress, **how)
@@ -126,7 +126,7 @@ def report(
     from the scene to the image; with references, the worst cases of the first run are found and shown.
     """
     how = _how(**asked)
-    from photonfarm.trainer.cli.show_progress import measuring_progress
+    from photonfarm.trainer.cli.show import measuring_progress
     from photonfarm.trainer.report import write_report
 
     with measuring_progress() as on_progress:
@@ -167,8 +167,7 @@ def infer(
 
     The views of a path are in no store: the renderer makes their buffers, where it is installed, or a file has them.
     """
-    from photonfarm.shared.scene.camera_path import CameraPath
-    from photonfarm.shared.scene.frames import Frames
+    from photonfarm.shared.scene.camera_path import CameraPath, Frames
     from photonfarm.trainer.predict import infer as shows
     from photonfarm.trainer.predict.trained import TrainedRun
 

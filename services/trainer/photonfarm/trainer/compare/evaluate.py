@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
-from photonfarm.shared.core.estimate import Estimate, group_means
-from photonfarm.shared.core.frame_costs import Seconds
+from photonfarm.shared.core.files import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.statistics import Estimate, group_means
 from photonfarm.shared.store import SceneReader
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
@@ -45,8 +45,7 @@ from photonfarm.trainer.predict.evaluation import (
     by_turns,
     measure,
 )
-from photonfarm.trainer.predict.ready import ReadyPredictor
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.device import described, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 

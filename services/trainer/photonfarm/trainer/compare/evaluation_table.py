@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.core.statistics import Estimate
+from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import References
-from photonfarm.trainer.compare.markdown import markdown_table
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS

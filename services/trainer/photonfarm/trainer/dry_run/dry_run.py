@@ -11,12 +11,10 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch, size_bytes
-from photonfarm.trainer.dry_run.live_memory import LiveMemory
-from photonfarm.trainer.dry_run.made_up import MadeUpScene
+from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
 from photonfarm.trainer.runs.device import described, usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.compiled import compiling
-from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.learner import Learner, compiling
 
 TIMED_STEPS = 3
 SECONDS = 20.0

@@ -1,15 +1,26 @@
 """The quality of images: the columns of the paper's tables, and further ones of ours [supplement 4]."""
 
-from photonfarm.trainer.metrics.feature_l1 import HEADLINE_BLOCK, feature_l1
 from photonfarm.trainer.metrics.fid import Fid, fid, kid
-from photonfarm.trainer.metrics.flip import flip
-from photonfarm.trainer.metrics.image_metrics import ImageMetrics, image_metrics, reference_features
-from photonfarm.trainer.metrics.inception import Features, FIDInceptionV3, Inception, load_inception
-from photonfarm.trainer.metrics.inception_weights import InceptionWeights, find_weights
+from photonfarm.trainer.metrics.image_metrics import (
+    HEADLINE_BLOCK,
+    ImageMetrics,
+    feature_l1,
+    flip,
+    image_metrics,
+    metric_space,
+    mse,
+    mssim,
+    reference_features,
+)
+from photonfarm.trainer.metrics.inception import (
+    Features,
+    FIDInceptionV3,
+    Inception,
+    InceptionWeights,
+    find_weights,
+    load_inception,
+)
 from photonfarm.trainer.metrics.intervals import PerImage, confidence_interval
-from photonfarm.trainer.metrics.metric_space import metric_space
-from photonfarm.trainer.metrics.mse import mse
-from photonfarm.trainer.metrics.mssim import mssim
 
 __all__ = [
     "HEADLINE_BLOCK",

@@ -1,29 +1,146 @@
-"""A row of the tables: all metrics of one predictor's images against their references [supplement 4, Tables 1 and 2].
+"""The metrics of one predictor's images against their references: a row of the tables [supplement 4, Tables 1 and 2].
 
-Shape letters: N images, H W image.
+Images are given as exposed linear radiance (radiance × the scene's fixed exposure) and compared in the metric space:
+the values that a display would show [method §4, ours]. MSSIM: Wang et al., Image quality assessment, 2004. FLIP, how
+strongly a viewer who flips between two images sees them differ: Andersson et al., 2020. Feature L1: the distance of two
+images in the averaged features of an Inception block [supplement Fig. 5].
+
+Shape letters: N images, H W image, C channels or features.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from photonfarm.shared.core.estimate import Estimate
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.core.records import F32
-from photonfarm.trainer.metrics.feature_l1 import HEADLINE_BLOCK, feature_l1
+from photonfarm.shared.core.statistics import Estimate
 from photonfarm.trainer.metrics.fid import FEWEST, Fid, fid, kid
-from photonfarm.trainer.metrics.flip import flip
-from photonfarm.trainer.metrics.inception import Features, Inception
-from photonfarm.trainer.metrics.inception_weights import InceptionWeights
+from photonfarm.trainer.metrics.inception import Features, Inception, InceptionWeights
 from photonfarm.trainer.metrics.intervals import PerImage
-from photonfarm.trainer.metrics.metric_space import check_pairs, metric_space
-from photonfarm.trainer.metrics.mse import mse
-from photonfarm.trainer.metrics.mssim import mssim
+
+
+def metric_space(exposed: F32 | Tensor) -> Tensor:
+    """clip(I, 0, 1)^(1/2.2) of exposed linear radiance, (N, H, W, 3) → float32 of the same shape in [0, 1].
+
+    The exposure is fixed per scene: one derived from an image would hide errors of brightness. Infinite values become
+    white. Raises ValueError for another shape, SpecError for values that are not numbers.
+    """
+    if isinstance(exposed, Tensor):
+        exposed = exposed.detach().float().cpu().numpy()
+    images = np.asarray(exposed, np.float32)
+    if images.ndim != 4 or images.shape[-1] != 3:
+        raise ValueError(f"images have the shape {images.shape}; metrics are taken of (N, H, W, 3)")
+    if len(spoilt := np.flatnonzero(np.isnan(images).any(axis=(1, 2, 3)))):
+        raise SpecError(
+            f"image {int(spoilt[0])} of {len(images)} holds values that are not numbers, so it has no error; "
+            "a network that gives them has diverged: take an earlier checkpoint"
+        )
+    return torch.from_numpy(display_values(images))
+
+
+def check_pairs(predictions: Tensor, references: Tensor) -> None:
+    """Raise ValueError unless both are as many images of the same size, one reference per prediction."""
+    if predictions.shape != references.shape:
+        raise ValueError(
+            f"predictions have the shape {tuple(predictions.shape)} and references {tuple(references.shape)}; "
+            "each prediction is compared with the reference of its own view"
+        )
+
+
+HEADLINE_BLOCK = 3
+"""The block of the tables' column; Fig. 5 shows all four."""
+
+
+def feature_l1(predictions: Features, references: Features) -> tuple[NDArray[np.float64], ...]:
+    """Mean |f − g| over the C spatially averaged features of each pair of images: (N,) for each of the four blocks."""
+    return tuple(
+        np.abs(f.astype(np.float64) - g).mean(axis=1)
+        for f, g in zip(predictions.blocks, references.blocks, strict=True)
+    )
+
+
+def flip(predictions: Tensor, references: Tensor) -> NDArray[np.float64]:
+    """Mean FLIP (low dynamic range) of each pair of display images, 2 × (N, H, W, 3) → (N,); 0 is equality, 1 the most.
+
+    The authors' package computes it for its default viewer: 67 pixels per degree. It takes display values as sRGB.
+    """
+    from flip_evaluator import evaluate  # type: ignore[import-untyped]
+
+    check_pairs(predictions, references)
+    pairs = zip(predictions.float().cpu().numpy(), references.float().cpu().numpy(), strict=True)
+    return np.array(
+        [evaluate(reference, image, "LDR", applyMagma=False, parameters={})[1] for image, reference in pairs],
+        np.float64,
+    )
+
+
+WINDOW = 11  # pixels
+SIGMA = 1.5  # pixels
+C1, C2 = 0.01**2, 0.03**2  # (K · data range)², the data range being 1
+
+
+def mssim(predictions: Tensor, references: Tensor) -> NDArray[np.float64]:
+    """SSIM of each pair of display images averaged over windows and channels, 2 × (N, H, W, 3) → (N,).
+
+    Windows are 11×11 Gaussians of σ 1.5 that lie in the image whole; variances are those of the population; colour
+    channels are compared one by one. 1 is equality. Raises ValueError for images smaller than a window.
+    """
+    check_pairs(predictions, references)
+    if min(predictions.shape[1:3]) < WINDOW:
+        size = "×".join(map(str, predictions.shape[1:3]))
+        raise ValueError(f"images are {size} pixels; MSSIM needs at least {WINDOW}×{WINDOW}, the size of its window")
+    x, y = (images.movedim(-1, 1).double() for images in (predictions, references))
+    mean_x, mean_y, square_x, square_y, product = (_blurred(image) for image in (x, y, x * x, y * y, x * y))
+    variance_x, variance_y, covariance = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y
+    luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
+    structure = (2 * covariance + C2) / (variance_x + variance_y + C2)  # and contrast: C3 = C2 / 2
+    similarity: NDArray[np.float64] = (luminance * structure).mean((1, 2, 3)).cpu().numpy()
+    return similarity
+
+
+def _blurred(images: Tensor) -> Tensor:
+    """Gaussian means over whole windows: (N, C, H, W) → (N, C, H − 10, W − 10).
+
+    Rows, then columns, as sums of shifted images: a seventh of the time of float64 convolutions on a CPU.
+    """
+    weight = [math.exp(-((i - WINDOW // 2) ** 2) / (2 * SIGMA**2)) for i in range(WINDOW)]
+    for axis in (2, 3):
+        room = images.shape[axis] - WINDOW + 1
+        blurred = torch.zeros_like(images.narrow(axis, 0, room))
+        for i, w in enumerate(weight):
+            blurred.add_(images.narrow(axis, i, room), alpha=w / sum(weight))
+        images = blurred
+    return images
+
+
+def mse(
+    predictions: Tensor, references: Tensor, other_halves: Tensor | None = None, *, having_seen_a: bool = False
+) -> NDArray[np.float64]:
+    """Mean squared difference of each pair of display images, 2 × (N, H, W, 3) → (N,) [supplement 4].
+
+    With references in two independent halves it is mean (f − A)(f − B), whose noise averages to nothing; the remaining
+    bias is the shift of their noise by the display's curve, of second order. It may be negative below the noise. For
+    predictions that depend on a part of A it is mean f² − 2fB + AB, as in `clean_error_having_seen_a`. Raises
+    ValueError for shapes that do not match.
+    """
+    halves = references, references if other_halves is None else other_halves
+    for half in halves:
+        check_pairs(predictions, half)
+    f, a, b = (images.double() for images in (predictions, *halves))
+    product = f * (f - 2 * b) + a * b if having_seen_a else (f - a) * (f - b)
+    errors: NDArray[np.float64] = product.mean((1, 2, 3)).cpu().numpy()
+    return errors
+
 
 CHUNK = 8  # images at a time
 TITLES = {

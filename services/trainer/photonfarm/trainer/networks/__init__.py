@@ -11,9 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.trainer.networks.cnn import Cnn
-from photonfarm.trainer.networks.denoiser import Denoiser
-from photonfarm.trainer.networks.feature_projection import FeatureProjection
+from photonfarm.trainer.networks.baselines import Cnn, Denoiser, FeatureProjection
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.guided import Guided
 from photonfarm.trainer.networks.inputs import Inputs, Needs

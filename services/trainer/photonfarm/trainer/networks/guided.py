@@ -18,8 +18,7 @@ from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, given
 from photonfarm.trainer.networks.lit_points import CHANNELS, DIFFUSE, LitPoints
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.networks.photon_light import PhotonLight
-from photonfarm.trainer.networks.photon_map import WINDOWS
+from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 GUIDE_CHANNELS = 27

@@ -11,8 +11,7 @@ from torch import Tensor
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, given
 from photonfarm.trainer.networks.network import Network, descriptors
-from photonfarm.trainer.networks.photon_light import PhotonLight
-from photonfarm.trainer.networks.photon_map import WINDOWS
+from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
 from photonfarm.trainer.networks.point_layers import WIDTH, LightTransportLayer
 from photonfarm.trainer.runs.settings import NetworkSettings
 

@@ -14,7 +14,37 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from photonfarm.trainer.networks.projection import Footprint, Optics
+from photonfarm.shared.core.errors import SpecError
+from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import Inputs, given
+from photonfarm.trainer.networks.projection import Footprint, Optics, footprint
+
+
+class PhotonLight:
+    """The exposed radiance of white diffuse surfaces by the photons in windows of the image.
+
+    It takes the photons whose path to the eye is no longer than the paths of the images, and whose light has been
+    reflected at least `bounces` times.
+    """
+
+    def __init__(self, frame: SceneFrame, architecture: str, *, bounces: int = 0) -> None:
+        """Take the scene's constants from a frame; raises SpecError for a scene without photons."""
+        if not frame.photon_paths:
+            raise SpecError(
+                f"network.architecture = {architecture!r}: the scene has photons.paths = 0, and none are stored; set "
+                "photons.paths in its spec and render it anew, or train an architecture without photons"
+            )
+        self._optics, self._exposure, self._first = frame.optics, frame.exposure, bounces
+        self._last = frame.max_depth - 2 if frame.max_depth >= 0 else math.inf  # then one edge to the eye
+
+    def __call__(self, inputs: Inputs) -> list[Tensor]:
+        """(B, H, W, 3) for each of `photon_map.WINDOWS`."""
+        photons, view = given(inputs.photons), (inputs.world_to_camera, inputs.depth, inputs.normal)
+        on_side = arrives_on_seen_side(photons.position, photons.direction, photons.normal, inputs.world_to_camera)
+        wanted = photons.present & on_side & (photons.bounce >= self._first) & (photons.bounce <= self._last)
+        kept = footprint(photons.position, wanted, photons.seen, *view, self._optics)
+        return gathered(photons.power * self._exposure, kept, seen_area(self._optics, *view))
+
 
 WINDOWS = (0.07, 0.17)
 """The sides of the squares over which photons and area are summed, as shares of the image's width.

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.estimate import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
-from photonfarm.shared.core.frame_costs import Seconds
+from photonfarm.shared.core.files import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
+from photonfarm.shared.core.statistics import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import image_of

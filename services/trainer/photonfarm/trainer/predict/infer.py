@@ -17,11 +17,11 @@ import numpy as np
 import torch
 
 from photonfarm.data.torch_dataset import SampleTensors
-from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
+from photonfarm.shared.core.processes import command, is_installed
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.scene.frames import Frames
+from photonfarm.shared.scene.camera_path import Frames
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import Sample, SceneReader, Store
 from photonfarm.shared.store.read.find import Query, find_samples

@@ -1,10 +1,14 @@
-"""A training run after its training: its settings, its scene, its network."""
+"""Predictors: a training run after its training, and denoisers that need no training and get the same inputs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
+
+import torch
+from torch import Tensor
 
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.records import BasePointCloud, Geometry
@@ -12,14 +16,15 @@ from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store import SceneReader
 from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.networks.inputs import Inputs, Needs, given
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.predict.evaluation import DevicePredictor, network_predictor
+from photonfarm.trainer.predict.fill_in import fill_in
 from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.device import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
-from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.runs.stored_settings import read_settings
+from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
 from photonfarm.trainer.runs.user_code import named_in_errors
 
 
@@ -82,3 +87,35 @@ class TrainedRun:
         predict = network_predictor(self.network(spec, base).to(usable_device(device)).eval())
         named = named_in_errors(architecture=self.settings.network.architecture)
         return replace(predict, images=named(predict.images))
+
+
+@dataclass(frozen=True, slots=True)
+class ReadyPredictor:
+    """A denoiser that is given one of `kept` pixels of half A."""
+
+    denoiser: ReadyDenoiser
+    kept: int
+    settings: TrainSettings  # for reading samples
+
+    @property
+    def name(self) -> str:
+        """A name such as "oidn 1/4"."""
+        return f"{self.denoiser} 1/{self.kept}"
+
+    @property
+    def needs(self) -> Needs:
+        """The noisy colour, beside the buffers."""
+        return Needs(points=False, kept=self.kept)
+
+    def predictor(self, *_: object) -> DevicePredictor:
+        """The predictor, on the CPU, whatever the scene and the device. Raises SpecError if a package is missing."""
+        return DevicePredictor(self._images(), torch.device("cpu"))
+
+    def _images(self) -> Callable[[Inputs], Tensor]:
+        if self.denoiser == "none":
+            return lambda inputs: given(inputs.noisy).colour
+        if self.denoiser == "fill-in":
+            return lambda inputs: fill_in(given(inputs.noisy), inputs.albedo)
+        from photonfarm.trainer.predict.oidn import Oidn
+
+        return Oidn(self.settings.threads)

@@ -17,12 +17,10 @@ from photonfarm.trainer.compare.evaluate import MeasureProgress
 from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.contents import gathered
-from photonfarm.trainer.report.markdown_page import markdown
-from photonfarm.trainer.report.page import page
-from photonfarm.trainer.report.pictures import OVERVIEW, overview
+from photonfarm.trainer.report.page import markdown, page
 from photonfarm.trainer.report.plots import plots
 from photonfarm.trainer.report.verdict import Verdict
-from photonfarm.trainer.report.views import shown_views
+from photonfarm.trainer.report.views import OVERVIEW, overview, shown_views
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 

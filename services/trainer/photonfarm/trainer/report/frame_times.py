@@ -5,6 +5,9 @@ The renderer's verb measures its parts, in a process of its own; `evaluation` me
 
 from __future__ import annotations
 
+import os
+import platform
+import re
 import subprocess
 import tempfile
 from collections.abc import Sequence
@@ -12,12 +15,46 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.commands import command, is_installed
 from photonfarm.shared.core.errors import BackendError
-from photonfarm.shared.core.frame_costs import FrameCosts, Seconds
-from photonfarm.trainer.predict.ready import ReadyPredictor
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.shared.core.files import FrameCosts, Seconds
+from photonfarm.shared.core.processes import command, is_installed
+from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.run_folder import with_scenes
+
+CPU_INFO = Path("/proc/cpuinfo")
+
+
+@dataclass(frozen=True, slots=True)
+class Machine:
+    """The properties of a machine that times depend on."""
+
+    cpu: str | None  # its model, if the system states it
+    cores: int
+    architecture: str
+    load_average: tuple[float, float, float]  # processes that ran or waited to, in the last 1, 5 and 15 minutes
+
+    @classmethod
+    def here(cls) -> Machine:
+        """The machine of this process, with its present load."""
+        return cls(_model(), os.cpu_count() or 1, platform.machine(), os.getloadavg())
+
+    @property
+    def stated(self) -> str:
+        """The machine in words, on one line."""
+        load = ", ".join(f"{average:.1f}" for average in self.load_average)
+        return (
+            f"{self.cpu or 'a CPU of unknown model'}, {self.cores} cores, {self.architecture}; load average {load} "
+            "over 1, 5 and 15 minutes when times had been taken"
+        )
+
+
+def _model() -> str | None:
+    try:
+        found = re.search(r"^model name\s*:\s*(.+)$", CPU_INFO.read_text(), re.MULTILINE)
+    except OSError:  # another system
+        return None
+    return found[1] if found else None
+
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from photonfarm.shared.core.estimate import Estimate
-from photonfarm.shared.core.frame_costs import Seconds
+from photonfarm.shared.core.files import Seconds
+from photonfarm.shared.core.statistics import Estimate
 from photonfarm.trainer.compare.evaluation_table import counted, notes, place_of_networks
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE, TITLES

@@ -18,16 +18,17 @@ from typing import Any
 
 import numpy as np
 import torch
+from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
-from photonfarm.shared.core.models import Changes, differing
+from photonfarm.shared.core.models import Changes, differing, sentences
 from photonfarm.shared.farm.training import METADATA
 from photonfarm.shared.store.io.local import sync
-from photonfarm.trainer.runs.run_folder import GOOD
-from photonfarm.trainer.runs.settings import NetworkSettings
+from photonfarm.trainer.runs.run_folder import GOOD, SETTINGS
+from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings
 
 FORMAT = 4
 ANEW = "remove it, and the run begins anew"
@@ -212,3 +213,28 @@ def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mappi
             f"{path}: was trained on samples of another store, or of other plans; use another run folder (--run), or "
             "the store that it was trained on (--store)"
         )
+
+
+def read_settings(run: Path) -> TrainSettings:
+    """The settings a run was made with.
+
+    Raises StoreError if there is no run or its settings cannot be read, SpecError for those of another version.
+    """
+    path = run / SETTINGS
+    try:
+        document = json.loads(path.read_text())
+        settings = TrainSettings.model_validate(document)
+    except FileNotFoundError as error:
+        if not run.is_dir():
+            raise StoreError(f"{run}: there is no such folder") from error
+        raise StoreError(
+            f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
+        ) from error
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise StoreError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
+    except ValueError as error:
+        raise StoreError(f"{path}: is not the JSON that a training run leaves there: {error}") from error
+    check_of_this_version(path, document.get("network", {}))
+    return settings

@@ -15,9 +15,9 @@ from typing import Any, TypeVar
 import torch
 
 from photonfarm.shared.core.errors import SpecError, store_errors
-from photonfarm.shared.core.estimate import group_means
 from photonfarm.shared.core.models import Changes
 from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.core.statistics import group_means
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.data.growth import BatchStream, Growth
@@ -30,9 +30,8 @@ from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SET
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.user_code import named_in_errors
 from photonfarm.trainer.runs.wait_times import Stopwatch, TimeKind, samples_per_used, wait_shares
-from photonfarm.trainer.training.compiled import compiling
-from photonfarm.trainer.training.learner import DivergedError, Learner
-from photonfarm.trainer.training.presence import Presence
+from photonfarm.trainer.training.learner import DivergedError, Learner, compiling
+from photonfarm.trainer.training.other_ranks import Presence
 from photonfarm.trainer.training.recovery import GoodState, settle
 from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
 

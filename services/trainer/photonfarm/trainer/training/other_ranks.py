@@ -1,20 +1,29 @@
-"""The other processes of a group while rank 0 trains: they compute their part of each batch, at its commands."""
+"""The other processes of a group while rank 0 trains: they compute their part of each batch, at its commands.
+
+A trainer is announced in its scene while it reads there, and ends that for whoever takes the scene's lease.
+"""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import torch
 
+from photonfarm.shared.core.processes import Stop
+from photonfarm.shared.core.waiting import pause_after_look
+from photonfarm.shared.store.write.lease import LeasedError
 from photonfarm.trainer.data.batch import ResidentSamples
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.distributed import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.compiled import compiling
-from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.learner import Learner, compiling
 from photonfarm.trainer.training.recovery import GoodState
 
 
@@ -55,3 +64,54 @@ def _follow(ranks: Ranks, feed: Feed, good: GoodState, step: int) -> None:
         else:  # "take"
             good.step_or_go_back(step, feed.take())
             step += 1
+
+
+LOOK_S = 2.0
+"""The seconds between two looks for a lease, or more where a look takes long."""
+
+
+class Presence:
+    """A context manager: at its end the trainer is no longer at work in the scene."""
+
+    def __init__(self, source: SampleSource, what: str, tell: Callable[[str], object]) -> None:
+        """Nothing is announced yet. `tell` gets a sentence when somebody else has the scene for itself."""
+        self._source, self._what, self._tell = source, what, tell
+        self._announced = ExitStack()
+        self._due = 0.0
+        self.is_there = False  # announced as at work
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+
+    def begin(self, stop: Stop, is_over: Callable[[], bool]) -> bool:
+        """Announce it as soon as nobody has the scene for itself; False if it is stopped or over before that."""
+        said = ""
+        while not self.is_there:
+            try:
+                self._announced.enter_context(self._source.at_work(self._what))
+                self.is_there = True
+            except LeasedError as error:
+                if str(error) != said:
+                    self._tell(f"training waits: {error}")
+                said = str(error)
+                if stop.wait(LOOK_S) or is_over():
+                    break
+        return self.is_there
+
+    def end(self) -> None:
+        """End it: whoever has the lease may begin."""
+        self._announced.close()
+        self.is_there = False
+
+    def is_to_end(self) -> bool:
+        """Whether somebody has taken the lease, by a look now and then."""
+        if (began := time.monotonic()) < self._due:
+            return False
+        found = self._source.lease() is not None
+        self._due = (now := time.monotonic()) + pause_after_look(now - began, LOOK_S)
+        return found

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm.shared.core.commands import command
 from photonfarm.shared.core.errors import SpecError
+from photonfarm.shared.core.processes import command
 from photonfarm.shared.farm.devices import CUDA, DEVICE_VARIABLE, VISIBLE_VARIABLE
 from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
 

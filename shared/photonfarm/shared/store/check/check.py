@@ -14,14 +14,12 @@ from math import ceil
 
 from photonfarm.shared.core.errors import CorruptError, IncompleteError, StoreError, store_errors
 from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.check.content_check import CheckTotals
-from photonfarm.shared.store.check.halves import SIGNIFICANCE, HalvesResult, HalvesTest
+from photonfarm.shared.store.check.content_check import SIGNIFICANCE, CheckTotals, HalvesResult, HalvesTest
 from photonfarm.shared.store.check.job_check import CheckTarget
 from photonfarm.shared.store.check.job_pool import JobPool
-from photonfarm.shared.store.check.plan_check import PlanCheck, jobs_to_render
+from photonfarm.shared.store.check.plan_check import PlanCheck, jobs_to_render, unplanned_files
 from photonfarm.shared.store.check.plan_repair import PlanRepair
 from photonfarm.shared.store.check.repeated_seeds import equal_samples
-from photonfarm.shared.store.check.unplanned_files import unplanned_files
 from photonfarm.shared.store.format import markers
 from photonfarm.shared.store.io.storage import TMP, Storage
 from photonfarm.shared.store.write import plans

@@ -9,8 +9,7 @@ from types import TracebackType
 from typing import Self
 
 from photonfarm.shared.core.processes import usable_cores
-from photonfarm.shared.store.check.content_check import CheckTotals
-from photonfarm.shared.store.check.halves import HalvesTest
+from photonfarm.shared.store.check.content_check import CheckTotals, HalvesTest
 from photonfarm.shared.store.check.job_check import CheckTarget, JobCheck
 from photonfarm.shared.store.io.storage import renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding

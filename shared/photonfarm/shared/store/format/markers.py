@@ -1,17 +1,22 @@
-"""Markers: a job is committed when its marker is there. The marker names the job's files, their sizes and checksums."""
+"""Markers: a job is committed when its marker is there. The marker names the job's files, their sizes and checksums.
+
+A small file beside a plan names its withdrawn jobs, whose rows count as unused.
+"""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from photonfarm.shared.core.errors import CorruptError, StoreError, store_errors
 from photonfarm.shared.core.models import sentences
-from photonfarm.shared.store.io.storage import Storage, put_json
+from photonfarm.shared.store.io.storage import Ordered, Storage, put_json
 
 COMMITTED = "committed"
 _DIGITS = 12
@@ -122,3 +127,74 @@ def jobs(storage: Storage, scene: str) -> set[int]:
 def jobs_named(names: Iterable[str]) -> set[int]:
     """The jobs of those names in a folder of markers that are names of markers."""
     return {int(found[1]) for name in names if (found := _NAME.fullmatch(name))}
+
+
+WHOLE_S = 600.0
+"""The seconds after which all markers are listed again: only so is it seen that a repair has set jobs aside."""
+
+LISTED_AT_ONCE = 1000
+"""The names in an answer of a bucket."""
+
+
+class FollowedMarkers:
+    """The jobs of a scene that have a marker, looked at again and again by one process.
+
+    In a bucket a listing costs a request for each thousand names, and a look each second would cost hundreds of them.
+    Jobs are committed about in the order of their numbers; so a look asks for the few that are missing among the first
+    ones, one by one, and lists what lies behind. In a folder a look lists all.
+    """
+
+    def __init__(self, storage: Storage, scene: str, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take the folder of a scene; nothing is listed yet."""
+        self._storage, self._scene, self._clock = storage, scene, clock
+        self._known: set[int] = set()
+        self._whole_due = clock()
+
+    def doubt(self) -> None:
+        """List all markers at the next look: some may have been removed."""
+        self._whole_due = self._clock()
+
+    def look(self) -> set[int]:
+        """The jobs that have a marker now.
+
+        In a bucket, one that was there at an earlier look is taken to be there for WHOLE_S, unless there is a doubt.
+        """
+        now = self._clock()
+        if not self._known or now >= self._whole_due or not isinstance(self._storage, Ordered):
+            self._known = jobs(self._storage, self._scene)
+            self._whole_due = now + WHOLE_S
+        else:
+            with store_errors("look for markers", f"{self._storage.where}/{self._scene}"):
+                self._known |= self._new(self._storage)
+        return set(self._known)
+
+    def _new(self, storage: Ordered) -> set[int]:
+        """The jobs that were committed since the last look, by the fewest requests."""
+        last = max(self._known)
+        seen = np.zeros(last + 1, np.bool_)
+        seen[list(self._known)] = True
+        missing = np.flatnonzero(~seen)
+        behind = np.append(missing, last + 1) - 1  # for 0, 1, 2, … of the missing asked for: the name to list behind
+        asked = int(np.argmin(np.arange(len(behind)) + (last - behind) // LISTED_AT_ONCE))
+        new = {job for job in missing[:asked].tolist() if self._storage.exists(name_of(self._scene, job))}
+        after = file_of(int(behind[asked])) if behind[asked] >= 0 else ""
+        return new | jobs_named(storage.names_behind(f"{self._scene}/{COMMITTED}", after))
+
+
+def withdrawn_file(plan: str) -> str:
+    """The file of a plan, given its folder."""
+    return f"{plan}.withdrawn.json"
+
+
+def read_withdrawn(storage: Storage, plan: str) -> frozenset[int]:
+    """The withdrawn jobs of a plan whose file is there; raises CorruptError if it names none."""
+    name = withdrawn_file(plan)
+    try:
+        return frozenset(int(job) for job in json.loads(storage.read(name))["jobs"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptError(f"{storage.where}/{name}: names no jobs: {error}; put it back from a copy") from error
+
+
+def write_withdrawn(storage: Storage, plan: str, jobs: Set[int]) -> None:
+    """Name the withdrawn jobs of a plan, in place of those named before."""
+    put_json(storage, {"jobs": sorted(jobs)}, withdrawn_file(plan), replace=True)

@@ -23,8 +23,7 @@ from photonfarm.shared.core.records import (
     Visibility,
     arrays_of,
 )
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.pointcloud import rebuild
+from photonfarm.shared.scene.modification import Modification, rebuild
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
 from photonfarm.shared.store.format import schema

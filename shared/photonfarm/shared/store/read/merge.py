@@ -24,13 +24,12 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.archives import stored_arrays, write_arrays
 from photonfarm.shared.core.errors import CorruptError, StoreError
+from photonfarm.shared.core.files import stored_arrays, write_arrays
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.store.read.batch import Batch
-from photonfarm.shared.store.read.query import Query
+from photonfarm.shared.store.read.find import Query, SceneMatch
 from photonfarm.shared.store.read.reader import SceneReader
-from photonfarm.shared.store.read.scene_match import SceneMatch
 from photonfarm.shared.store.write.scene_store import SceneStore
 
 F64 = NDArray[np.float64]
@@ -54,7 +53,7 @@ class MergedView:
     mean: F64  # (H, W, 3) of all 2 · passes halves
     m2: F64  # (H, W, 3) sum of the squared differences from `mean`
     half_a: F64  # (H, W, 3) mean of the halves A, independent of…
-    half_b: F64  # (H, W, 3) …the mean of the halves B: what `photonfarm.shared.core.estimate` takes
+    half_b: F64  # (H, W, 3) …the mean of the halves B: what `photonfarm.shared.core.statistics` takes
 
     @property
     def count(self) -> int:

@@ -26,7 +26,7 @@ from photonfarm.shared.scene.modification import Modification, modification_keys
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View, view_keys
 from photonfarm.shared.store.format import markers, schema
-from photonfarm.shared.store.format.followed_markers import FollowedMarkers
+from photonfarm.shared.store.format.markers import FollowedMarkers
 from photonfarm.shared.store.format.shards import OpenShards, Shard
 from photonfarm.shared.store.io.storage import FORMAT_FILE, open_storage, renew_copy
 from photonfarm.shared.store.read.batch import Batch, Sample

@@ -22,12 +22,19 @@ from photonfarm.shared.core.errors import CorruptError, IncompleteError, store_e
 from photonfarm.shared.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import markers, schema
-from photonfarm.shared.store.format.shards import Shard, ShardWriter, encode
+from photonfarm.shared.store.format.shards import (
+    NOISY_GUIDES,
+    Shard,
+    ShardWriter,
+    as_array,
+    encode,
+    rounded,
+    stays_finite,
+)
 from photonfarm.shared.store.io.storage import Storage, discard, renew_copy
 from photonfarm.shared.store.write.findings import Cause, Finding
 from photonfarm.shared.store.write.plans import JobRows
 from photonfarm.shared.store.write.quarantine import Quarantine
-from photonfarm.shared.store.write.rounding import NOISY_GUIDES, as_array, rounded, stays_finite
 
 WAITING_ROWS = 8
 """The most rows that wait to be written: more would only hide for a while that the disk is slower than the renderer."""

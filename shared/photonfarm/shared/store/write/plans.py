@@ -32,7 +32,7 @@ from photonfarm.shared.plan.top_up import TopUp, expand_top_up
 from photonfarm.shared.scene.modification import Modification
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.format import declarations, schema, vectors, withdrawn
+from photonfarm.shared.store.format import declarations, markers, schema
 from photonfarm.shared.store.io.storage import Storage
 from photonfarm.shared.store.write import findings
 
@@ -190,7 +190,7 @@ def build(
     with group_in(part) as store:
         group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
         for declared in declarations.PLAN_INPUTS:
-            more = vectors.attributes(declared.name, [each.name for each in spec.groups])
+            more = schema.vector_attributes(declared.name, [each.name for each in spec.groups])
             schema.create_input(group, declared, getattr(rows, declared.name), more)
         schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
 
@@ -209,8 +209,8 @@ def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: i
         end = _counted(storage, scene, names, len(kept)) if until is None else until
         found = kept + [replace(_load(storage, scene, n), forgotten=times) for n in range(len(kept), end)]
         for number, plan in enumerate(found):
-            if withdrawn.name_of(plan.folder).rpartition("/")[2] in names:
-                found[number] = _without(storage, scene, plan, withdrawn.read(storage, plan.folder))
+            if markers.withdrawn_file(plan.folder).rpartition("/")[2] in names:
+                found[number] = _without(storage, scene, plan, markers.read_withdrawn(storage, plan.folder))
         return found
 
 
@@ -273,7 +273,7 @@ def _opened(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
 def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]:
     """An array of inputs; one of vectors has the columns that this program knows, in their order."""
     values = schema.read_input(storage, f"{folder}/{name}", group[name])
-    return vectors.known(name, values, group[name].attrs) if name in vectors.FIELDS else values
+    return schema.known_columns(name, values, group[name].attrs) if name in schema.FIELDS else values
 
 
 @contextlib.contextmanager

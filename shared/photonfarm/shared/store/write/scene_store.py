@@ -33,7 +33,7 @@ from photonfarm.shared.plan.request import (
 from photonfarm.shared.plan.top_up import TopUp
 from photonfarm.shared.scene.spec import SceneSpec
 from photonfarm.shared.store.format import declarations, markers, schema
-from photonfarm.shared.store.format.followed_markers import FollowedMarkers
+from photonfarm.shared.store.format.markers import FollowedMarkers
 from photonfarm.shared.store.io.storage import Storage, put_json
 from photonfarm.shared.store.write import findings, plans
 from photonfarm.shared.store.write.commit import JobWriter

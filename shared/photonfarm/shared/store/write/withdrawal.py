@@ -1,21 +1,30 @@
-"""`photonfarm store withdraw`: what a plan holds and nobody has rendered is forgotten, and may be planned again.
+"""`store withdraw`: what a plan holds and nobody has rendered may be planned again. `store forget`: a scene is deleted.
 
-The plan stays as it is. A small file beside it names the jobs whose rows count as unused from now on.
+*Withdrawn.* The plan stays as it is. A small file beside it names the jobs whose rows count as unused from now on.
+
+*Forgotten.* A small file stays in the folder of its plans. By that, a process that knows the plans sees that they are
+gone, also when others have been made under their numbers since. Markers go first, then the plans from the last to the
+first, then the rest. So what is left by one that was killed is never taken for complete samples; to forget it again
+ends it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from uuid import uuid4
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.errors import SpecError, store_errors
+from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
 from photonfarm.shared.plan.request import UNUSED
-from photonfarm.shared.store.format import withdrawn
+from photonfarm.shared.store.format import markers
+from photonfarm.shared.store.io.storage import put_json
+from photonfarm.shared.store.write import plans
 from photonfarm.shared.store.write.lease import OnWait, lease
 from photonfarm.shared.store.write.plans import StoredPlan
-from photonfarm.shared.store.write.scene_store import SceneStore
+from photonfarm.shared.store.write.scene_store import SCENES, SceneStore, is_there
+from photonfarm.shared.store.write.store import FAILURES_FOLDER, Store
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +60,7 @@ def _withdraw(scene: SceneStore, number: int | None) -> Withdrawal:
     committed = scene.committed_jobs()
     jobs = _withdrawable(scene, found, plan, committed)
     if jobs:
-        withdrawn.write(scene.storage, plan.folder, plan.withdrawn | jobs)
+        markers.write_withdrawn(scene.storage, plan.folder, plan.withdrawn | jobs)
     samples = {job: plan.samples_in(job) for job in range(plan.first_job, plan.end_job)}
     rendered = sum(count for job, count in samples.items() if job in committed)
     forgotten = sum(samples[job] for job in jobs)
@@ -86,3 +95,37 @@ def _references(plan: StoredPlan) -> tuple[NDArray[np.int64], NDArray[np.int64]]
     used = np.flatnonzero(plan.rows.sample_modification != UNUSED)
     referred = np.stack([plan.rows.sample_view[used], plan.rows.sample_modification[used]], axis=1)
     return (plan.first_row + used) // plan.shard_rows, referred // plan.shard_rows
+
+
+@dataclass(frozen=True, slots=True)
+class Forgotten:
+    """The outcome of forgetting a scene."""
+
+    scene_id: str
+    jobs: int  # committed ones that were deleted
+
+
+def forget(store: Store, scene_id: str, *, on_wait: OnWait = lambda _: None) -> Forgotten:
+    """Delete a scene, damaged or not; waits with `on_wait` for its lease. Raises StoreError if it is not there.
+
+    What a repair has set aside of it stays in the quarantine.
+    """
+    storage, folder = store.storage, f"{SCENES}/{scene_id}"
+    taken = lease(storage, scene_id, "store forget", on_wait)
+    with taken as held, store_errors("forget a scene", storage.where):
+        if not is_there(storage, scene_id):
+            raise StoreError(f"{storage.where}: holds no scene {scene_id}")
+        jobs = len(markers.jobs(storage, folder))
+        below = f"{folder}/{plans.PLANS}"
+        put_json(storage, {"jobs": jobs}, f"{below}/{plans.FORGOTTEN}{uuid4().hex}.json")
+        numbers = reversed(range(plans.count(storage, folder)))
+        folders = [f"{folder}/{markers.COMMITTED}", *(plans.folder(folder, n) for n in numbers), f"{folder}/base"]
+        for each in folders:
+            held.check()
+            storage.delete_folder(each)
+        left = [f"{below}/{name}" for name in storage.names(below) if not name.startswith(plans.FORGOTTEN)]
+        failures = [name for name in storage.names(FAILURES_FOLDER) if name.startswith(f"{scene_id}-")]
+        for each in (*left, *(f"{FAILURES_FOLDER}/{name}" for name in failures), f"{folder}/base.claim"):
+            storage.delete(each)
+        storage.delete(f"{folder}/spec.json")
+    return Forgotten(scene_id, jobs)

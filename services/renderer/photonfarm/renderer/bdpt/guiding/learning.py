@@ -9,9 +9,9 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.bdpt.film import ImageStack
+from photonfarm.renderer.bdpt.camera import ImageStack
 from photonfarm.renderer.bdpt.guiding.densities import gains
-from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
+from photonfarm.renderer.bdpt.guiding.grid import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import F64, Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import Totals, column_of, tiles_of
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, usefulness

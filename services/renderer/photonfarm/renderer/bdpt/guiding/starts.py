@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.bdpt.guiding.squares import cell_of, corner_of, within_cell
+from photonfarm.renderer.bdpt.guiding.grid import cell_of, corner_of, within_cell
 from photonfarm.renderer.bdpt.randomness import Sampler
 
 F64 = NDArray[np.float64]

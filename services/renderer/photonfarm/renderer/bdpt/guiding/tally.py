@@ -12,9 +12,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.bdpt.film import Splat
-from photonfarm.renderer.bdpt.guiding.grid import Grid
-from photonfarm.renderer.bdpt.guiding.sparse_lanes import SparseLanes
+from photonfarm.renderer.bdpt.camera import Splat
+from photonfarm.renderer.bdpt.guiding.grid import Grid, SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import Layout
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, cell_of
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex

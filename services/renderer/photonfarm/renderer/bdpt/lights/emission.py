@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.guiding import squares
+from photonfarm.renderer.bdpt.guiding import grid
 from photonfarm.renderer.bdpt.guiding.starts import GuidedStarts, StartGuide, rectangles
 from photonfarm.renderer.bdpt.lights.selection import (
     LightIndex,
@@ -130,13 +130,13 @@ class Lights:
         light, d = self.guided.number_of(emitter), -ds.d
         u = mi.Point2f(0)
         if self.has(AREA):
-            u = squares.on_area(n, d)
+            u = grid.on_area(n, d)
         if self.has(INFINITE) or self.has(DIRECTION):
             at_infinity = self.is_kind(light, INFINITE) | self.is_kind(light, DIRECTION)
-            u = dr.select(at_infinity, squares.on_disk(d, (x - self.centre) / self.radius), u)
+            u = dr.select(at_infinity, grid.on_disk(d, (x - self.centre) / self.radius), u)
         if self.has(POSITION):
             axis, cutoff = dr.gather(mi.Vector3f, self.axis, light), dr.gather(mi.Float, self.cos_cutoff, light)
-            u = dr.select(self.is_kind(light, POSITION), squares.in_cone(axis, cutoff, d), u)
+            u = dr.select(self.is_kind(light, POSITION), grid.in_cone(axis, cutoff, d), u)
         return self.guided.gain_at(light, u, ds.uv, active & (dr.reinterpret_array(mi.UInt32, emitter) != 0))
 
 
@@ -353,7 +353,7 @@ def _start_on_area(
         ps.n = lights.spheres.normal(index, ps)
     si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Color0f))
     if lights.guided is not None:
-        si.sh_frame = squares.frame_about(ps.n)
+        si.sh_frame = grid.frame_about(ps.n)
     si.wi = mi.warp.square_to_cosine_hemisphere(u_direction)
     out.throughput[mask] = out.emitter.eval(si, mask)
     out.ray = dr.select(mask, si.spawn_ray(si.to_world(si.wi)), out.ray)
@@ -367,7 +367,7 @@ def _start_at_infinity(
     reference.p = lights.centre
     ds, weight = out.emitter.sample_direction(reference, u_direction, mask)
     disk = mi.warp.square_to_uniform_disk_concentric(u_position)
-    frame = mi.Frame3f(ds.d) if lights.guided is None else squares.frame_about(ds.d)
+    frame = mi.Frame3f(ds.d) if lights.guided is None else grid.frame_about(ds.d)
     offset = frame.to_world(mi.Vector3f(disk.x, disk.y, 1))
     ray = mi.Ray3f(lights.centre + lights.radius * offset, -ds.d)
     out.throughput[mask] = weight

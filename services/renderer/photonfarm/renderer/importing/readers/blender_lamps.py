@@ -14,9 +14,9 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from photonfarm.renderer.importing import elements, images
+from photonfarm.renderer.importing.elements import WIDEST, Profile, cone_image, put_cone
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.meshes import Floats
-from photonfarm.renderer.importing.spots import WIDEST, Profile, cone_image, put_cone
 
 Lamp = dict[str, Any]
 Sky = list[float] | str

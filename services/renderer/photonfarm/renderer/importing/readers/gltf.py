@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from photonfarm.renderer.importing import elements
+from photonfarm.renderer.importing.elements import WIDEST, cone_image, put_cone
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh
 from photonfarm.renderer.importing.readers.gltf_file import COMPRESSED, GltfFile, Node, extension, normalised, numbers
 from photonfarm.renderer.importing.readers.gltf_materials import Look, Materials, Textures
-from photonfarm.renderer.importing.spots import WIDEST, cone_image, put_cone
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
 

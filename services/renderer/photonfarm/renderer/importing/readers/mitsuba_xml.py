@@ -18,7 +18,7 @@ from photonfarm.renderer.importing.readers import mitsuba_old, mitsuba_parts
 from photonfarm.renderer.importing.readers.mitsuba_old import value_of
 from photonfarm.shared.core.errors import SpecError
 from photonfarm.shared.core.waiting import Log
-from photonfarm.shared.scene.located_xml import line_of, parse
+from photonfarm.shared.scene.files import line_of, parse
 
 OLDEST, MITSUBA_2 = (0, 4), (2,)
 """The oldest version that is read, and the first one that Mitsuba 3 reads as it is."""

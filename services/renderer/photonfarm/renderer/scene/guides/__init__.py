@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from photonfarm.renderer.scene.guides.direct import irradiance, point_light
 from photonfarm.renderer.scene.guides.images import view_guides
-from photonfarm.renderer.scene.guides.settings import FOLLOWED, GuideSettings
+from photonfarm.renderer.scene.guides.pattern import FOLLOWED, GuideSettings
 from photonfarm.renderer.scene.guides.specular_paths import trace
 
 __all__ = ["FOLLOWED", "GuideSettings", "irradiance", "point_light", "trace", "view_guides"]

@@ -17,8 +17,7 @@ from photonfarm.renderer.bdpt.lights.emission import Lights, hit_densities, read
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, reflects_here
-from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, PatternSampler, pattern_of, shifted
-from photonfarm.renderer.scene.guides.settings import GuideSettings
+from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, GuideSettings, PatternSampler, pattern_of, shifted
 from photonfarm.renderer.scene.materials import has_other_lobes
 from photonfarm.shared.core.keys import Key, Stream
 from photonfarm.shared.core.records import F32

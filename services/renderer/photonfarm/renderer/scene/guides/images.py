@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.scene.arrays import floats, points
 from photonfarm.renderer.scene.gbuffer import GRID, RAYS
-from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, pattern_of
-from photonfarm.renderer.scene.guides.settings import FOLLOWED, NO_LIMIT, GuideSettings
+from photonfarm.renderer.scene.guides.pattern import FOLLOWED, NO_LIMIT, SUB_PIXELS, GuideSettings, pattern_of
 from photonfarm.renderer.scene.guides.specular_paths import trace
 from photonfarm.renderer.scene.materials import Materials
 from photonfarm.shared.core.keys import Key, Stream

@@ -1,7 +1,8 @@
-"""The sample points of guides: one low-discrepancy set, shifted by another offset in each pixel."""
+"""The sample points of guides, one low-discrepancy set shifted by another offset in each pixel; kernels' settings."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -10,6 +11,24 @@ import numpy as np
 
 from photonfarm.renderer.scene.gbuffer import GRID
 from photonfarm.shared.core.records import F32
+
+FOLLOWED = 8
+"""The most mirrors and panes of glass that are followed."""
+
+NO_LIMIT = 1 << 20
+"""The edges of a path if the spec sets no limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuideSettings:
+    """The numbers that a kernel is compiled for."""
+
+    light_samples: int  # of each ray
+    followed: int  # the most mirrors and panes
+    max_depth: int  # the most edges of a path
+    near: float  # distance of the near plane
+    glossy: bool  # whether any surface has lobes that are neither diffuse nor followed
+
 
 SUB_PIXELS = GRID * GRID
 

@@ -1,4 +1,9 @@
-"""Rays followed through mirrors and glass, and the surfaces on the way and at the end."""
+"""Rays followed through mirrors and glass, and the surfaces on the way and at the end.
+
+The share of light that a surface reflects or transmits by lobes other than the diffuse one is evaluated by these lobes
+alone, through the context's `type_mask`. Subtracting the diffuse reflectance from the total would not work: the coat of
+a plastic leaves its base less light, so the difference is too small, and often below 0.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +15,9 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt.lights.emission import Lights
 from photonfarm.renderer.bdpt.recording import traced_once
-from photonfarm.renderer.scene.gbuffer import seen_reflectance
+from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, seen_reflectance
 from photonfarm.renderer.scene.guides.direct import RayArrival, lit, turned
-from photonfarm.renderer.scene.guides.settings import GuideSettings
-from photonfarm.renderer.scene.guides.specular import specular_of
+from photonfarm.renderer.scene.guides.pattern import STEPS, SUB_PIXELS, GuideSettings
 from photonfarm.renderer.scene.materials import is_pure_delta
 
 
@@ -104,3 +108,27 @@ def _follow(scene: Any, s: _Path, si: Any, settings: GuideSettings) -> _Path:
         length=dr.select(leads_on, s.length + si.t, s.length),
         followed=dr.select(leads_on, s.followed + 1, s.followed),
     )
+
+
+BSDF_SAMPLES = 2
+"""The samples of each ray, for the directional albedo."""
+
+
+def specular_of(bsdf: Any, si: Any, hit: Any, diffuse_kept: Any) -> Any:
+    """The directional albedo of all lobes but the diffuse one, 0 if there are none; it may be below 0 for `principled`.
+
+    `diffuse_kept` is that of `Materials`. The albedo is a share of the light's power: radiance in glass is larger by
+    the square of the refractive index.
+    """
+    flags, context = bsdf.flags(), mi.BSDFContext(mi.TransportMode.Importance)
+    context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
+    other = mi.has_flag(flags, mi.BSDFFlags.Delta) | mi.has_flag(flags, mi.BSDFFlags.Glossy)
+    sampled = hit & other
+    total = mi.Color3f(0)
+    within = dr.arange(mi.UInt32, dr.width(hit)) % SUB_PIXELS
+    for sample in range(BSDF_SAMPLES):
+        u = [dr.fma(mi.Float(within * BSDF_SAMPLES + sample), step, 0.5) for step in STEPS]
+        u = [x - dr.floor(x) for x in u]
+        _, weight = bsdf.sample(context, si, u[0], mi.Point2f(u[1], u[2]), sampled)
+        total += dr.select(sampled, weight, 0)
+    return total / BSDF_SAMPLES - dr.select(sampled, diffuse_kept * diffuse_reflectance(si, sampled), 0)

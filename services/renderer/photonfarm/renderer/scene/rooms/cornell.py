@@ -10,8 +10,7 @@ from typing import Any
 import trimesh
 
 from photonfarm.renderer.scene.rooms.materials import diffuse
-from photonfarm.renderer.scene.rooms.shapes import mesh, rectangle_light
-from photonfarm.renderer.scene.rooms.solids import quad, standing_box
+from photonfarm.renderer.scene.rooms.solids import mesh, quad, rectangle_light, standing_box
 
 WHITE, RED, GREEN = (0.73, 0.71, 0.68), (0.60, 0.06, 0.05), (0.12, 0.43, 0.10)
 

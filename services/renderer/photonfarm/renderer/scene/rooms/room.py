@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.rooms import furniture, materials
 from photonfarm.renderer.scene.rooms.materials import diffuse, glossy, metal, textured
-from photonfarm.renderer.scene.rooms.shapes import mesh, rectangle_light
-from photonfarm.renderer.scene.rooms.solids import Point, box, joined, quad
+from photonfarm.renderer.scene.rooms.solids import Point, box, joined, mesh, quad, rectangle_light
 
 X, Y, Z = 2.6, 2.6, 2.1  # half width, height, half depth
 OVERHANG = 0.05

@@ -114,7 +114,7 @@ def path(content: str) -> Doing:
 NOTHING: Doing = lambda _: None  # noqa: E731 - a constant of this type
 STARES = '{"frames": 1, "views": [{"origin": [0, 1, 0], "look_at": [0, 1, 0]}]}'
 FEW = "--steps 2 --batch 2 --hold-out 0.001 --set width=2"
-DEPTH = "differs in transport.max_depth (8 there, 6 here)"
+DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
 
 
 @pytest.mark.parametrize(

@@ -100,6 +100,8 @@ def test_the_password_of_a_plain_redis_goes_with_the_user_that_it_has(tmp_path: 
         plain.config_set("requirepass", "secret")
         with pytest.raises(QueueError):
             connect(with_password_of(tmp_path / "password", f"redis://127.0.0.1:{port}/0"))
+        with pytest.raises(QueueError, match=r"does not let in the user default .*; check the password"):
+            connect(f"redis://default:wrong@127.0.0.1:{port}/0")
         with connect(with_password_of(tmp_path / "password", f"redis://default@127.0.0.1:{port}/0")) as let_in:
             assert let_in.ping()
 

@@ -18,6 +18,7 @@ from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.report.contents import ReportContents, gathered
 from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, half_floats, light_data
+from photonfarm.trainer.report.tables import facts
 from photonfarm.trainer.report.verdict import Verdict
 from photonfarm.trainer.report.views import Layer, ShownView, light, shown_views
 
@@ -49,11 +50,19 @@ def judged(
     )
 
 
+def test_a_report_on_joined_samples_names_the_store_that_they_are_from(contents) -> None:
+    joined = {"kind": "join", "store": "5f3a"}
+    of_both = replace(contents, card=replace(contents.card, requests=[*contents.card.requests, joined]))
+    assert "plan 1: samples of store 5f3a, joined" in dict(facts(of_both))["seeds"]
+
+
 def test_the_verdict_follows_from_the_numbers(contents) -> None:
     colour = errors(1.8, 1.8, 1.8, 1.8, 1.8, 1.8)
     better = judged(contents, errors(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), colour)
     assert better.kind == "better"
-    assert better.sentence == "light_transport predicts unseen configurations with 1/18 of the mean colour’s error."
+    assert better.sentence.startswith(
+        "light_transport predicts unseen configurations with 1/18 of the mean colour’s error. Training has "
+    )
     assert "in 3 of 3 configurations" in better.further[0]
     assert "with 50 % of " in judged(contents, errors(0.9, 0.9), errors(1.8, 1.8)).sentence
     with_lamps = judged(contents, errors(0.1, 0.1), errors(50, 50), shown=errors(2, 2))

@@ -114,7 +114,7 @@ def _lead(
         note_scene_folder(folder, beside)
         began = time.monotonic()
         if is_vacant(store):
-            log(f"waiting for a store and a scene in {store}")
+            log(f"waiting for a store and a scene in {store} (--store): `photonfarm submit` makes them")
         scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
         if scene_id is None and not stop.is_set():
             raise IncompleteError(

@@ -70,7 +70,10 @@ def submit(
     request: Request,
     shard_rows: int | None,
 ) -> None:
-    """Plan samples of SPEC and queue them; what is planned already is not planned again."""
+    """Plan samples of SPEC and queue them; what is planned already is not planned again.
+
+    SPEC is a scene.toml, or the name of a ready one: room and cornell are built in, others need their files.
+    """
     from photonfarm.shared.cli import show
     from photonfarm.shared.farm import dry_run as dry
     from photonfarm.shared.farm import submission

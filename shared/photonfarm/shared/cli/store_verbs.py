@@ -213,5 +213,6 @@ def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
         question = f"Delete {show_store.contents(opened, scene_id)} of {store}?"
         if not sys.stdin.isatty():
             raise click.UsageError(f"{question} Without a terminal to ask, --yes is required.")
-        click.confirm(question, abort=True, err=True)
+        if not click.confirm(question, err=True):
+            raise click.ClickException("nothing is deleted")
     show_store.forgotten(forgotten(opened, scene_id, on_wait=show_store.waiting), as_json)

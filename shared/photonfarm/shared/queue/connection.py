@@ -67,7 +67,10 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
     try:
         connection.ping()
     except (redis.RedisError, OSError) as error:
-        raise QueueError(f"no Redis at {shown}: {_reason(error, url)}") from error
+        refused = isinstance(error, redis.AuthenticationError)
+        raise QueueError(
+            f"{'the' if refused else 'no'} Redis at {shown}{' ' if refused else ': '}{_reason(error, url)}"
+        ) from error
     return connection
 
 
@@ -82,15 +85,17 @@ def _reason(error: Exception, url: str) -> str:
     reason = str(error).rstrip(".")
     if not has_password(url):
         return (
-            f"it wants a password ({reason}); put it into a file that {PASSWORD_VARIABLE} names. That logs in as the "
+            f"wants a password ({reason}); put it into a file that {PASSWORD_VARIABLE} names. That logs in as the "
             f"user {USER}, and with redis://default@host as the one that `requirepass` is for"
         )
     if urlsplit(url).username == USER:
         return (
-            f"it does not let in the user {USER} ({reason}), which a password file ({PASSWORD_VARIABLE}) is for unless "
-            "the URL names another; a Redis with `requirepass` has the user default: redis://default@host"
+            f"does not let in the user {USER} ({reason}), which a password file ({PASSWORD_VARIABLE}) is for unless "
+            "the URL names another; check the password; a Redis with `requirepass` has the user default: "
+            "redis://default@host"
         )
-    return reason
+    user = urlsplit(url).username or "default"
+    return f"does not let in the user {user} ({reason}); check the password, in the URL or in a {PASSWORD_VARIABLE}"
 
 
 def _checked(url: str) -> str:

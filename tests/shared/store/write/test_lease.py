@@ -24,7 +24,7 @@ AT_WORK = """
 import sys, time
 from photonfarm.shared.store import Store
 from photonfarm.shared.store.write.lease import at_work
-with at_work(Store(sys.argv[1]).storage, sys.argv[2], "worker w1 renders job 12"):
+with at_work(Store(sys.argv[1]).storage, sys.argv[2], "worker w1 at job 12"):
     print("in", flush=True)
     sys.stdin.readline()
 """
@@ -60,7 +60,7 @@ def test_a_lease_waits_for_who_is_at_work_and_says_whom(storage: LocalStorage, w
     with lease(storage, SCENE, "store check --repair", let_go):
         assert worker.wait() == 0
         assert "store check --repair" in leases(storage)[SCENE]
-    assert f"scene {SCENE}: store check --repair waits for worker w1 renders job 12" in waited[0]
+    assert f"scene {SCENE}: store check --repair waits for worker w1 at job 12" in waited[0]
     assert str(worker.pid) in waited[0]
     assert leases(storage) == {}
 
@@ -68,11 +68,11 @@ def test_a_lease_waits_for_who_is_at_work_and_says_whom(storage: LocalStorage, w
 def test_nobody_begins_to_work_under_a_lease_and_other_scenes_are_free(storage: LocalStorage) -> None:
     refused = pytest.raises(LeasedError, match=r"store forget .* has it for itself")
     with lease(storage, SCENE, "store forget", pytest.fail):
-        with refused, at_work(storage, SCENE, "worker w1 renders job 3"):
+        with refused, at_work(storage, SCENE, "worker w1 at job 3"):
             pytest.fail("worked under a lease")
-        with at_work(storage, SCENE[::-1], "worker w1 renders job 3"):
+        with at_work(storage, SCENE[::-1], "worker w1 at job 3"):
             pass
-    with at_work(storage, SCENE, "worker w1 renders job 3"):
+    with at_work(storage, SCENE, "worker w1 at job 3"):
         pass
 
 

@@ -85,7 +85,7 @@ def test_the_job_in_hand_is_waited_for_and_stays(scene: SceneStore) -> None:
     taken, waited = threading.Event(), threading.Event()
 
     def work() -> None:
-        with at_work(scene.storage, scene.scene_id, "worker w1 renders job 1"):
+        with at_work(scene.storage, scene.scene_id, "worker w1 at job 1"):
             taken.set()
             assert waited.wait(20)
             assert samples.commit(scene, 1, samples.outputs(scene, 1))
@@ -97,7 +97,7 @@ def test_the_job_in_hand_is_waited_for_and_stays(scene: SceneStore) -> None:
     done = withdraw(fresh(scene), on_wait=lambda sentence: (said.append(sentence), waited.set()))
     worker.join()
     assert (done.jobs, done.rendered) == (1, 6)
-    assert "store withdraw waits for worker w1 renders job 1" in said[0]
+    assert "store withdraw waits for worker w1 at job 1" in said[0]
     assert fresh(scene).progress().committed_samples == 6
 
 

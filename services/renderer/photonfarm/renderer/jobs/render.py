@@ -135,7 +135,7 @@ class ShardRenderer:
         SceneNotHereError if the scene file here is not the planned one, IncompleteError if renders stay non-finite or
         buffers are.
         """
-        what = f"worker {self._worker} renders job {job}"
+        what = f"worker {self._worker} at job {job}"
         with at_work(self._store.storage, scene_id, what):
             if not self._store.has_scene(scene_id):  # forgotten while its jobs were queued
                 return False

@@ -100,6 +100,8 @@ def _seeds(contents: ReportContents) -> str:
                 f"plan {number}: seed {request['seed']}, {request['modifications']} configurations × "
                 f"{request['views_per_modification']} views × {request['passes']} passes"
             )
+        elif request["kind"] == "join":
+            asked.append(f"plan {number}: samples of store {request['store']}, joined")
         else:
             where = f" where {' and '.join(request['where'])}" if request["where"] else ""
             asked.append(f"plan {number}: {'+' if request['adds'] else ''}{request['spp']} samples per pixel{where}")

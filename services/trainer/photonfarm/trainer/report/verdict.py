@@ -38,10 +38,12 @@ class Verdict:
         shown = _shown_ratio(errors, contents.baselines.mean_shown_colour)
         further = (
             _won(errors, constant, shown, evaluation.unit),
-            _since_start(errors.error.mean, contents.baselines.untrained.error.mean),
             _of_references(evaluation.references, first.row.metrics),
         )
-        return cls(*_against(first.name, errors, constant, shown, evaluation.unit), further)
+        kind, sentence = _against(first.name, errors, constant, shown, evaluation.unit)
+        return cls(
+            kind, f"{sentence} {_since_start(errors.error.mean, contents.baselines.untrained.error.mean)}", further
+        )
 
 
 def _shown_ratio(errors: HeldOutErrors, constant: HeldOutErrors) -> float:

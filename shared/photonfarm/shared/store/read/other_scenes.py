@@ -78,7 +78,10 @@ def differences(there: SceneSpec, here: SceneSpec) -> str:
     few = list(changes.items())[:FEW]
     more = f" and {len(changes) - len(few)} more" if len(changes) > len(few) else ""
     return (
-        ", ".join(FILES if key == "content" else f"{key} ({_said(a)} there, {_said(b)} here)" for key, (a, b) in few)
+        ", ".join(
+            FILES if key == "content" else f"{key} ({_said(a)} in the store, {_said(b)} asked for)"
+            for key, (a, b) in few
+        )
         + more
     )
 

@@ -64,7 +64,7 @@ def leases(storage: Storage) -> dict[str, str]:
 def at_work(storage: Storage, scene_id: str, what: str, on_wait: OnWait | None = None) -> Iterator[None]:
     """Announce that this process is at work in a scene, so that a lease waits for the end of the block.
 
-    `what` is in words: "worker w1 renders job 12". Where the store cannot be written to, nothing is announced. If
+    `what` is in words: "worker w1 at job 12". Where the store cannot be written to, nothing is announced. If
     somebody has the lease, this waits with `on_wait`, and raises LeasedError without. Raises StoreError.
     """
     name = f"{LEASES}/{scene_id}/{uuid.uuid4().hex}.json"

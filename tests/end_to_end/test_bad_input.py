@@ -231,7 +231,7 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
 def test_up_without_a_trainer_or_a_worker_says_so_before_it_writes_anything(
     tmp_path: Path, verb: str, distribution: str
 ) -> None:
-    code = f"from photonfarm.shared.cli import main, verbs; verbs._installed().pop('{verb}'); main.main(['up', 'room'])"
+    code = f"from photonfarm.shared.cli import main; main._installed().pop('{verb}'); main.main(['up', 'room'])"
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
     assert f"photonfarm {verb}" in result.stderr

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from photonfarm.data import Sample
 from photonfarm.export.settings import Extra
+from photonfarm.shared.core.archives import write_arrays
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.files import write_arrays
 from photonfarm.shared.core.records import arrays_of
 from photonfarm.shared.scene.spec import SceneSpec
 

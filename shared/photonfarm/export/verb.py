@@ -3,64 +3,13 @@
 from __future__ import annotations
 
 import sys
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from photonfarm.export.export import OnProgress, Result
 from photonfarm.shared.cli.options import json_option, store_option
-from photonfarm.shared.cli.show import print_json
-from photonfarm.shared.core.waiting import in_words
 from photonfarm.shared.plan.hold_out import HOLD_OUT
-
-LINE_S = 4.0
-"""The seconds between lines of progress where there is no terminal."""
-
-
-@contextmanager
-def progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
-    """Functions that say a line, and how far the export is: a bar on a terminal, else lines; both on stderr."""
-    console = Console(stderr=True, soft_wrap=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("samples"),
-               TextColumn("{task.fields[rate]}"), TimeRemainingColumn())  # fmt: skip
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
-        bar = bars.add_task("export", total=None, rate="", visible=False)
-        began = last = time.monotonic()
-
-        def show(done: int, total: int, size_bytes: int) -> None:
-            nonlocal last
-            now = time.monotonic()
-            rate = done / max(now - began, 1e-9)
-            speed = f"{rate:.0f}/s, {rate * size_bytes / done / 1e6:.0f} MB/s"
-            bars.update(bar, completed=done, total=total, rate=speed, visible=True)
-            if not console.is_terminal and (now - last > LINE_S or done == total):
-                last, left = now, in_words((total - done) / rate)
-                console.print(f"{done}/{total} samples, {speed}, {left} left", highlight=False)
-
-        def say(line: str) -> None:
-            nonlocal began
-            began = time.monotonic()  # the samples begin after the last line about what was before them
-            console.print(line, markup=False, highlight=False)
-
-        yield say, show
-
-
-def print_result(found: Result, as_json: bool) -> None:
-    """Print what was written."""
-    if as_json:
-        print_json(asdict(found))
-        return
-    shared = f", {found.configurations} configurations" if found.configurations else ""
-    size = f" in {found.new_files} files of {found.new_bytes / 1e6:,.1f} MB" if found.new else ""
-    click.echo(f"{found.folder}: {found.samples} samples{shared}; {found.new} of them new{size}")
-
 
 EXTRAS = ("points", "photons", "visibility")
 
@@ -111,13 +60,14 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
 
     Exit codes: 0 exported, 7 no sample is complete, 4 store or folder, 3 what the scene does not have, 130 Ctrl-C.
     """
+    from photonfarm.export import show
     from photonfarm.export.export import export_scene
     from photonfarm.export.settings import ExportRequest
 
     try:
-        with progress() as (log, on_progress):
+        with show.progress() as (log, on_progress):
             result = export_scene(store, scene, out, ExportRequest(**asked), log, on_progress)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)
-    print_result(result, as_json)
+    show.result(result, as_json)

@@ -24,8 +24,8 @@ from photonfarm.renderer.measure.frame_costs import (
 )
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.shared.core.archives import PARTS, FrameCosts, Surface
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.files import PARTS, FrameCosts, Surface
 from photonfarm.shared.plan.request import Request
 from photonfarm.shared.scene.modification import Modification, rest
 from photonfarm.shared.scene.spec import SceneSpec

@@ -18,8 +18,8 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from read_batches import batch_of
 
+from photonfarm.shared.core.archives import Seconds
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.files import Seconds
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.plan.hold_out import rows_held_out
 from photonfarm.shared.plan.request import Request

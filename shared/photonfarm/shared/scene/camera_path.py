@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, ValidationError
 
+from photonfarm.shared.core.archives import stored_arrays, write_arrays
 from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.files import stored_arrays, write_arrays
 from photonfarm.shared.core.models import Frozen, sentences
 from photonfarm.shared.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.shared.scene.modification import Modification, rest

@@ -15,9 +15,10 @@ from photonfarm.renderer.jobs.estimates import halves_of
 from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
 from photonfarm.renderer.scene import backend
 from photonfarm.shared.core import pictures
+from photonfarm.shared.core.archives import write_arrays
 from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
 from photonfarm.shared.core.exr import write_layers
-from photonfarm.shared.core.files import whole_file, write_arrays
+from photonfarm.shared.core.files import whole_file
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import block_z_test

@@ -35,8 +35,8 @@ from photonfarm.renderer.jobs.render import lit_points, located
 from photonfarm.renderer.scene.gbuffer import first_surfaces
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
+from photonfarm.shared.core.archives import PARTS, FrameCosts, Surface
 from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.files import PARTS, FrameCosts, Surface
 from photonfarm.shared.core.keys import Key, view_key
 from photonfarm.shared.core.records import F32, BasePointCloud, Guides, arrays_of
 from photonfarm.shared.scene.modification import Modification, rebuild, rest

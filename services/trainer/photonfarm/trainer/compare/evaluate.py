@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from photonfarm.shared.core.archives import Seconds
 from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
-from photonfarm.shared.core.files import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import Estimate, group_means

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from photonfarm.shared.core.archives import Seconds
 from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.files import Seconds
 from photonfarm.shared.core.keys import Key
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.core.statistics import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor

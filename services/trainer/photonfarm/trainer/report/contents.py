@@ -12,8 +12,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from photonfarm.shared.core.archives import FrameCosts
 from photonfarm.shared.core.errors import BackendError
-from photonfarm.shared.core.files import FrameCosts
 from photonfarm.shared.core.records import F32, Guides, ViewBuffers
 from photonfarm.shared.core.statistics import Estimate
 from photonfarm.shared.scene.spec import SceneSpec

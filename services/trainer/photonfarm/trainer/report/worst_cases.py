@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.files import Surface
+from photonfarm.shared.core.archives import Surface
 from photonfarm.shared.core.pictures import display_values
 from photonfarm.shared.core.records import F32, ViewBuffers
 

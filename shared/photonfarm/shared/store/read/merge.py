@@ -24,8 +24,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.shared.core.archives import stored_arrays, write_arrays
 from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.core.files import stored_arrays, write_arrays
 from photonfarm.shared.core.records import F32
 from photonfarm.shared.store.read.batch import Batch
 from photonfarm.shared.store.read.find import Query, SceneMatch

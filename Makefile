@@ -1,23 +1,28 @@
 # make demo   the main job, on embedded defaults      make test       the tests
 # make check  style, types, layers                    make test-slow  those that take long: many kills, many images
-# make setup  the virtual environment alone         make docs       the documentation as a site, in build/site
+# make setup  what the demo needs, in .venv         make docs       the documentation as a site, in build/site
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.ready
-PROJECTS := shared services/renderer services/trainer
+DEV := $(VENV)/.dev-ready
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: setup demo test test-slow test-compose test-slurm test-kubernetes check docs stability lock clean
 .DELETE_ON_ERROR:
 
 setup: $(STAMP)
 
-$(STAMP): constraints.txt scripts/setup.sh $(PROJECTS:%=%/pyproject.toml)
+$(STAMP): constraints.txt scripts/setup.sh pyproject.toml
 	PYTHON="$(PYTHON)" ./scripts/setup.sh "$(VENV)"
 	@touch $@
 
+$(DEV): constraints.txt scripts/setup.sh pyproject.toml
+	PYTHON="$(PYTHON)" ./scripts/setup.sh "$(VENV)" dev
+	@touch $@ $(STAMP)
+
 demo: $(STAMP)
-	$(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 1000 --reference-views 6 --store demo/store --run demo/run --out demo
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 1000 --reference-views 6 --store demo/store --run demo/run --out demo
 
 # Three at a time on two cores, as many tests wait; a file's tests together, as they share servers and scenes; in order,
 # as the longest files come early; a process that crashes ends it, as xdist never ends with another one in its place.
@@ -25,19 +30,19 @@ demo: $(STAMP)
 PYTEST := env -u PYTHONDONTWRITEBYTECODE $(BIN)/python -m pytest \
 	-n 3 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
-test: $(STAMP)
+test: $(DEV)
 	$(PYTEST) -m 'not slow'
 
-test-slow: $(STAMP)
+test-slow: $(DEV)
 	$(PYTEST) -m slow
 
 # The compose file, run for real; needs a Docker engine.
-test-compose: $(STAMP)
+test-compose: $(DEV)
 	PHOTONFARM_TEST_COMPOSE=1 $(BIN)/python -m pytest -s tests/end_to_end/test_compose.py
 
 # photonfarm slurm on a SLURM of two nodes, which the test starts: as root, with Debian's slurmctld, slurmd, slurm-client
 # and munge installed. A quarter of an hour, as SLURM lets requeued jobs wait.
-test-slurm: $(STAMP)
+test-slurm: $(DEV)
 	PHOTONFARM_TEST_SLURM=1 $(BIN)/python -m pytest -s tests/end_to_end/test_slurm.py
 
 # The chart and the kustomize files, validated by helm and kubectl and run for real by Podman (docs/kubernetes.md); what
@@ -45,11 +50,11 @@ test-slurm: $(STAMP)
 test-kubernetes: $(VENV)/.kubernetes-ready
 	PHOTONFARM_TEST_KUBERNETES=1 $(BIN)/python -m pytest -sv tests/end_to_end/test_kubernetes.py tests/end_to_end/test_kubernetes_files.py
 
-$(VENV)/.kubernetes-ready: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[kubernetes]'
+$(VENV)/.kubernetes-ready: $(DEV)
+	$(PIP) --group kubernetes
 	@touch $@
 
-check: $(STAMP)
+check: $(DEV)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
@@ -60,27 +65,27 @@ docs: $(VENV)/.docs-ready
 	$(BIN)/python scripts/cli_page.py
 	$(BIN)/mkdocs build --strict --quiet
 
-$(VENV)/.docs-ready: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[docs]'
+$(VENV)/.docs-ready: $(DEV)
+	$(PIP) --group docs
 	@touch $@
 
 # What only this benchmark needs: the peers it is about, and plots.
-$(VENV)/.bench-ready: $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e 'shared[bench]'
+$(VENV)/.bench-ready: $(DEV)
+	$(PIP) --group bench
 	@touch $@
 
 bench-render: $(VENV)/.bench-ready
 
 # bench-moved-lamps is the module bench.trainer.moved_lamps: whichever room of bench/ has it.
-bench-%: $(STAMP)
+bench-%: $(DEV)
 	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))
 
 # The integrator on 36 rows of hard scenes, each against its truth: make stability ARGS="--quick --only 13".
-stability: $(STAMP)
+stability: $(DEV)
 	$(BIN)/python -m bench.stability $(ARGS)
 
 # Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
-experiments-%: $(STAMP)
+experiments-%: $(DEV)
 	$(BIN)/python experiments/run.py --size $*
 
 # The exact versions in constraints.txt, made from a fresh environment.

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Self
 
 from experiments.experiment import Experiment, Run
-from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.scene.spec import SceneSpec
 
 FRAMES = 4
 """Views that a scene's costs are measured on."""

@@ -9,10 +9,10 @@ from typing import Any, Literal, Self
 
 from pydantic import Field, ValidationError
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.models import Frozen, Name, sentences
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
+from photonfarm.core.errors import SpecError
+from photonfarm.core.models import Frozen, Name, sentences
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
 
 HERE = Path(__file__).parent
 SIZES = "sizes.toml"

@@ -26,8 +26,8 @@ from PIL import Image, ImageDraw, ImageFont
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
 
 from experiments.experiment import HERE, Experiment
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.pictures import Picture
+from photonfarm.core.errors import IncompleteError
+from photonfarm.core.pictures import Picture
 from photonfarm.trainer.compare.comparison import COMPARISON, GAP, LINE
 from photonfarm.trainer.predict.animation import read_png, write_png
 from photonfarm.trainer.report.views import OVERVIEW, coloured

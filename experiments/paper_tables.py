@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from experiments.rooms import Room, estimate
-from photonfarm.shared.core.statistics import Estimate
+from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from experiments.experiment import Experiment, seeded
 from experiments.stages import EVALUATION
-from photonfarm.shared.core.errors import IncompleteError, SpecError
-from photonfarm.shared.core.statistics import Estimate
+from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.statistics import Estimate
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -23,7 +23,7 @@ from bench.harness.results import ROOT
 from experiments import dry_run
 from experiments.experiment import Experiment, SizeName, names
 from experiments.stages import Stages, tell
-from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
+from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError
 
 
 def options() -> argparse.ArgumentParser:

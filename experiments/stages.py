@@ -18,12 +18,12 @@ from typing import Any
 
 from bench.harness import results
 from experiments.experiment import Experiment, Run
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.processes import command, tied
-from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format.markers import COMMITTED
+from photonfarm.core.errors import IncompleteError
+from photonfarm.core.files import write_whole
+from photonfarm.core.processes import command, tied
+from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.format.markers import COMMITTED
 
 EVALUATION = "evaluation.json"  # what `evaluate` leaves in each run's folder
 COMMITS = "commits.json"  # in each run's folder: at which commits it was trained

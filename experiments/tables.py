@@ -28,7 +28,7 @@ from experiments.experiment import HERE, Experiment, Part, SizeName, names
 from experiments.paper_tables import CLOSE, error_table, further_table, lacking, order_table
 from experiments.room_tables import cost_table, descriptions, room_table, said, wrapped
 from experiments.rooms import Room
-from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError
+from photonfarm.core.errors import IncompleteError, PhotonfarmError
 from photonfarm.trainer.report.contents import FIXED_LIGHTS, MOVABLE_LIGHTS, PublishedTable
 
 PARTS: Mapping[Part, tuple[str, PublishedTable]] = {

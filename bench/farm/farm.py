@@ -21,8 +21,8 @@ from pathlib import Path
 from bench.farm.account import PARTS, Account, account
 from bench.farm.pairs import Pair, pairs
 from bench.harness import results
-from photonfarm.shared.plan.request import SHARD_ROWS
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.plan.request import SHARD_ROWS
+from photonfarm.scene.spec_loading import load_spec
 
 QUICK = {"jobs": 8, "rows": 4, "repetitions": 1}
 QUEUE_TARGET = 0.01

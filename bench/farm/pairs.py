@@ -18,12 +18,12 @@ from typing import Any, NamedTuple
 from bench.farm.account import planned
 from bench.farm.workers import make_sample
 from bench.harness.processes import Processes, answer
+from photonfarm.core.processes import tied
+from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.renderer.jobs import render as jobs
-from photonfarm.shared.core.processes import tied
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneStore
-from photonfarm.shared.store.format import markers
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneStore
+from photonfarm.store.format import markers
 
 SPINS = 12_000_000  # of a loop: about a second
 
@@ -75,7 +75,7 @@ def farm(folder: Path, options: argparse.Namespace, count: int) -> ConcurrentWor
     with EmbeddedRedis(folder / "redis") as redis:
         scene = planned(folder / "store", redis.url, options.jobs, options)
         told = {"PHOTONFARM_STORE": str(folder / "store"), "PHOTONFARM_REDIS_URL": redis.url}
-        verb = [sys.executable, "-m", "photonfarm.shared.cli", "work", "--until-complete", "--quiet", "--name"]
+        verb = [sys.executable, "-m", "photonfarm.cli", "work", "--until-complete", "--quiet", "--name"]
         running = [
             subprocess.Popen(tied([*verb, f"worker-{i}"]), env={**os.environ, **told}, stdin=subprocess.DEVNULL)
             for i in range(count)

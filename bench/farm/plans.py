@@ -71,9 +71,9 @@ NamedSteps = Iterable[tuple[str, Callable[[], Any]]]
 
 
 def submit(options: argparse.Namespace) -> NamedSteps:
-    from photonfarm.shared.farm import submission
-    from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.scene.spec_loading import NamedSpec
+    from photonfarm.farm import submission
+    from photonfarm.plan.request import Request
+    from photonfarm.scene.spec_loading import NamedSpec
 
     request = Request(modifications=options.samples // options.views, views_per_modification=options.views)
     store = options.folder / "store"
@@ -81,8 +81,8 @@ def submit(options: argparse.Namespace) -> NamedSteps:
 
 
 def reconcile(options: argparse.Namespace) -> NamedSteps:
-    from photonfarm.shared import queue
-    from photonfarm.shared.store import Store
+    from photonfarm import queue
+    from photonfarm.store import Store
 
     connection = queue.connect(options.redis)
     connection.flushall()
@@ -101,13 +101,13 @@ def fill(options: argparse.Namespace) -> NamedSteps:
 
 
 def status(options: argparse.Namespace) -> NamedSteps:
-    from photonfarm.shared.store import Store, store_status
+    from photonfarm.store import Store, store_status
 
     yield "status", lambda: store_status(Store(options.folder / "store"))
 
 
 def read(options: argparse.Namespace) -> NamedSteps:
-    from photonfarm.shared.store import SceneReader
+    from photonfarm.store import SceneReader
 
     generator = Markers(options.folder / "store")
     reader = SceneReader(options.folder / "store", generator.scene.scene_id)
@@ -120,8 +120,8 @@ def read(options: argparse.Namespace) -> NamedSteps:
 
 
 def again(options: argparse.Namespace) -> NamedSteps:
-    from photonfarm.shared.plan.top_up import TopUp
-    from photonfarm.shared.store import Store
+    from photonfarm.plan.top_up import TopUp
+    from photonfarm.store import Store
 
     scene = Store(options.folder / "store").scenes()[0]
     (plan,) = scene.plans()
@@ -133,8 +133,8 @@ class Markers:
     """Markers as commits would place them, of shards that are not there."""
 
     def __init__(self, root: Path) -> None:
-        from photonfarm.shared.store import Store
-        from photonfarm.shared.store.format import schema
+        from photonfarm.store import Store
+        from photonfarm.store.format import schema
 
         self.scene = Store(root).scenes()[0]
         (self.plan,) = self.scene.plans()
@@ -143,14 +143,14 @@ class Markers:
 
     def place(self, job: int) -> None:
         """Write one marker, not synced."""
-        from photonfarm.shared.store import Figures
-        from photonfarm.shared.store.format import markers
+        from photonfarm.store import Figures
+        from photonfarm.store.format import markers
 
         files = {self.plan.shard(name, array, job): array for name, array in self._arrays.items()}
         described = {
             file.removeprefix(f"{self.scene.name}/"): {"size": 1_000_000, "crc32c": "00000000"} for file in files
         }
-        versions = dict.fromkeys(("photonfarm-renderer", "photonfarm-shared", "mitsuba", "drjit", "numpy"), "1.0.0")
+        versions = dict.fromkeys(("photonfarm", "mitsuba", "drjit", "numpy"), "1.0.0")
         figures = asdict(Figures(core_s=12.345678, wall_s=12.5, redrawn=0, worker="bench-1", versions=versions))
         path = self.scene.storage.local(markers.name_of(self.scene.name, job))
         path.parent.mkdir(exist_ok=True)
@@ -162,8 +162,8 @@ class Markers:
 
 def measure(options: argparse.Namespace, folder: Path) -> tuple[list[StepCost], dict[str, int]]:
     """Every step in its process, and what Redis holds."""
-    from photonfarm.shared import queue
-    from photonfarm.shared.farm.redis_server import EmbeddedRedis
+    from photonfarm import queue
+    from photonfarm.farm.redis_server import EmbeddedRedis
 
     rows, sizes = [], {}
     with EmbeddedRedis(folder / "redis") as server:
@@ -189,7 +189,7 @@ def run(job: str, options: argparse.Namespace, folder: Path, redis_url: str) -> 
 
 
 def page(rows: list[StepCost], sizes: dict[str, int], options: argparse.Namespace) -> str:
-    from photonfarm.shared import queue
+    from photonfarm import queue
 
     lines = [
         [

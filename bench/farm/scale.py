@@ -24,7 +24,7 @@ from bench.farm import scale_bucket, scale_plans, scale_store, scale_workers
 from bench.farm.scale_costs import Measured, grown
 from bench.farm.scale_page import page
 from bench.harness import results
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.redis_server import EmbeddedRedis
 
 SAMPLES = (10_000, 31_600, 100_000, 316_000, 1_000_000)
 BUCKET = (64_000, 160_000, 400_000, 1_000_000)

@@ -73,10 +73,10 @@ def _variables(values: dict[str, str]) -> Iterator[None]:
 
 
 def _steps(url: str, samples: int, requests: Requests, direct: dict[str, str]) -> dict[str, Costs]:
-    from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.scene.spec_loading import NamedSpec
-    from photonfarm.shared.store import SceneReader, Store
-    from photonfarm.shared.store.format import markers
+    from photonfarm.plan.request import Request
+    from photonfarm.scene.spec_loading import NamedSpec
+    from photonfarm.store import SceneReader, Store
+    from photonfarm.store.format import markers
 
     spec = NamedSpec.load(SPEC).spec
     found: dict[str, Costs] = {}
@@ -112,7 +112,7 @@ def _steps(url: str, samples: int, requests: Requests, direct: dict[str, str]) -
 def _pace(url: str) -> Callable[[], object]:
     """The looks of a worker with --ahead at what is committed."""
     from photonfarm.renderer.worker.backpressure import TrainerPace
-    from photonfarm.shared.store import Store
+    from photonfarm.store import Store
 
     return TrainerPace(Store(url), None, 1.5)._progress  # type: ignore[arg-type]  # it asks Redis elsewhere
 

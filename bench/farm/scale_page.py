@@ -140,8 +140,8 @@ def _size(size: float) -> str:
 
 def _files() -> str:
     """The number of files and names, computed from the arrays that a scene has."""
-    from photonfarm.shared.scene.spec_loading import NamedSpec
-    from photonfarm.shared.store.format import schema
+    from photonfarm.scene.spec_loading import NamedSpec
+    from photonfarm.store.format import schema
 
     spec = NamedSpec.load(SPEC).spec
     outputs = len(schema.output_arrays(spec)) - 1  # radiance_wide is rare

@@ -21,11 +21,11 @@ def main() -> int:
 
 def costs(folder: Path, count: int) -> Costs:
     """A worker's start, keys of all samples, and a further submission, with so many plans."""
-    from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.scene.modification import modification_keys
-    from photonfarm.shared.scene.spec_loading import NamedSpec
-    from photonfarm.shared.store import SceneReader, Store
-    from photonfarm.shared.store.write import plans
+    from photonfarm.plan.request import Request
+    from photonfarm.scene.modification import modification_keys
+    from photonfarm.scene.spec_loading import NamedSpec
+    from photonfarm.store import SceneReader, Store
+    from photonfarm.store.write import plans
 
     spec = NamedSpec.load(SPEC).spec
     store = Store(folder / "store", create=True)

@@ -16,7 +16,7 @@ from typing import Any
 
 from bench.farm.plans import Markers
 from bench.farm.scale_operations import counted, forget_peak, peak_bytes, processor_s, resident_bytes
-from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.store.io.local import LocalStorage
 
 SPEC = "room"
 SHARD_ROWS = 32
@@ -62,7 +62,7 @@ def missing_of(jobs: int) -> list[int]:
 
 
 def _store(folder: Path) -> Any:
-    from photonfarm.shared.store import Store
+    from photonfarm.store import Store
 
     return Store(folder / "store")
 
@@ -72,9 +72,9 @@ def _store(folder: Path) -> Any:
 
 def plan(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """An empty store's first submission, without the queue."""
-    from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.scene.spec_loading import NamedSpec
-    from photonfarm.shared.store import Store
+    from photonfarm.plan.request import Request
+    from photonfarm.scene.spec_loading import NamedSpec
+    from photonfarm.store import Store
 
     spec, request = NamedSpec.load(SPEC).spec, Request(modifications=samples)
     store = Store(folder / "store", create=True)
@@ -94,7 +94,7 @@ def mark(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
 
 def plan_more(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """A later submission of a few samples, with another seed."""
-    from photonfarm.shared.plan.request import Request
+    from photonfarm.plan.request import Request
 
     store = _store(folder)
     spec = store.scenes()[0].spec
@@ -115,7 +115,7 @@ def worker(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
 
 def reconcile(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """An empty queue, filled with what is missing."""
-    from photonfarm.shared import queue
+    from photonfarm import queue
 
     connection = queue.connect(redis)
     connection.flushall()
@@ -137,14 +137,14 @@ def _commands(connection: Any) -> int:
 
 def status(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """`photonfarm status`, which sums up every marker."""
-    from photonfarm.shared.store import store_status
+    from photonfarm.store import store_status
 
     return timed(lambda: store_status(_store(folder)))
 
 
 def reader(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """A trainer's reader: its start, a look without news, and one after a new marker."""
-    from photonfarm.shared.store import SceneReader
+    from photonfarm.store import SceneReader
 
     markers = Markers(folder / "store")
     scene_id, last = markers.scene.scene_id, markers.jobs - 1
@@ -163,8 +163,8 @@ def reader(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
 
 def ahead(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """What --ahead costs a worker: a count of what is committed, and another one later."""
+    from photonfarm import queue
     from photonfarm.renderer.worker.backpressure import TrainerPace
-    from photonfarm.shared import queue
 
     connection, store = queue.connect(redis), _store(folder)
     first = timed(TrainerPace(store, connection, 1.5).ahead)
@@ -173,7 +173,7 @@ def ahead(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
 
 def find(folder: Path, samples: int, redis: str) -> Costs:  # noqa: ARG001
     """`store find` of one sample by its key."""
-    from photonfarm.shared.store.read.find import Query, find_samples
+    from photonfarm.store.read.find import Query, find_samples
 
     store = _store(folder)
     scene = store.scenes()[0]

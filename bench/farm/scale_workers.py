@@ -22,7 +22,7 @@ from typing import Any
 from bench.farm.plans import Markers
 from bench.farm.scale_operations import counted
 from bench.harness import results
-from photonfarm.shared.queue.job import QUEUE_KEY, STARTED_KEY
+from photonfarm.queue.job import QUEUE_KEY, STARTED_KEY
 
 PROCESSES = 4
 SHARD_ROWS = 2
@@ -48,7 +48,7 @@ def main() -> int:
 
 def play(store: str, redis: str, first: int, count: int) -> None:
     """Play the workers `first` … `first` + `count` − 1."""
-    from photonfarm.shared.store.io.local import LocalStorage
+    from photonfarm.store.io.local import LocalStorage
 
     _analytic().AnalyticScene.pause_s = JOB_S / SHARD_ROWS / 2
     looks: Counter[str] = Counter()
@@ -73,7 +73,7 @@ def _work(root: str, redis: str, number: int, looks: Counter[str], ready: thread
     """Be one worker, for as long as the process lives."""
     from photonfarm.renderer.worker.child import RenderWorker
     from photonfarm.renderer.worker.settings import WorkerSettings
-    from photonfarm.shared.store import Store
+    from photonfarm.store import Store
 
     class Played(RenderWorker):
         def _is_complete(self, paused: str | None) -> bool:
@@ -93,10 +93,10 @@ def _work(root: str, redis: str, number: int, looks: Counter[str], ready: thread
 
 def measured(folder: Path, workers: int) -> Costs:
     """What so many workers ask of Redis and of the store: while they work, and while they wait for one last job."""
-    from photonfarm.shared import queue
-    from photonfarm.shared.farm.redis_server import EmbeddedRedis
-    from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.store import Store
+    from photonfarm import queue
+    from photonfarm.farm.redis_server import EmbeddedRedis
+    from photonfarm.plan.request import Request
+    from photonfarm.store import Store
 
     store = Store(folder / "store", create=True)
     jobs = COMMITTED + workers * JOBS_EACH + 1

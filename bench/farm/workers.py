@@ -18,7 +18,7 @@ from typing import Any
 from bench.harness import results
 from bench.harness.processes import Processes, answer
 from bench.harness.scenes import square
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.scene.spec_loading import load_spec
 
 WARM_UP = 2  # samples
 
@@ -56,8 +56,8 @@ def serve(pipe: Any, name: str, size: int, threads: int) -> None:
 
 def make_sample(scene: Any, number: int) -> None:
     """All that a worker renders for one sample; sample n is the same in every process."""
-    from photonfarm.shared.scene.modification import sample_modification
-    from photonfarm.shared.scene.view import sample_view
+    from photonfarm.scene.modification import sample_modification
+    from photonfarm.scene.view import sample_view
 
     modification = sample_modification(scene.spec, 0, number)
     view = sample_view(scene.spec, modification.key(scene.spec.radiance_id), 0, 0)

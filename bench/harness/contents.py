@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.core.keys import Key, view_key
-from photonfarm.shared.core.records import (
+from photonfarm.core.keys import Key, view_key
+from photonfarm.core.records import (
     F32,
     BasePointCloud,
     Geometry,
@@ -22,12 +22,12 @@ from photonfarm.shared.core.records import (
     Visibility,
     arrays_of,
 )
-from photonfarm.shared.scene.modification import Modification, rebuild
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
-from photonfarm.shared.store.format.schema import RowKind, output_arrays
-from photonfarm.shared.store.format.shards import NOISY_GUIDES, encode, rounded
+from photonfarm.scene.modification import Modification, rebuild
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View
+from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
+from photonfarm.store.format.schema import RowKind, output_arrays
+from photonfarm.store.format.shards import NOISY_GUIDES, encode, rounded
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.records import F32
+from photonfarm.core.records import F32
 from photonfarm.trainer.predict.animation import enlarged
 
 if TYPE_CHECKING:

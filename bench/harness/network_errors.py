@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.statistics import Estimate, group_means
+from photonfarm.core.keys import Key
+from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.metrics.intervals import t_975
 
 F64 = NDArray[np.float64]

@@ -31,16 +31,16 @@ from torch.nn.functional import avg_pool2d
 
 from bench.harness.results import ROOT
 from experiments.experiment import Experiment, names
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import clean_error
-from photonfarm.shared.plan.hold_out import rows_held_out, units_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.read.merge import merge_view
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import clean_error
+from photonfarm.plan.hold_out import rows_held_out, units_of
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.read.merge import merge_view
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.metrics import metric_space

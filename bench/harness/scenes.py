@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from bench.harness.results import ROOT
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
 
 
 def ready_spec(name: str) -> SceneSpec:

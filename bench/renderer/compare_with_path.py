@@ -101,7 +101,7 @@ def render(scene: Any, integrator: dict[str, Any], seeds: range, spp: int) -> An
 
 def compare(name: str, plan: Plan, arguments: argparse.Namespace) -> tuple[PathComparison, dict[str, Any]]:
     """(line of the table, pictures) of one scene."""
-    from photonfarm.shared.core.statistics import block_z_test
+    from photonfarm.core.statistics import block_z_test
 
     scene = load(name, plan.size)
     common = {"max_depth": plan.max_depth, "rr_depth": 5}

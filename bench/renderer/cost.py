@@ -93,7 +93,7 @@ def measure_together(size: int, count: int, repetitions: int) -> SharedLaunch:
     import numpy as np
 
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
-    from photonfarm.shared.scene.view import sample_view
+    from photonfarm.scene.view import sample_view
 
     spec = scenes.in_passes(scenes.square(scenes.ready_spec("room"), size), HALF_SPP)
     scene = LoadedScene.load(spec, paths_at_once=2 * count * size * size * HALF_SPP)

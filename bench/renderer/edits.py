@@ -78,8 +78,8 @@ def measure(name: str, modifications: int, warm_up: int) -> tuple[Any, Modificat
     import drjit as dr
 
     from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
-    from photonfarm.shared.scene.modification import rebuild, rest, sample_modification
-    from photonfarm.shared.scene.view import sample_view
+    from photonfarm.scene.modification import rebuild, rest, sample_modification
+    from photonfarm.scene.view import sample_view
 
     spec = ready_spec(name)
     seen: set[str] = set()

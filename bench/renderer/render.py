@@ -30,7 +30,7 @@ from bench.renderer.peers import chosen, page, plot
 from bench.renderer.peers.measure import MeasureSettings, measure, say
 from bench.renderer.peers.plans import METHODS, PLANS, estimated_seconds
 from bench.renderer.scene_loading import load
-from photonfarm.shared.core.files import write_whole
+from photonfarm.core.files import write_whole
 
 
 def parse() -> argparse.Namespace:

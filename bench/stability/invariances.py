@@ -24,7 +24,7 @@ from bench.stability.scenes.cameras import scaled
 from bench.stability.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
 from bench.stability.scenes.truths import TRUTH_SEEDS, load, render
 from bench.stability.weights import weight_check
-from photonfarm.shared.core.statistics import BlockTest, block_z_test
+from photonfarm.core.statistics import BlockTest, block_z_test
 
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
 LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=512, resolution=0.005)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from bench.stability.pictures import FULL_Z
 from bench.stability.rows import ROWS
 from bench.stability.runner import ROUNDING, SIGNIFICANCE, SceneResult, plus_minus
-from photonfarm.shared.core.statistics import two_sided_limit
+from photonfarm.core.statistics import two_sided_limit
 
 if TYPE_CHECKING:
     from bench.stability.report import StabilityReport

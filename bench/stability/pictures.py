@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.stability.runner import Renders, SceneOutcome
-from photonfarm.shared.core.pictures import Picture, display
+from photonfarm.core.pictures import Picture, display
 
 SIDE = 96
 """The pixels of one picture's side on the sheet."""

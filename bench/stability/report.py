@@ -14,7 +14,7 @@ from bench.stability.pictures import keep, sheet, triple
 from bench.stability.rows import ROWS
 from bench.stability.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
 from bench.stability.scenes.case import BdptSettings, HardScene, Refusal
-from photonfarm.shared.core.pictures import Picture
+from photonfarm.core.pictures import Picture
 
 Label = TypeVar("Label", int, str)
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from bench.stability.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
 from bench.stability.scenes.truths import PATH, load, render
-from photonfarm.shared.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
+from photonfarm.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
 
 SIGNIFICANCE = 4e-6
 """The probability that a right scene fails with one pair of settings: 0.1 % for 250 pairs, more than there are."""

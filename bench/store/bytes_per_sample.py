@@ -13,16 +13,16 @@ from typing import Any
 import numpy as np
 
 from bench.harness.contents import Contents, Pool, commit, view_row
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.modification import rebuild
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.format import schema
-from photonfarm.shared.store.format.schema import ArraySchema
-from photonfarm.shared.store.format.shards import ShardWriter, encode
-from photonfarm.shared.store.read.batch import GUIDE_NAMES
+from photonfarm.core.keys import Key
+from photonfarm.core.records import arrays_of
+from photonfarm.plan.request import Request
+from photonfarm.scene.modification import rebuild
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.format import schema
+from photonfarm.store.format.schema import ArraySchema
+from photonfarm.store.format.shards import ShardWriter, encode
+from photonfarm.store.read.batch import GUIDE_NAMES
 
 COUNTS = (1, 2, 4, 8)
 

@@ -75,8 +75,8 @@ def reading(store: Path, scene_id: str, bare: Path) -> dict[str, Callable[..., N
     import zarr
     from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 
-    from photonfarm.shared.store import SceneReader
-    from photonfarm.shared.store.read.batch import Batch
+    from photonfarm.store import SceneReader
+    from photonfarm.store.read.batch import Batch
 
     reader = SceneReader(store, scene_id)
     rows = reader.refresh()
@@ -126,7 +126,7 @@ def draws(rows: Any, seed: int, batches: int) -> Iterator[list[int]]:
 
 def writing(store: Path, scene_id: str, bare: Path, pool: Path) -> dict[str, Callable[..., None]]:
     """Ways to write a job: through the store, of values or of bytes, or the same sizes under the same names."""
-    from photonfarm.shared.store import Store
+    from photonfarm.store import Store
 
     scene, contents = Store(store).scene(scene_id), Pool.load(pool)
     encoded_contents = EncodedPool(contents, scene.spec)
@@ -244,7 +244,7 @@ def turned(ways: list[str], i: int) -> list[str]:
 
 def bare_arrays(store: Path, scene_id: str, folder: Path) -> None:
     """The samples of a store as one plain .npy file for each array, a row for each sample."""
-    from photonfarm.shared.store import SceneReader
+    from photonfarm.store import SceneReader
 
     reader = SceneReader(store, scene_id)
     rows = reader.refresh()
@@ -353,8 +353,8 @@ def main() -> int:
 
 def run(folder: Path, options: argparse.Namespace) -> tuple[list[StoreSpeed], Any, Any]:
     """All measurements: the bytes, which renders the contents, then reading and writing."""
-    from photonfarm.shared.plan.request import Request
-    from photonfarm.shared.scene.spec_loading import load_spec
+    from photonfarm.plan.request import Request
+    from photonfarm.scene.spec_loading import load_spec
 
     spec = square(load_spec(options.spec), options.size)
     contents = Contents(spec)

@@ -14,10 +14,10 @@ from typing import TypeVar
 import numpy as np
 
 from bench.harness.room_study import HELD_OUT, ChosenSamples
-from photonfarm.shared.core.records import Guides, ViewBuffers
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store.read.batch import Batch, Sample
-from photonfarm.shared.store.read.reader import SceneReader
+from photonfarm.core.records import Guides, ViewBuffers
+from photonfarm.plan.request import Request
+from photonfarm.store.read.batch import Batch, Sample
+from photonfarm.store.read.reader import SceneReader
 
 HALF_SPP = 1  # of what is rendered
 PASS_SPP = 2 * HALF_SPP

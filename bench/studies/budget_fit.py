@@ -1,6 +1,6 @@
 """How much of the measured errors the allocation's model explains, and its constants κ and ρ.
 
-`photonfarm.shared.plan.allocation` has the model. Each room has an error a that endless data would leave and a scale b
+`photonfarm.plan.allocation` has the model. Each room has an error a that endless data would leave and a scale b
 of the excess above it; κ and ρ are common to all.
 
 Shape letters: A arms of a room, G places of the grid, R replicates of the bootstrap.
@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 
 from bench.harness.network_errors import F64, Errors, own_errors, replicates, within
-from photonfarm.shared.plan.allocation import Allocation, excess
+from photonfarm.plan.allocation import Allocation, excess
 
 KAPPAS = np.geomspace(0.1, 3000, 60)
 RHOS = np.concatenate([[0.0], np.geomspace(0.03, 30, 40)])

@@ -6,7 +6,7 @@
 A room is a built-in spec, or an experiment of experiments/ in its small size. Costs and noise are measured as by
 `photonfarm scene cost`, best on a quiet machine; each arm of `budget_arms.SHARES` gets as many configurations as the
 budget pays for, is trained on from each seed, on other configurations each time, and measured on the same held-out
-views. The constants of `photonfarm.shared.plan.allocation` are fitted to all arms of all rooms. What is rendered and
+views. The constants of `photonfarm.plan.allocation` are fitted to all arms of all rooms. What is rendered and
 trained stays in build/noise_budget, and the next call goes on with it. PHOTONFARM_SCENES names the folder of the
 rooms' scene files. Exit code 0, whatever comes out.
 """
@@ -31,14 +31,14 @@ from bench.harness.room_study import HELD_OUT, ReferenceViews, Run, in_processes
 from bench.harness.scenes import in_passes
 from bench.studies.budget_arms import HALF_SPP, SHARES, ArmSamples, Share, requests
 from bench.studies.budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.plan.allocation import Allocation, CostModel, seconds
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.core.errors import SpecError
+from photonfarm.core.files import write_whole
+from photonfarm.plan.allocation import Allocation, CostModel, seconds
+from photonfarm.plan.request import Request
+from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.plan.top_up import TopUp
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneReader, Store
 
 ROOMS = ["movable-living-room-2", "movable-dining-room"]
 HELD_OUT_VIEWS = 48
@@ -269,12 +269,12 @@ samples per pixel (spp) of a pass. For each arm alike {room_study.described(sett
 **A sample of s spp** is an image of which each half has s/2. It is put together of independent passes with
 {2 * HALF_SPP} spp, so that its noise falls with 1/s: rendered at once it would be stratified, and less noisy. It is
 charged what it would cost rendered at once, by a line through the times of two numbers of spp; the variance given
-below, relative to squared brightness (`photonfarm.shared.plan.sample_costs.relative_variance`), is that of the
+below, relative to squared brightness (`photonfarm.plan.sample_costs.relative_variance`), is that of the
 passes. Passes of a view are samples of their own. **MSE** is in the metric space, the references' noise taken out;
 **linear MSE** in exposed linear radiance.
 {of_intervals(len(arguments.seeds))}
 
-**The model** is that of `photonfarm.shared.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and
+**The model** is that of `photonfarm.plan.allocation`, error = a + b · (ρ/M + (1 + ν/(κ·P·s))/(M·V)), with a and
 b of each room and κ and ρ of all: κ = {found.kappa:.3g} ({kappas}), ρ = {found.rho:.3g} ({rhos}); χ² is
 {found.chi2:.1f} with {found.freedom} degrees of freedom. Arms are weighted by standard errors without what the arms
 of a room have in common, which a and b absorb: how hard a configuration is, as a share of the mean. Ranges are 95 %

@@ -30,12 +30,12 @@ from bench.studies import path_data_page, path_scene
 from bench.studies.path_data_study import BLOCK, Arm, MeasuredArm, Study, Targets
 from bench.studies.path_scene import Rendered
 from experiments.experiment import Experiment
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import F32
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneReader
 
 BUDGETS = {"bdpt": (0.25, 0.5, 1.0), "path": (0.25, 0.5, 1.0, 2.0, 4.0)}
 HELD_OUT = 1 / 4  # of configurations: with a sixteenth as elsewhere few would be held out from so few samples

@@ -10,9 +10,9 @@ from bench.harness.room_study import ReferenceViews
 from bench.studies import path_statistics
 from bench.studies.path_scene import Costs, Rendered
 from bench.studies.path_statistics import BudgetFactor
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.runs.settings import TrainSettings
 
 BLOCK = 8  # px

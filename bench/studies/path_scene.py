@@ -23,17 +23,17 @@ from typing import Any
 import numpy as np
 
 from bench.harness.room_study import in_processes, planned, render_job
+from photonfarm.core.files import write_whole
+from photonfarm.core.records import F32
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View, sample_view
-from photonfarm.shared.store import Store
+from photonfarm.scene.modification import sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View, sample_view
+from photonfarm.store import Store
 
 SHARD_ROWS = 16  # small jobs: those of both kinds take turns, so that both are timed on the same machine
 TIMED_SEED = 1 << 40  # of configurations that are only timed; no plan has it by chance

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.harness.network_errors import F64, Errors, replicates, within
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32
 from photonfarm.trainer.training.losses import RELATIVE_EPSILON
 
 

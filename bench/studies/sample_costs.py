@@ -3,7 +3,7 @@
     python -m bench.studies.sample_costs [--budget 2000] [--views 12] [--out DIR]
 
 Measures the scenes of experiments/ in their small size as `photonfarm scene cost` does, and puts costs and noise into
-`photonfarm.shared.plan.allocation`. PHOTONFARM_SCENES names the folder of the scene files. Exit code 0.
+`photonfarm.plan.allocation`. PHOTONFARM_SCENES names the folder of the scene files. Exit code 0.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ from dataclasses import asdict, dataclass
 
 from bench.harness import results, room_study
 from experiments.experiment import names
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.allocation import KAPPA, RHO, Allocation, CostModel
-from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.core.errors import SpecError
+from photonfarm.plan.allocation import KAPPA, RHO, Allocation, CostModel
+from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.scene.spec import SceneSpec
 
 NAME = "sample_costs"
 SPP = (2, 4, 8, 32, 128)
@@ -84,11 +84,11 @@ def page(rooms: list[RoomCosts], budget: float, views: int) -> str:
     return f"""# What samples cost, how noisy they are, and how many samples per pixel that asks for
 
 Scenes of `experiments/` in their small size; core-milliseconds, medians over {views} views. ν is the
-variance of one sample per pixel over squared brightness (`photonfarm.shared.plan.sample_costs.relative_variance`), from
+variance of one sample per pixel over squared brightness (`photonfarm.plan.sample_costs.relative_variance`), from
 halves of the scene's samples per pixel, which are stratified: with fewer it is somewhat more. s* is the samples per
 pixel, both halves together, of least excess error with one view of each configuration, a guide to a factor of two
 ([choosing-spp.md](../choosing-spp.md)), and “best” the best of all shares with 2 spp and more
-(`photonfarm.shared.plan.allocation`, κ = {KAPPA:g}, ρ = {RHO:g}). The last columns: the excess error of the same
+(`photonfarm.plan.allocation`, κ = {KAPPA:g}, ρ = {RHO:g}). The last columns: the excess error of the same
 core-seconds spent on single views of so many spp, over that of the best.
 
 {results.table(header, (line(room, budget) for room in rooms))}"""

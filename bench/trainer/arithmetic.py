@@ -27,11 +27,11 @@ from bench.harness import results
 from bench.harness.contents import Contents, commit
 from bench.harness.scenes import square
 from bench.trainer.rounded_convolutions import round_factors
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import Estimate, clean_error
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import Estimate, clean_error
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.data.sampler import RoundSampler

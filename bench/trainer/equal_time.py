@@ -22,9 +22,9 @@ import torch
 from bench.harness import results, room_study
 from bench.harness.network_errors import Errors, of_intervals
 from bench.harness.scenes import in_passes, square
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics import mssim
 from photonfarm.trainer.metrics.image_metrics import metric_space

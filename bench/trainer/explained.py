@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.harness.network_errors import F64, Errors, replicates, within
-from photonfarm.shared.core.keys import Key
+from photonfarm.core.keys import Key
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -27,15 +27,15 @@ import click
 import numpy as np
 from pydantic import ValidationError
 
-from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.keys import Key, make_key
-from photonfarm.shared.core.models import sentences
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.core.statistics import Estimate, group_means, stated
-from photonfarm.shared.plan.hold_out import rows_held_out, units_of
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
+from photonfarm.core.files import write_whole
+from photonfarm.core.keys import Key, make_key
+from photonfarm.core.models import sentences
+from photonfarm.core.processes import Stop
+from photonfarm.core.statistics import Estimate, group_means, stated
+from photonfarm.plan.hold_out import rows_held_out, units_of
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.cli.train_verb import by_key
 from photonfarm.trainer.cli.train_verb import train as train_verb
 from photonfarm.trainer.compare.comparison import markdown_table

@@ -29,19 +29,19 @@ from bench.harness.network_errors import F64, Errors
 from bench.harness.scenes import in_passes
 from bench.trainer.explained import Change, Explained
 from bench.trainer.moved_lamps_page import KNOWN, ExplainedChange, LampStudy, document, page, stated
+from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError
+from photonfarm.core.keys import Key, seed_of, view_key
+from photonfarm.core.records import F32, BasePointCloud, Geometry, ViewBuffers
 from photonfarm.data.torch_dataset import SampleTensors
+from photonfarm.plan.hold_out import units_of
 from photonfarm.renderer.jobs.path_buffers import frames_of
 from photonfarm.renderer.jobs.render import SceneRenderer, load_scene, located
-from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError
-from photonfarm.shared.core.keys import Key, seed_of, view_key
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, ViewBuffers
-from photonfarm.shared.plan.hold_out import units_of
-from photonfarm.shared.scene.files import BUILTIN_EMITTING, SceneFile
-from photonfarm.shared.scene.modification import Modification, sample_modification
-from photonfarm.shared.scene.spec import Light, Movable, SceneSpec, shape_ids
-from photonfarm.shared.scene.spec_loading import find_scene, load_spec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import Sample, SceneReader, Store
+from photonfarm.scene.files import BUILTIN_EMITTING, SceneFile
+from photonfarm.scene.modification import Modification, sample_modification
+from photonfarm.scene.spec import Light, Movable, SceneSpec, shape_ids
+from photonfarm.scene.spec_loading import find_scene, load_spec
+from photonfarm.scene.view import View
+from photonfarm.store import Sample, SceneReader, Store
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.metrics import metric_space

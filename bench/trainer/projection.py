@@ -21,7 +21,7 @@ import torch
 
 from bench.harness import results
 from bench.trainer.projection_rooms import Counts, LoadedRoom, Viewed
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs.settings import Occlusion
 
 TARGET_ROOMS = ("living-room", "living-room-2", "dining-room", "veach-ajar")

@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.records import F32, STATIC, Geometry
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera
+from photonfarm.core.records import F32, STATIC, Geometry
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera
 
 F64 = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ def _met(corners: F64, ends: F64) -> tuple[NDArray[np.int64], F64]:
 
 
 def sees(corners: F64, camera: Camera, spec: SceneSpec, position: F32) -> NDArray[np.bool_]:
-    """Which points a camera sees, (P,), as `photonfarm.shared.core.records.Visibility` defines it."""
+    """Which points a camera sees, (P,), as `photonfarm.core.records.Visibility` defines it."""
     found = in_image(camera, spec, position)
     found[found] = first_met(corners, camera, spec, position[found]) > 1 - SELF_HIT
     return found

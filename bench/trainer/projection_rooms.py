@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from bench.harness.scenes import ready_spec, square
 from bench.trainer.projection_oracle import in_image, sees, triangles
-from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry, ViewBuffers
-from photonfarm.shared.scene.modification import rebuild, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera, View, sample_view
+from photonfarm.core.records import F32, STATIC, BasePointCloud, Geometry, ViewBuffers
+from photonfarm.scene.modification import rebuild, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View, sample_view
 from photonfarm.trainer.networks.projection import Optics, footprint
 from photonfarm.trainer.runs.settings import Occlusion
 

@@ -25,11 +25,11 @@ from torch import Tensor
 from bench.harness import results
 from bench.harness.contents import Contents, commit
 from bench.harness.scenes import square
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.read.batch import Batch
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.read.batch import Batch
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES

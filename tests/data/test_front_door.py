@@ -21,14 +21,14 @@ import torch
 import photonfarm.data
 import photonfarm.renderer
 import photonfarm.trainer
+from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.keys import seed_of
+from photonfarm.core.records import arrays_of
 from photonfarm.data import Scene, open_scene
-from photonfarm.shared.core.errors import SpecError, StoreError
-from photonfarm.shared.core.keys import seed_of
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
-from photonfarm.shared.store.read.find import Query, find_samples
+from photonfarm.plan.hold_out import are_held_out
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.store.read.find import Query, find_samples
 
 
 @pytest.fixture(params=["folder", "bucket"])

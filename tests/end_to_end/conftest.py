@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import pytest
 
-from photonfarm.shared.cli.main import umbrella
+from photonfarm.cli.main import umbrella
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -21,7 +21,7 @@ def photonfarm_in() -> Callable[[Path], Command]:
     def command(folder: Path) -> Command:
         def run(*args: str | Path, timeout: float = 300, **environment: str) -> subprocess.CompletedProcess[str]:
             return subprocess.run(
-                [sys.executable, "-m", "photonfarm.shared.cli", *map(str, args)],
+                [sys.executable, "-m", "photonfarm.cli", *map(str, args)],
                 cwd=folder, capture_output=True, text=True, timeout=timeout, check=False,
                 env={**os.environ, "PHOTONFARM_REDIS_URL": "redis://127.0.0.1:1/0", **environment},
             )  # fmt: skip
@@ -40,9 +40,9 @@ def photonfarm(photonfarm_in: Callable[[Path], Command], tmp_path: Path) -> Comm
 @pytest.fixture(scope="session")
 def small_room_in() -> Callable[[Path], Path]:
     """Writes the ready spec `room`, at 16² and with a small cloud: its kernels, at a fraction of its time."""
-    import photonfarm.shared
+    import photonfarm.scene
 
-    text = (Path(photonfarm.shared.__file__).parent / "scene/specs/room.toml").read_text()
+    text = (Path(photonfarm.scene.__file__).parent / "specs/room.toml").read_text()
     text = re.sub(r"(?m)^(width|height) = .*$", r"\1 = 16", re.sub(r"(?m)^points = .*$", "points = 512", text))
 
     def write(folder: Path) -> Path:

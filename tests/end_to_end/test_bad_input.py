@@ -12,14 +12,14 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from photonfarm.cli.main import main
+from photonfarm.core.errors import SpecError
+from photonfarm.farm.submission import check_hold_out, chosen_hold_out, submit
+from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.cli.main import main
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.farm.submission import check_hold_out, chosen_hold_out, submit
-from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.scene.spec_loading import NamedSpec, load_spec
+from photonfarm.store import SceneReader, Store
 
 Ended = subprocess.CompletedProcess[str]
 
@@ -225,18 +225,33 @@ def test_up_checks_the_hold_out_that_the_trainer_makes(analytic: ModuleType, tmp
 
 
 @pytest.mark.parametrize(
-    ("verb", "distribution"),
-    [("train", "photonfarm-trainer); --train-steps 0 renders only"), ("work", "photonfarm-renderer)")],
+    ("package", "said"),
+    [
+        (
+            "torch",
+            "`photonfarm train` needs the package torch: pip install 'photonfarm[train]'; --train-steps 0 renders",
+        ),
+        ("mitsuba", "`photonfarm work` needs the package mitsuba: pip install 'photonfarm[render]'"),
+    ],
 )
 def test_up_without_a_trainer_or_a_worker_says_so_before_it_writes_anything(
-    tmp_path: Path, verb: str, distribution: str
+    tmp_path: Path, package: str, said: str
 ) -> None:
-    code = f"from photonfarm.shared.cli import main; main._installed().pop('{verb}'); main.main(['up', 'room'])"
+    code = (
+        "from photonfarm.cli import farm_verbs, main; "
+        f"farm_verbs.find_spec = lambda name: None if name == '{package}' else name; main.main(['up', 'room'])"
+    )
     result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert result.returncode == 2
-    assert f"photonfarm {verb}" in result.stderr
-    assert distribution in " ".join(result.stderr.replace("│", " ").split())
+    assert said in " ".join(result.stderr.replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_verb_that_lacks_a_package_names_the_extra_that_brings_it(tmp_path: Path) -> None:
+    code = "import sys; sys.modules['torch'] = None; from photonfarm.cli import main; main.main(['evaluate'])"
+    (tmp_path / "run").mkdir()
+    result = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert (result.returncode, "pip install 'photonfarm[train]'" in result.stderr) == (2, True)
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.submission import submit
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.submission import submit
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import SceneStore, Store
 
 pytestmark = [
     pytest.mark.skipif(not Path("/proc").is_dir(), reason="looks at processes through /proc"),
@@ -52,7 +52,7 @@ def test_up_stopped_killed_and_robbed_of_its_redis_goes_on_and_leaves_nothing_be
     tmp_path: Path, small_room: Path
 ) -> None:
     def start(modifications: int, steps: int) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "photonfarm.shared.cli", "up", small_room.name, "--shard-rows", "4"]
+        command = [sys.executable, "-m", "photonfarm.cli", "up", small_room.name, "--shard-rows", "4"]
         command += ["--modifications", str(modifications), "--train-steps", str(steps), "--workers", "1"]
         return subprocess.Popen(
             command, cwd=tmp_path, stderr=subprocess.DEVNULL, start_new_session=True, preexec_fn=interruptible
@@ -101,7 +101,7 @@ def started(folder: Path, *verb: str, **environment: str) -> subprocess.Popen[by
     """A verb in a folder, with what it says in the file `said`."""
     with (folder / "said").open("wb") as said:
         return subprocess.Popen(
-            [sys.executable, "-m", "photonfarm.shared.cli", *verb],
+            [sys.executable, "-m", "photonfarm.cli", *verb],
             cwd=folder, stderr=said, start_new_session=True, preexec_fn=interruptible, env=os.environ | environment,
         )  # fmt: skip
 

@@ -17,13 +17,13 @@ import pytest
 import yaml
 from redis import Redis
 
-from photonfarm.shared.farm.running_farm import METRICS_PORT
-from photonfarm.shared.queue.rq_adapter import open_queue
+from photonfarm.farm.running_farm import METRICS_PORT
+from photonfarm.queue.rq_adapter import open_queue
 
 ROOT = Path(__file__).parents[2]
 CHART, KUSTOMIZE = ROOT / "deploy/helm/photonfarm", ROOT / "deploy/kustomize"
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
-VERSION = tomllib.loads((ROOT / "shared/pyproject.toml").read_text())["project"]["version"]
+VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 
 DOCUMENTS: list[dict[str, Any]] = [
     document

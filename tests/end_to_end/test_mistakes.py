@@ -153,7 +153,7 @@ def test_submit_says_so_if_training_will_refuse_what_it_plans(here: Path) -> Non
 
 
 def test_a_full_disk_is_told(here: Path) -> None:
-    command = [sys.executable, "-m", "photonfarm.shared.cli", "submit", "room", "--no-queue"]
+    command = [sys.executable, "-m", "photonfarm.cli", "submit", "room", "--no-queue"]
     full = subprocess.run(
         command, capture_output=True, text=True, check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)),

@@ -17,13 +17,13 @@ from types import ModuleType
 import pytest
 from refusals import refused, said
 
-import photonfarm.shared
+import photonfarm.scene
+from photonfarm.cli.main import main
+from photonfarm.farm.submission import submit
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.cli.main import main
-from photonfarm.shared.farm.submission import submit
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import Store
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import Store
 
 NET = """
 from torch import nn
@@ -47,7 +47,7 @@ Doing = Callable[[Path], object]
 def prepared(tmp_path_factory: pytest.TempPathFactory, analytic: ModuleType) -> Path:
     """A folder with the spec den.toml, a store with its samples, another store, and two trained runs."""
     folder = tmp_path_factory.mktemp("mistakes")
-    text = (Path(photonfarm.shared.__file__).parent / "scene/specs/room.toml").read_text()
+    text = (Path(photonfarm.scene.__file__).parent / "specs/room.toml").read_text()
     text = re.sub(r"(?m)^(width|height) = .*$", r"\1 = 16", re.sub(r"(?m)^points = .*$", "points = 64", text))
     (folder / "den.toml").write_text(text.replace('name = "room"', 'name = "den"'))
     request = Request(modifications=12, views_per_modification=1)

@@ -19,8 +19,8 @@ import pytest
 import store_samples as samples
 import torch
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import Store
+from photonfarm.plan.request import Request
+from photonfarm.store import Store
 from photonfarm.trainer.training.unbiasedness import judged
 
 ROOT = Path(__file__).parents[2]
@@ -181,7 +181,7 @@ def test_the_tutorial_leads_from_an_empty_folder_to_pictures_of_a_room_and_to_sa
     (tmp_path / "checkout/docs").symlink_to(ROOT / "docs")
     monkeypatch.chdir(tmp_path / "checkout")
     monkeypatch.setenv("PHOTONFARM_REDIS_URL", "redis://127.0.0.1:1/0")
-    ours = f'python() {{ {sys.executable} "$@"; }}\nphotonfarm() {{ python -m photonfarm.shared.cli "$@"; }}'
+    ours = f'python() {{ {sys.executable} "$@"; }}\nphotonfarm() {{ python -m photonfarm.cli "$@"; }}'
     done = subprocess.run(["bash", "-ec", f"{ours}\n{lines}"], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 

@@ -19,8 +19,8 @@ import pytest
 import slurm_cluster
 from slurm_cluster import Cluster
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.store import SceneStore, Store
 
 ROOT = Path(__file__).parents[2]
 
@@ -53,9 +53,9 @@ def folder(tmp_path: Path) -> Path:
     """A folder whose name has to be quoted, with the spec of a tiny room in it."""
     folder = tmp_path / "a farm"
     folder.mkdir()
-    import photonfarm.shared
+    import photonfarm.scene
 
-    text = (Path(photonfarm.shared.__file__).parent / "scene/specs/cornell.toml").read_text()
+    text = (Path(photonfarm.scene.__file__).parent / "specs/cornell.toml").read_text()
     for key, value in {"width": 32, "height": 32, "points": 512}.items():
         text, found = re.subn(rf"(?m)^{key} = .*$", f"{key} = {value}", text)
         assert found == 1, key

@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 import redis
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.submission import submit
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import NamedSpec
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.submission import submit
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec_loading import NamedSpec
 
 MOST_CPU_S = 1.2
 """Of a start: three times what it takes on a quiet machine."""
@@ -24,7 +24,7 @@ HEAVY = {"torch", "mitsuba", "drjit", "zarr", "scipy", "matplotlib", "trimesh", 
 
 CODE = """
 import json, sys
-from photonfarm.shared.cli.main import main
+from photonfarm.cli.main import main
 try:
     main(sys.argv[1:])
 finally:
@@ -77,7 +77,7 @@ def test_status_with_a_redis_loads_nothing_that_only_shards_need(
 def test_garbage_is_collected_again_after_loading() -> None:
     code = """
 import gc
-from photonfarm.shared.cli.options import StorePlace
+from photonfarm.cli.options import StorePlace
 StorePlace().convert("store", None, None)
 print(gc.isenabled(), gc.get_freeze_count() > 0)
 """
@@ -88,7 +88,7 @@ print(gc.isenabled(), gc.get_freeze_count() > 0)
 @pytest.mark.usefixtures("hears_ctrl_c")
 @pytest.mark.parametrize(("verb", "code"), [(["scene", "plan"], -signal.SIGINT), (["submit", "--dry-run"], 130)])
 def test_ctrl_c_ends_a_measurement_within_two_seconds(tmp_path: Path, verb: list[str], code: int) -> None:
-    command = [sys.executable, "-m", "photonfarm.shared.cli", *verb, "cornell"]
+    command = [sys.executable, "-m", "photonfarm.cli", *verb, "cornell"]
     environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
     with subprocess.Popen(
         command, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True, start_new_session=True

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared.store import Store
+from photonfarm.store import Store
 
 ROOT = Path(__file__).parents[2]
 

@@ -12,7 +12,7 @@ import pytest
 from experiments import equal_time, paper_tables, room_tables, tables
 from experiments.experiment import Experiment, SizeName
 from experiments.rooms import Room
-from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.core.errors import IncompleteError, SpecError
 
 NETWORKS = ("light_transport_photons", "light_transport", "feature_projection", "cnn")
 MACHINE = {"cpu": "Some CPU", "cores": 2, "architecture": "x86_64", "load_average": [0.4, 0.6, 1.2]}

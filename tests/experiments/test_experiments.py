@@ -18,10 +18,10 @@ from experiments.paper_tables import error_table
 from experiments.room_tables import room_table
 from experiments.rooms import Room
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec import Emitters
-from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
+from photonfarm.core.errors import SpecError
+from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.scene.spec import Emitters
+from photonfarm.scene.spec_loading import SCENES_VARIABLE
 from photonfarm.trainer.report.contents import MOVABLE_LIGHTS
 
 ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
@@ -105,7 +105,7 @@ loss = "relative"
 
 @pytest.fixture
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
-    from photonfarm.shared.scene.spec_loading import find_spec
+    from photonfarm.scene.spec_loading import find_spec
 
     monkeypatch.setattr(experiment, "HERE", tmp_path)
     (tmp_path / "tiny.toml").write_text(TINY)

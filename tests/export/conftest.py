@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from exports import commit, planned
 
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from pyarrow import parquet
 
 from photonfarm.export.export import Result, export_scene
 from photonfarm.export.settings import ExportRequest
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
 
 FORMATS = ("webdataset", "exr", "npz", "parquet")
 BRIGHT = 3  # a row whose radiance float16 cannot hold

@@ -11,12 +11,12 @@ import pytest
 import store_samples as samples
 from exports import BRIGHT, FORMATS, exported, planned, read, several
 
+from photonfarm.cli.main import main
 from photonfarm.data import Sample, open_scene
 from photonfarm.export.columns import ranges, rows_in, spans
 from photonfarm.export.export import export_scene
 from photonfarm.export.settings import ExportRequest
-from photonfarm.shared.cli.main import main
-from photonfarm.shared.store import SceneStore
+from photonfarm.store import SceneStore
 
 GUIDES = tuple(samples.guides(samples.small_spec(), 0).__dataclass_fields__)
 

@@ -11,8 +11,8 @@ import yaml
 from exports import exported, planned, several
 
 from photonfarm.data import open_scene
-from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store import SceneStore
+from photonfarm.scene.view import Camera
+from photonfarm.store import SceneStore
 
 
 def test_the_cameras_of_transforms_show_what_the_samples_show(scene: SceneStore, tmp_path: Path) -> None:

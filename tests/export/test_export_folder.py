@@ -10,9 +10,9 @@ import pytest
 import store_samples as samples
 from exports import FORMATS, commit, exported, planned, read, several
 
+from photonfarm.core.errors import CorruptError, IncompleteError, SpecError, StoreError
 from photonfarm.export.columns import rows_in
-from photonfarm.shared.core.errors import CorruptError, IncompleteError, SpecError, StoreError
-from photonfarm.shared.store import SceneStore
+from photonfarm.store import SceneStore
 
 # --------------------------------------------------------------------------------------------- going on, and growing
 
@@ -147,6 +147,6 @@ def test_a_missing_package_is_named_before_a_folder_is_made(
     scene: SceneStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(StoreError, match=rf"{package}.*photonfarm-shared\[export\]"):
+    with pytest.raises(StoreError, match=rf"{package}.*photonfarm\[export\]"):
         exported(scene, tmp_path / "out", to)
     assert not (tmp_path / "out").exists()

@@ -11,8 +11,8 @@ import store_samples as samples
 from photonfarm.export.card import READING
 from photonfarm.export.export import export_scene
 from photonfarm.export.settings import ExportRequest, FormatName
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import Store
+from photonfarm.plan.request import Request
+from photonfarm.store import Store
 
 PAGE = Path(__file__).parents[2] / "docs/export.md"
 

@@ -16,16 +16,16 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import BackendError
+from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.core.errors import BackendError
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.format.schema import output_arrays
-from photonfarm.shared.store.format.shards import NOISY_GUIDES
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import GuideSpec, SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.view import View
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.format.schema import output_arrays
+from photonfarm.store.format.shards import NOISY_GUIDES
 
 FOLDER = Path(__file__).parent  # on sys.path, it makes this module known to a process of its own
 
@@ -132,7 +132,7 @@ def start_worker(
     code = """
 import json, sys
 from photonfarm.renderer.worker.worker import run_worker
-from photonfarm.shared.core.errors import PhotonfarmError
+from photonfarm.core.errors import PhotonfarmError
 store, url, child, settings = json.loads(sys.argv[1])
 try:
     run_worker(store, url, child=child, **settings)

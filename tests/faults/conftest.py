@@ -4,8 +4,8 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.store import SceneReader, SceneStore
+from photonfarm.store import SceneReader, SceneStore
 
 YEAR_S = 365 * 86400
 ENDED_S = 60.0  # for a process to end that nobody talks to any more
@@ -53,11 +53,11 @@ MACHINE = """
 import contextlib, io, json, sys, traceback
 from pathlib import Path
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import WorkerReport, connect, queue_status, reconcile
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.plan.request import Request
+from photonfarm.queue import WorkerReport, connect, queue_status, reconcile
+from photonfarm.store import Store
+from photonfarm.store.check.check import check_store
+from photonfarm.plan.top_up import TopUp
 sys.path.append(sys.argv[1])
 sys.path.append(sys.argv[1] + "/../shared")
 import analytic_scene as analytic

@@ -16,8 +16,8 @@ import numpy as np
 import zarr
 
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format.markers import name_of
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.format.markers import name_of
 
 CHILD = """
 import os, sys

@@ -21,11 +21,11 @@ import analytic_scene as analytic
 import redis
 import soak_evidence as evidence
 
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, reconcile
 from photonfarm.renderer.worker.settings import GRACE_S
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, reconcile
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.store import SceneStore, Store
 
 HEARTBEAT_TTL_S = 2.0
 STOPPED_S = 20.0  # at most, where nobody takes the job meanwhile

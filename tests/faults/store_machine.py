@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, precondition, rule
 from store_model import Model, Planned, Writer, base_of
 
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.plan.request import UNUSED, Request
-from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.core.errors import IncompleteError
+from photonfarm.plan.request import UNUSED, Request
+from photonfarm.plan.top_up import TopUp, spp_per_pass
+from photonfarm.store import SceneStore, Store
 
 SPECS = (
     samples.small_spec(),

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import store_samples as samples
 
-from photonfarm.shared.core.records import BasePointCloud, Geometry, Guides, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.plan.request import UNUSED, PlannedContent, Request, expand, sample_key
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.core.records import BasePointCloud, Geometry, Guides, ViewBuffers, Visibility, arrays_of
+from photonfarm.plan.request import UNUSED, PlannedContent, Request, expand, sample_key
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneReader, SceneStore
+from photonfarm.store.format.shards import NOISY_GUIDES, rounded
 
 # ------------------------------------------------------------------------------ what is rendered: a function of content
 

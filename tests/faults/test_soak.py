@@ -9,8 +9,8 @@ import pytest
 import soaking
 
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.format.markers import name_of
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.format.markers import name_of
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 

@@ -17,18 +17,18 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, reconcile
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.write.lease import leases
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, reconcile
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.write.lease import leases
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 
 VERB = """
 import sys
-from photonfarm.shared.cli.main import main
+from photonfarm.cli.main import main
 sys.argv = ['photonfarm', *sys.argv[1:]]
 sys.exit(main())
 """

@@ -11,9 +11,9 @@ import pytest
 
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
-from photonfarm.shared.scene.view import View
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec, parse_spec
+from photonfarm.scene.view import View
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.keys import make_key
+from photonfarm.core.records import Guides
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import GRID
-from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.core.records import Guides
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.spec import GuideSpec, SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.view import Camera, View
 
 mi = backend.load(threads=1)
 

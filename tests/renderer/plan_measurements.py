@@ -11,8 +11,8 @@ from photonfarm.renderer.strategy.budget import ImageCost  # noqa: E402
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, RelativeErrors  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
-from photonfarm.shared.scene.spec import Film, SceneSpec  # noqa: E402
-from photonfarm.shared.scene.spec_loading import parse_spec  # noqa: E402
+from photonfarm.scene.spec import Film, SceneSpec  # noqa: E402
+from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
 
 SPEC = """
 name = "small-box"  # the box

@@ -7,9 +7,9 @@ from pathlib import Path
 import nvidia_driver
 import pytest
 
+from photonfarm.core.errors import BackendError
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.native import gathers
-from photonfarm.shared.core.errors import BackendError
 
 LOAD = "from photonfarm.renderer.scene import backend; print(backend.load(1).variant())"
 
@@ -101,7 +101,7 @@ def test_one_card_is_shown_to_mitsuba_and_llvm_is_not_looked_for(tmp_path: Path)
     code = """
 import os
 from photonfarm.renderer.scene import backend
-from photonfarm.shared.core.errors import BackendError
+from photonfarm.core.errors import BackendError
 found = backend.device()
 print(found.variant, found.name, found.card.number, backend.paths_at_once())
 try:

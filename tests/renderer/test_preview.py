@@ -8,13 +8,13 @@ import pytest
 import store_samples as samples
 from chromium import chromium, needs_chromium
 
+from photonfarm.core.records import Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.plan.request import Request
 from photonfarm.renderer.tools.plan_view import PlanView, axes
 from photonfarm.renderer.tools.preview import photon_picture, write_contact_sheet
-from photonfarm.shared.core.records import Geometry, Photons, ViewBuffers, Visibility
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.view import Camera, View, sample_view
-from photonfarm.shared.store import Sample, Store
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.view import Camera, View, sample_view
+from photonfarm.store import Sample, Store
 
 
 def test_a_dot_is_where_a_photon_is_seen_and_nowhere_else() -> None:

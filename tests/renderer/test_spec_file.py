@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools import spec_file
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+from photonfarm.scene.spec_loading import find_spec, load_spec
 
 SETTINGS = {"transport": {"connections": 0, "light_ratio": 4.0, "half_spp": 9}, "photons": {"paths": 0, "depth": 2}}
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import store_samples as samples
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.io.objects import ObjectStorage
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.io.objects import ObjectStorage
 
 
 def planned(place: str | Path, **request: int) -> SceneStore:

@@ -8,9 +8,9 @@ from typing import Any
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.check.check import StoreReport, check_store
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.check.check import StoreReport, check_store
 
 _MADE: dict[str, Path] = {}
 """Stores that are made once, and copied for each test: that takes a third of the time."""

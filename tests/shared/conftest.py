@@ -1,7 +1,7 @@
 import pytest
 
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
 
 DESCRIBED = {
     "name": "test-room",

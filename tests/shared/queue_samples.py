@@ -6,10 +6,10 @@ import pytest
 import redis
 import store_samples as samples
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import WorkerReport, beat
-from photonfarm.shared.queue.rq_adapter import Execution, fail, open_queue, take
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.plan.request import Request
+from photonfarm.queue import WorkerReport, beat
+from photonfarm.queue.rq_adapter import Execution, fail, open_queue, take
+from photonfarm.store import SceneStore, Store
 
 SCENE_ID = "0123456789abcdef" * 2
 NAME = f"{SCENE_ID}-7"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.cli.main import main
+from photonfarm.cli.main import main
 
 MOST_S = 20.0
 """The longest that any of them may take to be told, on a busy machine."""

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared.core.processes import tied
+from photonfarm.core.processes import tied
 
 KEYS = {"AWS_ACCESS_KEY_ID": "photonfarm", "AWS_SECRET_ACCESS_KEY": "not-a-secret", "AWS_REGION": "us-east-1"}
 PORTS = ("master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port", "filer.port.grpc",

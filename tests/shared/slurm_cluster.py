@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm.shared.core.processes import free_port
+from photonfarm.core.processes import free_port
 
 COMMANDS = ("slurmctld", "slurmd", "sbatch", "squeue", "munged")
 NODES = ("n1", "n2")

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.store import Figures, JobWriter, SceneReader, SceneStore, Store
-from photonfarm.shared.store.format.schema import output_arrays
+from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.store import Figures, JobWriter, SceneReader, SceneStore, Store
+from photonfarm.store.format.schema import output_arrays
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.statistics import block_z_test, mean_ratio
+from photonfarm.core.statistics import block_z_test, mean_ratio
 
 
 def noise(seed: int, scale: float = 1.0, k: int = 8) -> np.ndarray:

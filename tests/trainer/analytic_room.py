@@ -10,11 +10,11 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.keys import Stream, make_key
-from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
-from photonfarm.shared.scene.modification import Modification, rebuild, sample_surface
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.core.keys import Stream, make_key
+from photonfarm.core.records import F32, STATIC, BasePointCloud, Geometry, Photons, ViewBuffers, Visibility
+from photonfarm.scene.modification import Modification, rebuild, sample_surface
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
 
 CUBE_HALF = 0.3
 CUBE_REST = np.array([0.0, -0.7, 0.0])

@@ -9,8 +9,8 @@ import numpy as np
 from analytic_room import analytic_base, render, sees, trace, visibility
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.keys import Key, make_key
-from photonfarm.shared.core.records import (
+from photonfarm.core.keys import Key, make_key
+from photonfarm.core.records import (
     F32,
     LIT_POINTS,
     BasePointCloud,
@@ -19,12 +19,12 @@ from photonfarm.shared.core.records import (
     Photons,
     ViewBuffers,
 )
-from photonfarm.shared.plan.request import sample_key
-from photonfarm.shared.scene.modification import Modification, rebuild, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View, sample_view
-from photonfarm.shared.store import Figures, Sample, SceneStore
-from photonfarm.shared.store.read.batch import Batch
+from photonfarm.plan.request import sample_key
+from photonfarm.scene.modification import Modification, rebuild, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View, sample_view
+from photonfarm.store import Figures, Sample, SceneStore
+from photonfarm.store.read.batch import Batch
 
 
 class AnalyticSource:

@@ -10,9 +10,9 @@ import torch
 from analytic_room import analytic_base, analytic_spec
 from analytic_room_samples import AnalyticSource, ScarceSource, commit_job
 
-from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.core.records import BasePointCloud, Geometry
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneStore, Store
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 
 

@@ -8,11 +8,11 @@ import queue_samples
 import redis
 import store_samples as samples
 
-from photonfarm.shared import queue
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.watch import FarmWatch
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm import queue
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.watch import FarmWatch
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture

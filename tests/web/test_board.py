@@ -10,8 +10,8 @@ import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from photonfarm.shared.farm.running_farm import METRICS_PORT
-from photonfarm.shared.farm.watch import FarmWatch
+from photonfarm.farm.running_farm import METRICS_PORT
+from photonfarm.farm.watch import FarmWatch
 from photonfarm.web.metrics import FarmMetrics
 
 ROOT = Path(__file__).parents[2]

@@ -18,13 +18,13 @@ import redis
 import store_samples as samples
 from prometheus_client.parser import text_string_to_metric_families
 
-from photonfarm.shared import queue
-from photonfarm.shared.cli.main import main
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.watch import FarmView, FarmWatch
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm import queue
+from photonfarm.cli.main import main
+from photonfarm.core.errors import StoreError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.watch import FarmView, FarmWatch
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
 from photonfarm.web.images import Kept
 from photonfarm.web.metrics import MOST_ERRORS, OTHER, FarmMetrics
 
@@ -174,7 +174,7 @@ def test_the_page_lists_every_metric_with_its_type_and_labels(farm: FarmWatch) -
 @contextmanager
 def serving(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """A verb that serves, and what it prints first."""
-    command = [sys.executable, "-m", "photonfarm.shared.cli", *words]
+    command = [sys.executable, "-m", "photonfarm.cli", *words]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         try:
             assert process.stdout is not None

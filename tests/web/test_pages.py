@@ -22,15 +22,15 @@ import store_samples as samples
 from chromium import chromium, needs_chromium
 from PIL import Image, PngImagePlugin
 
-from photonfarm.shared.cli.main import main
-from photonfarm.shared.core import pictures
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.farm.training import PROGRESS, WAITS
-from photonfarm.shared.farm.watch import FarmWatch
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.sample_costs import relative_variance
-from photonfarm.shared.scene.modification import rebuild
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.cli.main import main
+from photonfarm.core import pictures
+from photonfarm.core.errors import StoreError
+from photonfarm.farm.training import PROGRESS, WAITS
+from photonfarm.farm.watch import FarmWatch
+from photonfarm.plan.request import Request
+from photonfarm.plan.sample_costs import relative_variance
+from photonfarm.scene.modification import rebuild
+from photonfarm.store import SceneStore, Store
 from photonfarm.web import images
 from photonfarm.web.farm_pages import FarmPages
 from photonfarm.web.images import POINT, Kept
@@ -376,7 +376,7 @@ def test_a_mouse_and_a_finger_turn_the_points(server: PageServer, scene: SceneSt
 def test_the_verb_takes_a_free_port_where_its_own_is_taken_and_ends_on_ctrl_c(scene: SceneStore) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         words = ["web", "--store", str(scene.folder.parent.parent), "--port", str(taken.getsockname()[1])]
-        command = [sys.executable, "-m", "photonfarm.shared.cli", *words]
+        command = [sys.executable, "-m", "photonfarm.cli", *words]
         with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as serving:
             assert serving.stdout is not None
             address = re.fullmatch(r"http://localhost:(\d+)/\n", serving.stdout.readline())

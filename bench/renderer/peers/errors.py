@@ -125,7 +125,7 @@ class MeanRatio:
 
 def mean_ratio(images: Any, reference: ReferenceImage) -> MeanRatio:
     """How bright K images are together, against the reference; its noise counts too."""
-    from photonfarm.shared.core.statistics import student_to_normal
+    from photonfarm.core.statistics import student_to_normal
 
     means = np.asarray(images, dtype=np.float64).reshape(len(images), -1).mean(axis=1)
     own, base = means.var(ddof=1) / len(means), reference.mean_standard_error**2

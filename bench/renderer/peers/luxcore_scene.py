@@ -60,8 +60,8 @@ def _triangles(shape: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDA
     """Vertices, faces that turn counter-clockwise seen from the front, and normals of smooth shapes."""
     import mitsuba as mi
 
+    from photonfarm.core.errors import SpecError
     from photonfarm.renderer.scene.tessellation import triangles_of
-    from photonfarm.shared.core.errors import SpecError
 
     try:
         triangles = triangles_of(shape)

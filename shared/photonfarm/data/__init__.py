@@ -10,6 +10,6 @@ Nothing here needs Mitsuba, and only `Scene.torch` needs torch.
 """
 
 from photonfarm.data.scene import Scene, open_scene
-from photonfarm.shared.store.read.batch import PointCloud, Sample
+from photonfarm.store.read.batch import PointCloud, Sample
 
 __all__ = ["PointCloud", "Sample", "Scene", "open_scene"]

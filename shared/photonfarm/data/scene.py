@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.records import Geometry
-from photonfarm.shared.plan.hold_out import HOLD_OUT, rows_held_out
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.read.batch import Batch, Sample
-from photonfarm.shared.store.read.find import scene_named
+from photonfarm.core.records import Geometry
+from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.read.batch import Batch, Sample
+from photonfarm.store.read.find import scene_named
 
 if TYPE_CHECKING:
     from photonfarm.data.torch_dataset import SceneDataset

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import Guides, Photons
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store.format.schema import output_arrays
-from photonfarm.shared.store.read.batch import Batch, Sample
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import Guides, Photons
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera
+from photonfarm.store.format.schema import output_arrays
+from photonfarm.store.read.batch import Batch, Sample
 
 GUIDES = tuple(field.name for field in dataclass_fields(Guides))
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from photonfarm.core.errors import store_errors
+from photonfarm.core.files import write_whole
 from photonfarm.export.columns import Column
 from photonfarm.export.folder import DATA
 from photonfarm.export.formats.format import Exported
 from photonfarm.export.manifest import Manifest
 from photonfarm.export.settings import FormatName
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.files import write_whole
 
 CARD = "README.md"
 

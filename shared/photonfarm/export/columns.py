@@ -12,10 +12,10 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import Guides
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store.format import declarations, schema
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import Guides
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store.format import declarations, schema
 
 BUFFERS = ("albedo", "normal", "depth")
 """The buffers that every view has."""

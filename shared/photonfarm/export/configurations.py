@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.archives import write_arrays
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import arrays_of
 from photonfarm.data import Sample
 from photonfarm.export.settings import Extra
-from photonfarm.shared.core.archives import write_arrays
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.scene.spec import SceneSpec
 
 FOLDER = "configurations"
 

@@ -10,6 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.waiting import waiting
 from photonfarm.export import card, configurations, folder, manifest
 from photonfarm.export.columns import GUIDES, Column, Contents, buffers_named, columns, ranges, spans
 from photonfarm.export.folder import Files, Planned
@@ -17,12 +19,10 @@ from photonfarm.export.formats.format import Exported, Format, format_named
 from photonfarm.export.manifest import Manifest, SceneName
 from photonfarm.export.settings import ExportRequest, ExportSettings
 from photonfarm.export.snapshot import Snapshot, Values, constants
-from photonfarm.shared.core.errors import IncompleteError, SpecError
-from photonfarm.shared.core.waiting import waiting
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.format.declarations import VERSION
-from photonfarm.shared.store.read.find import scene_or_spec
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.format.declarations import VERSION
+from photonfarm.store.read.find import scene_or_spec
 
 FILE_BYTES = 128 << 20
 """About how large a file of several samples becomes, unless their number is given."""
@@ -176,7 +176,7 @@ class _Export:
             "credits": snapshot.spec.credits and snapshot.spec.credits.model_dump(),
             "jobs": ranges(snapshot.jobs_of(rows)),
             "plans": tuple(snapshot.plans()),
-            "versions": {"photonfarm-shared": version("photonfarm-shared"), "store": VERSION, "rendered_by": rendered},
+            "versions": {"photonfarm": version("photonfarm"), "store": VERSION, "rendered_by": rendered},
         }
 
 

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from photonfarm.core.errors import StoreError, store_errors
 from photonfarm.export import manifest
 from photonfarm.export.columns import ranges, rows_in
 from photonfarm.export.manifest import MANIFEST, Manifest, Part
-from photonfarm.shared.core.errors import StoreError, store_errors
 
 LOCK = ".lock"
 DATA, SAMPLES = "data", "samples"

@@ -8,10 +8,10 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.files import write_whole
+from photonfarm.core.models import sentences
 from photonfarm.export.settings import ExportSettings
-from photonfarm.shared.core.errors import StoreError, store_errors
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.models import sentences
 
 MANIFEST = "export.json"
 RowText = Annotated[str, Field(pattern=r"^[0-9,-]*$")]

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from photonfarm.shared.core.models import Frozen
-from photonfarm.shared.plan.hold_out import HOLD_OUT
+from photonfarm.core.models import Frozen
+from photonfarm.plan.hold_out import HOLD_OUT
 
 FormatName = Literal["webdataset", "exr", "npz", "parquet"]
 Extra = Literal["points", "photons", "visibility"]

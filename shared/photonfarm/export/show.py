@@ -11,9 +11,9 @@ import click
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from photonfarm.cli.show import print_json
+from photonfarm.core.waiting import in_words
 from photonfarm.export.export import OnProgress, Result
-from photonfarm.shared.cli.show import print_json
-from photonfarm.shared.core.waiting import in_words
 
 LINE_S = 4.0
 """The seconds between lines of progress where there is no terminal."""

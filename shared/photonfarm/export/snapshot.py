@@ -10,13 +10,13 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.keys import seed_of, view_key
 from photonfarm.data import Sample, Scene
 from photonfarm.export.columns import HALVES, Column
-from photonfarm.shared.core.keys import seed_of, view_key
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera, View
-from photonfarm.shared.store import SceneStore
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
+from photonfarm.store import SceneStore
 
 Split = Literal["train", "held-out"]
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 
-from photonfarm.shared.cli.options import json_option, store_option
-from photonfarm.shared.plan.hold_out import HOLD_OUT
+from photonfarm.cli.options import json_option, store_option
+from photonfarm.plan.hold_out import HOLD_OUT
 
 EXTRAS = ("points", "photons", "visibility")
 

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photonfarm.shared.cli.options import Command, names_redis, redis_option, store_option
-from photonfarm.shared.farm.running_farm import METRICS_PORT, WEB_PORT
+from photonfarm.cli.options import Command, names_redis, redis_option, store_option
+from photonfarm.farm.running_farm import METRICS_PORT, WEB_PORT
 
 if TYPE_CHECKING:
-    from photonfarm.shared.farm.watch import FarmWatch
+    from photonfarm.farm.watch import FarmWatch
     from photonfarm.web.server import Routes
 
 
@@ -46,7 +46,7 @@ def web(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any)
 
     They only read, and fetch nothing from elsewhere. /metrics is for Prometheus. Ends on Ctrl-C.
     """
-    from photonfarm.shared.core.processes import free_port
+    from photonfarm.core.processes import free_port
     from photonfarm.web.farm_pages import FarmPages
     from photonfarm.web.server import page_routes
 
@@ -70,9 +70,9 @@ def serve_metrics(store: str | Path, redis_url: str, runs: tuple[Path, ...], **w
 
 def _watch(store: str | Path, redis_url: str, runs: tuple[Path, ...]) -> FarmWatch:
     """The farm that the options name. Raises StoreError without a store."""
-    from photonfarm.shared.farm.running_farm import running_farm
-    from photonfarm.shared.farm.watch import FarmWatch
-    from photonfarm.shared.store import Store
+    from photonfarm.farm.running_farm import running_farm
+    from photonfarm.farm.watch import FarmWatch
+    from photonfarm.store import Store
 
     opened = Store(store)
     if not runs and running_farm(opened) is None:
@@ -82,7 +82,7 @@ def _watch(store: str | Path, redis_url: str, runs: tuple[Path, ...]) -> FarmWat
 
 def _serve(routes: Routes, path: str, *, host: str, port: int, names: tuple[str, ...]) -> None:
     """Serve until Ctrl-C, and print the address. Raises StoreError if nothing can listen there."""
-    from photonfarm.shared.core.errors import StoreError
+    from photonfarm.core.errors import StoreError
     from photonfarm.web.server import PageServer
 
     logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)

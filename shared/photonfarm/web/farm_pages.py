@@ -9,11 +9,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.farm.status import NoQueue
-from photonfarm.shared.farm.training import VIEWS, RunFolder
-from photonfarm.shared.farm.watch import FarmView, FarmWatch
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.write.plans import plan_of
+from photonfarm.farm.status import NoQueue
+from photonfarm.farm.training import VIEWS, RunFolder
+from photonfarm.farm.watch import FarmView, FarmWatch
+from photonfarm.store import Store
+from photonfarm.store.write.plans import plan_of
 from photonfarm.web.images import Kept
 from photonfarm.web.samples import SceneSamples
 from photonfarm.web.server import NotThereError

@@ -17,10 +17,10 @@ from typing import Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core import pictures
-from photonfarm.shared.core.pictures import Picture
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.sample_costs import FLOOR
+from photonfarm.core import pictures
+from photonfarm.core.pictures import Picture
+from photonfarm.core.records import F32
+from photonfarm.plan.sample_costs import FLOOR
 
 POINT = np.dtype([("position", "<f4", 3), ("colour", "u1", 3), ("seen", "u1"), ("normal", "i1", 3), ("rest", "u1")])
 """A point as the script reads it: 20 bytes; normals are 127 long."""

@@ -20,9 +20,9 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from photonfarm.shared.farm.status import NoQueue, StoreQueue, WaitKind
-from photonfarm.shared.farm.training import TRAINS, WAITS, TrainingProgress
-from photonfarm.shared.farm.watch import FarmView, SceneView
+from photonfarm.farm.status import NoQueue, StoreQueue, WaitKind
+from photonfarm.farm.training import TRAINS, WAITS, TrainingProgress
+from photonfarm.farm.watch import FarmView, SceneView
 from photonfarm.web.server import Answer
 
 MOST_ERRORS = 10

@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.core import pictures
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.sample_costs import relative_variance
-from photonfarm.shared.store import Sample, SceneReader
+from photonfarm.core import pictures
+from photonfarm.core.errors import IncompleteError
+from photonfarm.core.records import F32
+from photonfarm.plan.sample_costs import relative_variance
+from photonfarm.store import Sample, SceneReader
 from photonfarm.web import images
 from photonfarm.web.server import NotThereError
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from photonfarm.shared.core.errors import PhotonfarmError
+from photonfarm.core.errors import PhotonfarmError
 
 if TYPE_CHECKING:
-    from photonfarm.shared.farm.watch import FarmView
+    from photonfarm.farm.watch import FarmView
     from photonfarm.web.farm_pages import FarmPages
     from photonfarm.web.metrics import FarmMetrics
 

@@ -11,10 +11,10 @@ from analytic_scene import small_spec
 from store_samples import guides
 
 from bench.harness.contents import EncodedPool, Pool, commit, commit_encoded
-from photonfarm.shared.core.records import Photons, ViewBuffers, Visibility
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.core.records import Photons, ViewBuffers, Visibility
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneStore, Store
 
 SIZE, SLOTS = 8, 8
 

@@ -20,11 +20,11 @@ from bench.harness.contents import Pool, commit
 from bench.harness.network_errors import Errors
 from bench.harness.room_study import HELD_OUT, ReferenceViews, Run
 from bench.studies.budget_arms import HALF_SPP, ArmSamples, Share, requests
-from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.core.records import F32, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.metrics.intervals import t_975
 from photonfarm.trainer.runs.settings import preset
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from bench.renderer import compare_with_path
-from photonfarm.shared.core.statistics import block_z_test
+from photonfarm.core.statistics import block_z_test
 
 
 def images(mean: float, sigma: float, seed: int) -> np.ndarray:

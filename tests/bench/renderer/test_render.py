@@ -17,8 +17,8 @@ from bench.renderer.peers.errors import reference_of
 from bench.renderer.peers.measure import MeasuredMethod
 from bench.renderer.peers.methods import Shot, calibrate
 from bench.renderer.peers.plans import BUDGETS, METHODS, PLAN_SECONDS, PLANS, estimated_seconds
+from photonfarm.core.files import write_whole
 from photonfarm.renderer.cli.measuring_verbs import scene_plan
-from photonfarm.shared.core.files import write_whole
 
 TRUTH = np.ones((16, 16, 3))
 

@@ -7,7 +7,7 @@ import pytest
 
 from bench.harness.network_errors import Errors, own_errors
 from bench.studies.budget_fit import KAPPAS, RHOS, Fit, RoomErrors, fit
-from photonfarm.shared.plan.allocation import Allocation, excess
+from photonfarm.plan.allocation import Allocation, excess
 
 KAPPA, RHO = 40.0, 2.0
 ARMS = [

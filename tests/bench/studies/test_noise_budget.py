@@ -14,8 +14,8 @@ from bench.studies import noise_budget
 from bench.studies.budget_arms import SHARES
 from bench.studies.budget_fit import KAPPAS, RHOS, RoomErrors, fit
 from bench.studies.noise_budget import BudgetStudy, MeasuredShare
-from photonfarm.shared.plan.allocation import excess
-from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.plan.allocation import excess
+from photonfarm.plan.sample_costs import SampleCosts
 
 VIEWS, SIZE, BUDGET = 12, 16, 200.0
 UNITS = tuple(bytes([unit]) * 16 for unit in range(VIEWS))

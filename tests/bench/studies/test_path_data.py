@@ -20,9 +20,9 @@ from bench.studies.path_data import BUDGETS, HELD_OUT, FirstSamples
 from bench.studies.path_data_study import METRICS, MeasuredArm, Study, Targets
 from bench.studies.path_scene import Costs, Rendered
 from bench.studies.path_statistics import BudgetFactor, bias, crossing, factor, noise, ratio, relative_noise
-from photonfarm.shared.core.records import F32, Photons, ViewBuffers, Visibility
-from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.store import Store
+from photonfarm.core.records import F32, Photons, ViewBuffers, Visibility
+from photonfarm.plan.hold_out import are_held_out
+from photonfarm.store import Store
 
 VIEWS, SIZE = 24, 16
 UNITS = tuple(bytes([unit]) * 16 for unit in range(VIEWS))

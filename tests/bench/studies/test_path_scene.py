@@ -12,13 +12,13 @@ import pytest
 from bench.harness.room_study import planned
 from bench.studies import path_scene
 from bench.studies.path_scene import Costs
+from photonfarm.core.records import F32, arrays_of
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.core.records import F32, arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import sample_view
-from photonfarm.shared.store import Sample, SceneReader, Store
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import sample_view
+from photonfarm.store import Sample, SceneReader, Store
 
 SIZE, SPP = 16, 72
 

@@ -6,8 +6,8 @@ import pytest
 from analytic_scene import small_spec
 
 from bench.studies.sample_costs import SPP, RoomCosts, line, shared_out
-from photonfarm.shared.plan.allocation import Allocation
-from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.plan.allocation import Allocation
+from photonfarm.plan.sample_costs import SampleCosts
 
 BUDGET = 200.0
 

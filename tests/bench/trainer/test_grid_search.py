@@ -15,11 +15,11 @@ from click.testing import CliRunner
 
 from bench.trainer import grid_search
 from bench.trainer.grid_search import Cell, main, run_grid, table
-from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.core.statistics import Estimate
-from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import Store
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.core.statistics import Estimate
+from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.plan.request import Request
+from photonfarm.store import Store
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT

@@ -22,14 +22,14 @@ from bench.trainer.moved_lamps import (
     stays,
     trained_runs,
 )
+from photonfarm.core.errors import IncompleteError
+from photonfarm.core.processes import Stop
+from photonfarm.core.records import F32, ViewBuffers
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.core.records import F32, ViewBuffers
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import Emitters, SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.scene.spec import Emitters, SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predict.evaluation import Predictor, constant_predictor

@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from read_batches import batch_of
 
 from bench.trainer.projection_oracle import in_camera, sees, triangles
+from photonfarm.core.records import F32
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.modification import rebuild
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.scene.modification import rebuild
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import Camera
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from bench.trainer.projection_oracle import first_met, in_image, sees, triangles
-from photonfarm.shared.core.records import STATIC, Geometry
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.core.records import STATIC, Geometry
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import Camera, View
 
 NEAR, FAR = 0.5, 20.0
 

@@ -5,8 +5,8 @@ import pytest
 from bench.trainer import projection
 from bench.trainer.projection import RoomCounts
 from bench.trainer.projection_rooms import Counts, LoadedRoom
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.scene import backend
-from photonfarm.shared.core.errors import SpecError
 
 SIZE, VIEWS, POINTS, JUDGED = 256, 4, 4096, 450
 

@@ -14,8 +14,8 @@ import pytest
 import redis
 from skewed_clock import CLOCK, ENDED_S, MACHINE, Machine
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.store import SceneStore
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.store import SceneStore
 
 
 @pytest.fixture(scope="module")

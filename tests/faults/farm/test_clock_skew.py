@@ -12,9 +12,9 @@ import pytest
 import store_samples as samples
 from skewed_clock import SKEWS, YEAR_S, Machine, root_of, rows_read
 
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.io.storage import FOREIGN_AGE_S, STRAY_AGE_S
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.io.storage import FOREIGN_AGE_S, STRAY_AGE_S
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loads a library before a process's own")
 

@@ -14,9 +14,9 @@ import pytest
 import queue_samples
 from skewed_clock import SKEWS, YEAR_S, Machine, root_of, rows_read
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import WorkerReport, connect, queue_status, read_workers, reconcile
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import WorkerReport, connect, queue_status, read_workers, reconcile
+from photonfarm.store import SceneStore, Store
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="loads a library before a process's own")
 

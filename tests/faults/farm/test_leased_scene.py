@@ -6,11 +6,11 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import TRIES, connect, queue_status
-from photonfarm.shared.queue.rq_adapter import open_queue
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.write.lease import lease
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import TRIES, connect, queue_status
+from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.write.lease import lease
 
 
 @pytest.mark.parametrize("share", [None, "0/1"])

@@ -13,11 +13,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import TRIES, connect, kept_failures, queue_status, reconcile
+from photonfarm.queue.rq_adapter import open_queue
 from photonfarm.renderer.worker.settings import GRACE_S
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import TRIES, connect, kept_failures, queue_status, reconcile
-from photonfarm.shared.queue.rq_adapter import open_queue
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.store import SceneReader, SceneStore, Store
 
 Bytes = Callable[[SceneStore], dict[str, bytes]]
 Starter = Callable[..., subprocess.Popen[bytes]]

@@ -9,12 +9,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, queue_status
 from photonfarm.renderer.worker.worker import CHILD, run_worker
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.store import SceneReader, SceneStore, Store
 
 
 def room_of_16_pixels(root: Path) -> SceneStore:

@@ -6,12 +6,12 @@ from types import ModuleType
 
 import pytest
 
+from photonfarm.core.errors import SceneNotHereError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.core.errors import SceneNotHereError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.store import SceneStore, Store
 
 XML = '<scene version="3.0.0"><shape type="cube" id="tall-block"/></scene>'
 

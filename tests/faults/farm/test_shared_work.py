@@ -13,16 +13,16 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import QueueError
+from photonfarm.farm.submission import submit
+from photonfarm.plan.request import Request
+from photonfarm.queue import TRIES, Share, kept_failures
 from photonfarm.renderer.worker.child import RenderWorker
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.worker import run_worker
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.farm.submission import submit
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import TRIES, Share, kept_failures
-from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import SceneStore, Store
 
 Starter = Callable[..., subprocess.Popen[bytes]]
 

@@ -9,16 +9,16 @@ import pytest
 import redis
 from pydantic import ValidationError
 
+from photonfarm.cli.farm_verbs import status
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, queue_status, report_consumed
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import AHEAD_LOOK_S, TrainerPace
 from photonfarm.renderer.worker.settings import WorkerSettings
-from photonfarm.shared.cli.farm_verbs import status
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, queue_status, report_consumed
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.write.scene_store import Progress
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.write.scene_store import Progress
 
 
 class Clock:

@@ -11,17 +11,17 @@ from types import ModuleType
 
 import pytest
 
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, job_name, queue_status, reconcile
+from photonfarm.queue.rq_adapter import open_queue
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.settings import WorkerSettings
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, job_name, queue_status, reconcile
-from photonfarm.shared.queue.rq_adapter import open_queue
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.store import SceneReader, SceneStore, Store
 
 COMMIT = """
 import os, sys
-from photonfarm.shared.store import JobWriter, Store
+from photonfarm.store import JobWriter, Store
 from photonfarm.renderer.jobs.render import ShardRenderer
 sys.path.append(sys.argv[1])
 import analytic_scene as analytic
@@ -45,7 +45,7 @@ if sys.argv[3] != "base":
     Store(sys.argv[2]).scenes()[0].write_base(*analytic.AnalyticScene(analytic.small_spec()).base())
 setattr(owner, function, dying)
 if sys.argv[3] == "plan":
-    from photonfarm.shared.plan.request import Request
+    from photonfarm.plan.request import Request
     Store(sys.argv[2]).plan(analytic.small_spec(), Request(modifications=9))
 else:
     renderer.render(Store(sys.argv[2]).scene_ids()[0], 0)

@@ -9,14 +9,14 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import StoreError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.backpressure import TrainerPace
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect
-from photonfarm.shared.store import SceneStore, Store, store_status
+from photonfarm.store import SceneStore, Store, store_status
 
 
 @pytest.fixture

@@ -15,14 +15,14 @@ from types import ModuleType
 
 import pytest
 
+from photonfarm.core.errors import StoreError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, queue_status
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.backpressure import is_full
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check.check import check_store
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="mounts a tmpfs")
 

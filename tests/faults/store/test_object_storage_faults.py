@@ -20,14 +20,14 @@ import s3_server
 from obstore.exceptions import AlreadyExistsError
 from obstore.store import from_url
 
+from photonfarm.core.errors import StoreError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import PlannedRows, Request
+from photonfarm.queue import connect, reconcile
 from photonfarm.renderer.tools import doctor
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import PlannedRows, Request
-from photonfarm.shared.queue import connect, reconcile
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.io import object_requests
-from photonfarm.shared.store.io.objects import ObjectStorage
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.io import object_requests
+from photonfarm.store.io.objects import ObjectStorage
 
 
 def stored(url: str) -> dict[str, bytes]:

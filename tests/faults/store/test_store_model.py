@@ -19,10 +19,10 @@ from hypothesis.stateful import invariant, precondition, rule, run_state_machine
 from store_machine import SPECS, WritingMachine, any_index, processes, scene_numbers
 from store_model import Reader, Writer, compare
 
-from photonfarm.shared.core.errors import CorruptError, IncompleteError
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.format.schema import output_arrays
+from photonfarm.core.errors import CorruptError, IncompleteError
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.format.schema import output_arrays
 
 EXAMPLES = int(os.environ.get("PHOTONFARM_MODEL_EXAMPLES", "0"))
 STEPS = int(os.environ.get("PHOTONFARM_MODEL_STEPS", "30"))

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonfarm.core.statistics import block_z_test
 from photonfarm.renderer.scene import backend
-from photonfarm.shared.core.statistics import block_z_test
 
 mi = backend.load(threads=1)
 

@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.statistics import block_z_test
+from photonfarm.core.statistics import block_z_test
 
 FILE = Path(__file__).parents[3] / "docs/minimal_bdpt.py"
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
+from photonfarm.plan.request import PlannedContent, Request, expand
 from photonfarm.renderer.check import samples
 from photonfarm.renderer.check.orthographic import PAPER, Projection, whole
 from photonfarm.renderer.check.scene_check import SceneCheck, check
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.plan.request import PlannedContent, Request, expand
-from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
+from photonfarm.scene.spec_loading import NamedSpec, load_spec
 
 ROOM = """<scene version="3.0.0">
 <shape type="cube" id="walls"><transform name="to_world"><scale x="2" y="1.5" z="2"/><translate y="1.5"/></transform>

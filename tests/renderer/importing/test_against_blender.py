@@ -215,7 +215,7 @@ def show_all(names: list[str], out: Path, size: int = 256) -> None:
     """
     from PIL import Image
 
-    from photonfarm.shared.core.pictures import display_values
+    from photonfarm.core.pictures import display_values
 
     pairs = []
     with TemporaryDirectory() as folder:

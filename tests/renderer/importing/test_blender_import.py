@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from blender_files import Loaded, needs_blender, run
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing.readers import blender
-from photonfarm.shared.core.errors import SpecError
 
 
 def test_a_fault_of_blenders_exporter_is_not_told_as_one_of_reading(tmp_path: Path, monkeypatch: Any) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from imported_scenes import FOUR, Loaded, Read, colour_at, losses
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 
 
 def test_nodes_are_placed_by_all_above_them_and_mirrored_ones_keep_their_fronts(gltf: Any, loaded: Loaded) -> None:

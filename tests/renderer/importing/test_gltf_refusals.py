@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from imported_scenes import FOUR, Read
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 
 
 def without(name: str) -> Callable[[Path], None]:

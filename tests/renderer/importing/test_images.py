@@ -10,8 +10,8 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing import images
-from photonfarm.shared.core.errors import SpecError
 
 
 def written(values: np.ndarray, kind: str) -> bytes:

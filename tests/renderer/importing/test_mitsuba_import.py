@@ -11,9 +11,9 @@ import pytest
 from mitsuba_scenes import SPHERE, Loaded, Read, reflectance
 from PIL import Image
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing.readers import mitsuba_parts
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.files import SceneFile
+from photonfarm.scene.files import SceneFile
 
 
 def test_the_cases_of_mitsuba_have_their_right_values(case: Callable[[str], Path], loaded: Loaded) -> None:
@@ -267,7 +267,7 @@ def test_settings_of_the_renderer_are_said_where_they_mean_another_picture(
 
 
 def test_a_spec_of_shapes_without_ids_is_told_of_the_import(write_xml: Callable[..., Path]) -> None:
-    from photonfarm.shared.scene.spec_loading import parse_spec
+    from photonfarm.scene.spec_loading import parse_spec
 
     path = write_xml('<shape type="sphere"/>')
     everywhere = {"min": [0, 0, 0], "max": [1, 1, 1]}

@@ -28,9 +28,9 @@ from obj_scenes import (
 )
 from PIL import Image
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing import images
 from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.shared.core.errors import SpecError
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ from obj_scenes import (
     said,
 )
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.shared.core.errors import SpecError
 
 
 def test_objects_and_materials_name_shapes_and_images_stand_upright(

@@ -14,15 +14,15 @@ import pytest
 import trimesh
 from click.testing import CliRunner, Result
 
+from photonfarm.core.errors import BackendError, PhotonfarmError, SpecError
+from photonfarm.core.pictures import display_values
 from photonfarm.renderer.cli.scene_verbs import scene_import
 from photonfarm.renderer.importing import importer
 from photonfarm.renderer.importing.readers import blender
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import BackendError, PhotonfarmError, SpecError
-from photonfarm.shared.core.pictures import display_values
-from photonfarm.shared.scene.modification import rest, sample_modification
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.scene.modification import rest, sample_modification
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import sample_view
 
 
 @pytest.fixture

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from store_samples import reader_of
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import arrays_of
+from photonfarm.farm.submission import submit
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.jobs.repeat import repeat
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.farm.submission import submit
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.read.other_scenes import with_same_radiance
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.read.other_scenes import with_same_radiance
 
 REQUEST = Request(modifications=3, views_per_modification=2)
 

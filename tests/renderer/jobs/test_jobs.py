@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonfarm.core.errors import IncompleteError, QueueError, SceneNotHereError
+from photonfarm.core.keys import seed_of
+from photonfarm.core.records import Visibility
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs import estimates
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import IncompleteError, QueueError, SceneNotHereError
-from photonfarm.shared.core.keys import seed_of
-from photonfarm.shared.core.records import Visibility
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.write.lease import LeasedError, lease
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.format import markers
+from photonfarm.store.write.lease import LeasedError, lease
 
 
 @pytest.fixture
@@ -308,8 +308,8 @@ def test_few_scenes_are_kept_loaded(analytic: ModuleType, store: Store, recorded
 def test_a_scene_file_that_is_not_the_planned_one_is_refused(
     store: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded: type
 ) -> None:
-    from photonfarm.shared.scene.spec import SceneSpec
-    from photonfarm.shared.scene.spec_loading import parse_spec
+    from photonfarm.scene.spec import SceneSpec
+    from photonfarm.scene.spec_loading import parse_spec
 
     folders = [tmp_path / "planned", tmp_path / "here"]
     for i, folder in enumerate(folders):

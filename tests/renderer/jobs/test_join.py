@@ -12,16 +12,16 @@ import pytest
 from click.testing import CliRunner
 from store_samples import reader_of
 
+from photonfarm.cli.store_verbs import join as verb
+from photonfarm.core.errors import CorruptError, SpecError
+from photonfarm.core.records import arrays_of
+from photonfarm.farm.join import join
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.shared.cli.store_verbs import join as verb
-from photonfarm.shared.core.errors import CorruptError, SpecError
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.farm.join import join
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.check.check import check_store
 
 
 def rendered(store: Store, spec: SceneSpec, analytic: ModuleType, *requests: Request | TopUp) -> SceneStore:
@@ -140,7 +140,7 @@ def test_workers_render_what_a_join_that_was_killed_had_planned(
 def test_a_join_that_is_killed_again_and_again_goes_on(tmp_path: Path, analytic: ModuleType) -> None:
     request = Request(modifications=60, views_per_modification=2)
     there = rendered(Store(tmp_path / "b", create=True), analytic.small_spec(), analytic, request)
-    code = "from photonfarm.shared.cli.store_verbs import join; join()"
+    code = "from photonfarm.cli.store_verbs import join; join()"
     command = [sys.executable, "-c", code, str(tmp_path / "b"), "--store"]
     kills = 0
     for attempt in range(40):

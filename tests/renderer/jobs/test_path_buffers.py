@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.records import arrays_of
+from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.path_buffers import frames_of
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import IncompleteError, SpecError
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.camera_path import Frames
-from photonfarm.shared.scene.modification import rest
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.format.schema import output_arrays
-from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.scene.camera_path import Frames
+from photonfarm.scene.modification import rest
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.format.schema import output_arrays
+from photonfarm.store.format.shards import NOISY_GUIDES, rounded
 
 
 @pytest.fixture

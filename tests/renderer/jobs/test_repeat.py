@@ -10,14 +10,14 @@ import pytest
 from click.testing import CliRunner
 from PIL import Image
 
+from photonfarm.core.errors import SceneNotHereError, SpecError, StoreError
+from photonfarm.plan.request import Request
 from photonfarm.renderer.cli import sample_verbs
 from photonfarm.renderer.jobs.render import SceneLoader, ShardRenderer
 from photonfarm.renderer.jobs.repeat import Repeated, repeat
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import SceneNotHereError, SpecError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, SceneStore, Store
 
 
 def again(scene: SceneStore, row: int, pass_number: int | None = None, *, load: SceneLoader) -> Repeated:

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from photonfarm.core.pictures import display_values
+from photonfarm.core.waiting import Steps, WorkLog
 from photonfarm.renderer.cli.measuring_verbs import scene_exposure
 from photonfarm.renderer.measure import exposure
 from photonfarm.renderer.measure.exposure import DarkError, Pictures, propose
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.pictures import display_values
-from photonfarm.shared.core.waiting import Steps, WorkLog
-from photonfarm.shared.scene.spec import Film, SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.scene.spec import Film, SceneSpec
+from photonfarm.scene.spec_loading import load_spec
 
 
 def pictures(values: np.ndarray, noise: float = 0.0) -> Pictures:

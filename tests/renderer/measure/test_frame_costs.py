@@ -11,6 +11,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.core.archives import PARTS, FrameCosts, Surface
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.plan.request import Request
 from photonfarm.renderer.cli.sample_verbs import measure_frames
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.measure.frame_costs import (
@@ -24,14 +27,11 @@ from photonfarm.renderer.measure.frame_costs import (
 )
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.archives import PARTS, FrameCosts, Surface
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec, parse_spec
+from photonfarm.scene.view import View
+from photonfarm.store import SceneReader, Store
 
 DIFFUSE = {"type": "diffuse"}
 MIRROR = {"type": "conductor"}

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.measure.free_space import measure
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.scene.modification import sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import sample_view
 
 
 def quietly(_line: str) -> None: ...

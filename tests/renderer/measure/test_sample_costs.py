@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from photonfarm.core.errors import SpecError
+from photonfarm.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.renderer.cli.measuring_verbs import scene_cost
 from photonfarm.renderer.measure import sample_costs as measuring
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
 from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs, timed
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.sample_costs import SECONDS, SampleCosts, relative_variance
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
-from photonfarm.shared.scene.view import View
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec, parse_spec
+from photonfarm.scene.view import View
 
 SOME = SampleCosts("0" * 32, 0.5, 0.25, 0.125, 0.0625, 0.3)
 

@@ -3,15 +3,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import make_key
+from photonfarm.core.records import STATIC
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.base_cloud import cloud_of, geometry_of
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.tessellation import triangles_of
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.core.records import STATIC
-from photonfarm.shared.scene.modification import rebuild, sample_modification
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.scene.modification import rebuild, sample_modification
+from photonfarm.scene.spec_loading import load_spec
 
 CHECKS = {
     "type": "checkerboard",

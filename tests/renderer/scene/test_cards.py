@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.processes import command
-from photonfarm.shared.core.statistics import block_z_test
-from photonfarm.shared.farm.devices import cards_here
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
+from photonfarm.core.processes import command
+from photonfarm.core.statistics import block_z_test
+from photonfarm.farm.devices import cards_here
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check.check import check_store
 
 PASSES = 12
 

@@ -9,17 +9,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.statistics import block_z_test
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy import content
 from photonfarm.renderer.strategy.measurement import PilotScene
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.statistics import block_z_test
-from photonfarm.shared.scene.files import BUILTIN_EMITTING
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
-from photonfarm.shared.scene.view import View
+from photonfarm.scene.files import BUILTIN_EMITTING
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec, parse_spec
+from photonfarm.scene.view import View
 
 Loader = Callable[..., LoadedScene]
 

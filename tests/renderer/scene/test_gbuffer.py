@@ -3,12 +3,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonfarm.core.records import ViewBuffers
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import view_buffers
-from photonfarm.shared.core.records import ViewBuffers
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.view import Camera, View
 
 COLOUR = (0.2, 0.4, 0.6)
 DIFFUSE = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(COLOUR)}}

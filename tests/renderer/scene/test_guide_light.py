@@ -26,13 +26,13 @@ from guide_scenes import (
 )
 from numpy.typing import NDArray
 
+from photonfarm.core.keys import make_key
+from photonfarm.core.records import arrays_of
+from photonfarm.core.statistics import block_z_test
 from photonfarm.renderer.scene.gbuffer import GRID
 from photonfarm.renderer.scene.guides import point_light
-from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.core.statistics import block_z_test
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
-from photonfarm.shared.scene.view import View
+from photonfarm.scene.spec import GuideSpec, SceneSpec
+from photonfarm.scene.view import View
 
 # ------------------------------------------------------------------------------------------------------------- emission
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonfarm.core.keys import make_key, seed_of, view_key
+from photonfarm.core.records import Guides, arrays_of
 from photonfarm.renderer.jobs.render import lit_points
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import GRID
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.keys import make_key, seed_of, view_key
-from photonfarm.shared.core.records import Guides, arrays_of
-from photonfarm.shared.scene.modification import rest
-from photonfarm.shared.scene.spec import GuideSpec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store.format.shards import NOISY_GUIDES
+from photonfarm.scene.modification import rest
+from photonfarm.scene.spec import GuideSpec
+from photonfarm.scene.view import View
+from photonfarm.store.format.shards import NOISY_GUIDES
 
 backend.load(threads=1)
 

@@ -21,11 +21,11 @@ from guide_scenes import (
 )
 from numpy.typing import NDArray
 
+from photonfarm.core.records import Guides, arrays_of
 from photonfarm.renderer.scene import guides
 from photonfarm.renderer.scene.gbuffer import view_buffers
 from photonfarm.renderer.scene.materials import Materials
-from photonfarm.shared.core.records import Guides, arrays_of
-from photonfarm.shared.scene.view import View
+from photonfarm.scene.view import View
 
 # ------------------------------------------------------------------------------------------------------------ materials
 

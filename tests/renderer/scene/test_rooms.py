@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.files import BUILTIN_SHAPES
-from photonfarm.shared.scene.spec import BUILTIN_ROOMS
-from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
+from photonfarm.scene.files import BUILTIN_SHAPES
+from photonfarm.scene.spec import BUILTIN_ROOMS
+from photonfarm.scene.spec_loading import load_spec, parse_spec
 
 
 @pytest.fixture(scope="module", params=BUILTIN_ROOMS)
@@ -35,7 +35,7 @@ def test_an_unknown_shape_id_of_a_built_in_room_is_refused_without_mitsuba() -> 
     described["objects"][0]["shapes"] = ["table-woood"]
     with pytest.raises(SpecError):
         parse_spec(described, where="test")
-    code = "import sys; from photonfarm.shared.scene.spec_loading import load_spec; "
+    code = "import sys; from photonfarm.scene.spec_loading import load_spec; "
     code += "load_spec('room'); exit('mitsuba' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 

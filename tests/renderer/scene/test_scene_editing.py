@@ -9,10 +9,10 @@ from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import view_buffers
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.native import acceleration
-from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import View, sample_view
+from photonfarm.scene.modification import Modification, rest, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import View, sample_view
 
 
 def mesh_state(loaded: LoadedScene) -> dict[str, bytes]:

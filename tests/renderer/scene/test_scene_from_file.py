@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.view import View
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.view import View
 
 LAMP = '<emitter type="area"><rgb name="radiance" value="6, 5, 4"/></emitter>'
 

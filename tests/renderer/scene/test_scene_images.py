@@ -6,10 +6,10 @@ import numpy as np
 
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.scene.modification import rest, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import Camera, View, sample_view
+from photonfarm.scene.modification import rest, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import Camera, View, sample_view
 
 
 def test_seeds_decide_the_noise_and_nothing_else_does(room: LoadedScene, somewhere: View) -> None:

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.scene.modification import sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec
+from photonfarm.scene.view import sample_view
 
 ROOT = Path(__file__).parents[3]
 

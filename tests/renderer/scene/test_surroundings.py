@@ -8,8 +8,8 @@ import pytest
 
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE, directions, hollow_boxes, surroundings
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec_loading import load_spec
 
 
 def box(low: list[float], high: list[float], *, inwards: bool = False) -> dict[str, Any]:

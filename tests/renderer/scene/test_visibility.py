@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonfarm.core.records import STATIC, BasePointCloud, Geometry, Photons, Visibility
 from photonfarm.renderer.jobs.render import visibility_of
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import seen_points
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry, Photons, Visibility
-from photonfarm.shared.scene.modification import Modification, rebuild, rest, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
-from photonfarm.shared.scene.view import View, sample_view
+from photonfarm.scene.modification import Modification, rebuild, rest, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec, parse_spec
+from photonfarm.scene.view import View, sample_view
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]

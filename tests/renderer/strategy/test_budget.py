@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import pytest
 
+from photonfarm.core.errors import IncompleteError
 from photonfarm.renderer.strategy.budget import Budget, affordable
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate
-from photonfarm.shared.core.errors import IncompleteError
 
 CANDIDATES = [Candidate(0, 1.0), PLAIN, Candidate(1, 1.0), Candidate(2, 1.0)]
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from photonfarm.core.records import F32
 from photonfarm.renderer.strategy.noise import BlockSums, missed
-from photonfarm.shared.core.records import F32
 
 SIDE, CANDIDATES, CONNECTED = 64, 6, 0.15
 WEIGHTS = np.ones((SIDE, SIDE, 3), np.float32)

@@ -9,10 +9,10 @@ from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
 
+from photonfarm.core.records import F32  # noqa: E402
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose, pair_errors, training_weights, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import Choice, choose  # noqa: E402
-from photonfarm.shared.core.records import F32  # noqa: E402
 
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
 CANDIDATES = [PLAIN, LIGHT, JOINED]

@@ -17,8 +17,8 @@ from photonfarm.renderer.strategy.candidates import GRID, PLAIN, Candidate  # no
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
 from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.printed import lines, plus_minus  # noqa: E402
-from photonfarm.shared.scene.spec import SceneSpec  # noqa: E402
-from photonfarm.shared.scene.spec_loading import parse_spec  # noqa: E402
+from photonfarm.scene.spec import SceneSpec  # noqa: E402
+from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
 
 
 def digest(spec: SceneSpec) -> str:

@@ -13,14 +13,14 @@ from photonfarm.renderer.scene import backend
 
 backend.load(threads=1)
 
+from photonfarm.cli.main import main  # noqa: E402
 from photonfarm.renderer.strategy import measurement as measurement_module  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy import plan  # noqa: E402
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.measurement import Measurement  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
-from photonfarm.shared.cli.main import main  # noqa: E402
-from photonfarm.shared.scene.spec import SceneSpec  # noqa: E402
-from photonfarm.shared.scene.spec_loading import load_spec  # noqa: E402
+from photonfarm.scene.spec import SceneSpec  # noqa: E402
+from photonfarm.scene.spec_loading import load_spec  # noqa: E402
 
 Run = Callable[..., tuple[int, str, str]]
 

@@ -10,14 +10,14 @@ from types import ModuleType
 import pytest
 from click.testing import CliRunner
 
+from photonfarm.core.errors import StoreError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, queue_status
 from photonfarm.renderer.cli import machine_verbs
 from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import FULL_S, DiskReserve, is_full
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, queue_status
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture
@@ -133,7 +133,7 @@ def test_a_commit_that_finds_the_disk_full_fails_no_job_and_ends_no_worker(
     code = """
 import errno, runpy, sys
 from photonfarm.renderer.worker import backpressure
-from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.store.io.local import LocalStorage
 backpressure.FULL_S = 0.5
 plain, refusals = LocalStorage.adopt, [2]
 def adopt(self, part, name, *, replace=False):

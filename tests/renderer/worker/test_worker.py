@@ -12,20 +12,20 @@ from types import ModuleType
 import pytest
 import queue_samples
 
+from photonfarm import queue
+from photonfarm.cli.farm_verbs import status
+from photonfarm.core.errors import BackendError, IncompleteError, QueueError, StoreError
+from photonfarm.core.processes import Stop
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, job_name, queue_status
 from photonfarm.renderer.worker import heartbeat
 from photonfarm.renderer.worker.queue_source import QueueSource
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.renderer.worker.supervisor import ChildOutput, ending
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
-from photonfarm.shared import queue
-from photonfarm.shared.cli.farm_verbs import status
-from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, job_name, queue_status
-from photonfarm.shared.scene.spec import Source
-from photonfarm.shared.store import SceneStore, Store, store_status
+from photonfarm.scene.spec import Source
+from photonfarm.store import SceneStore, Store, store_status
 
 
 @pytest.fixture

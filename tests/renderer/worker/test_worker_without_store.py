@@ -8,15 +8,15 @@ from types import ModuleType
 
 import pytest
 
+from photonfarm import queue
+from photonfarm.core.errors import StoreError
+from photonfarm.core.processes import process_space
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, job_name, queue_status, read_workers
+from photonfarm.queue.rq_adapter import open_queue
 from photonfarm.renderer.worker.worker import check, run_worker
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.core.processes import process_space
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, job_name, queue_status, read_workers
-from photonfarm.shared.queue.rq_adapter import open_queue
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture
@@ -51,7 +51,7 @@ def test_a_store_that_vanishes_under_a_worker_ends_it_and_the_queue_keeps_its_jo
 import runpy, sys
 from pathlib import Path
 from photonfarm.renderer.jobs import render as jobs
-from photonfarm.shared.store import Store
+from photonfarm.store import Store
 plain = jobs.ShardRenderer.render
 def render(self, *job):
     root = Path({str(root)!r})

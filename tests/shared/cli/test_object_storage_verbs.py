@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.store.io.storage import open_storage
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import StoreError
+from photonfarm.store.io.storage import open_storage
 
 
 def test_verbs_take_a_url_and_the_plan_they_write_is_found_again(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -39,16 +39,16 @@ def test_without_the_library_a_url_is_refused_with_what_to_install() -> None:
     code = """
 import sys
 sys.modules["obstore"] = None
-from photonfarm.shared.cli.main import main
+from photonfarm.cli.main import main
 main(["status", "--store", "s3://bucket/store"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == StoreError.exit_code
-    assert "photonfarm-shared[objects]" in done.stderr
+    assert "photonfarm[bucket]" in done.stderr
 
 
 def test_a_folders_store_does_not_load_the_library(tmp_path: Path) -> None:
-    code = "import sys; from photonfarm.shared.store import Store; Store(sys.argv[1], create=True); " \
+    code = "import sys; from photonfarm.store import Store; Store(sys.argv[1], create=True); " \
         "assert 'obstore' not in sys.modules"  # fmt: skip
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "store")], check=True)
     assert open_storage(tmp_path / "store").exists("photonfarm.json")

@@ -8,12 +8,12 @@ import queue_samples
 from click.testing import CliRunner, Result
 from redis import Redis
 
-from photonfarm.shared.cli.farm_verbs import reconcile
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.farm import submission
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec_loading import NamedSpec
+from photonfarm.cli.farm_verbs import reconcile
+from photonfarm.core.errors import StoreError
+from photonfarm.farm import submission
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec_loading import NamedSpec
 
 
 def ran(store: Path, url: str, *options: str) -> Result:

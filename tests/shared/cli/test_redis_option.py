@@ -5,10 +5,10 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared.cli.main import main
-from photonfarm.shared.farm import status
-from photonfarm.shared.queue import has_password
-from photonfarm.shared.store import Store
+from photonfarm.cli.main import main
+from photonfarm.farm import status
+from photonfarm.queue import has_password
+from photonfarm.store import Store
 
 SECRET = "hunter2"
 WITH = [

@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.cli.main import options_by_command, umbrella
-from photonfarm.shared.cli.settings import file_defaults
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.cli.main import options_by_command, umbrella
+from photonfarm.cli.settings import file_defaults
+from photonfarm.core.errors import SpecError
 
 OPTIONS = {"work": {"store": "store", "redis": "redis_url"}, "train": {"store": "store", "steps": "max_steps"}}
 

@@ -12,14 +12,14 @@ import pytest
 import redis
 from click.testing import CliRunner
 
+from photonfarm import queue
+from photonfarm.cli.main import main, umbrella
+from photonfarm.core.errors import QueueError
+from photonfarm.farm import status as farm_status
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.status import ANSWER_S
 from photonfarm.renderer.tools import doctor
-from photonfarm.shared import queue
-from photonfarm.shared.cli.main import main, umbrella
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.farm import status as farm_status
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.status import ANSWER_S
-from photonfarm.shared.store import Store
+from photonfarm.store import Store
 
 
 def test_json_has_the_reason_that_the_text_has_where_nothing_is_known_of_the_queue(tmp_path: Path) -> None:
@@ -64,7 +64,7 @@ def test_a_frozen_redis_does_not_hold_up_what_the_store_knows(tmp_path: Path) ->
         os.kill(running.pid, signal.SIGSTOP)
         try:
             words = ["status", "--store", str(tmp_path / "store"), "--redis", running.url]
-            command = [sys.executable, "-m", "photonfarm.shared.cli", *words]
+            command = [sys.executable, "-m", "photonfarm.cli", *words]
             with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as status:
                 assert status.stdout is not None
                 assert status.stdout.readline().startswith("scene")

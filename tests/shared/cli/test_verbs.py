@@ -8,9 +8,9 @@ import click
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli import main
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.processes import command
+from photonfarm.cli import main
+from photonfarm.cli.main import umbrella
+from photonfarm.core.processes import command
 
 
 @click.command()
@@ -106,7 +106,7 @@ def test_verbs_that_a_verb_starts_read_the_configuration_file_that_it_was_given(
     monkeypatch.setattr(EntryPoint, "load", lambda _: starting)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.toml").write_text("[report]\nout = 'room'\n[scene.show]\njson = true\n")
-    monkeypatch.setattr("photonfarm.shared.cli.main.file_defaults", lambda *_: {"report": {"out": "room"}})
+    monkeypatch.setattr("photonfarm.cli.main.file_defaults", lambda *_: {"report": {"out": "room"}})
     result = run("--config", "mine.toml", "report")
     assert result.output.startswith('0: {\n  "scene_id"'), result.output
     assert "PHOTONFARM_CONFIG" not in os.environ

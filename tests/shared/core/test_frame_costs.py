@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.archives import PARTS, FrameCosts, Seconds, Surface
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.core.archives import PARTS, FrameCosts, Seconds, Surface
+from photonfarm.core.errors import StoreError
 
 
 def made() -> FrameCosts:

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.keys import Stream, make_key, seed_of, uniform_of, view_key
-from photonfarm.shared.scene.view import view_keys
+from photonfarm.core.keys import Stream, make_key, seed_of, uniform_of, view_key
+from photonfarm.scene.view import view_keys
 
 
 def test_a_key_is_the_same_on_every_machine_and_in_every_version() -> None:

@@ -11,7 +11,7 @@ def test_no_distribution_closes_the_namespace() -> None:
 
 def test_submitting_needs_neither_mitsuba_nor_torch() -> None:
     code = (
-        "import sys; from photonfarm.shared.cli.main import main\n"
+        "import sys; from photonfarm.cli.main import main\n"
         "try: main(['submit', '--help'])\n"
         "except SystemExit: pass\n"
         "sys.exit(bool({'mitsuba', 'drjit', 'torch'} & set(sys.modules)))"

@@ -10,10 +10,10 @@ import pytest
 import queue_samples
 import redis
 
-from photonfarm.shared import queue
-from photonfarm.shared.core.processes import process_space
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import WorkerReport
+from photonfarm import queue
+from photonfarm.core.processes import process_space
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import WorkerReport
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_a_worker_that_was_killed_here_is_not_counted_while_its_heartbeat_lasts_
 
 
 def test_a_process_space_is_the_same_for_every_process_in_it_and_begins_with_the_hosts_name() -> None:
-    code = "from photonfarm.shared.core.processes import process_space; print(process_space())"
+    code = "from photonfarm.core.processes import process_space; print(process_space())"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert told.strip() == process_space()
     assert process_space().startswith(f"{os.uname().nodename}-")

@@ -9,11 +9,11 @@ import time
 
 import pytest
 
-from photonfarm.shared.core.processes import NAP_S, Stop
+from photonfarm.core.processes import NAP_S, Stop
 
 WAITING = """
 import signal, sys
-from photonfarm.shared.core.processes import Stop
+from photonfarm.core.processes import Stop
 stop = Stop()
 signal.signal(signal.SIGTERM, lambda *_: stop.set())
 print("ready", flush=True)

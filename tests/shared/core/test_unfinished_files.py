@@ -13,10 +13,10 @@ import zarr
 from zarr.abc.buffer import Buffer
 from zarr.storage import LocalStore
 
-from photonfarm.shared.store.io import object_cache
-from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.io.storage import put_json
-from photonfarm.shared.store.write.staging import group_in
+from photonfarm.store.io import object_cache
+from photonfarm.store.io.local import LocalStorage
+from photonfarm.store.io.storage import put_json
+from photonfarm.store.write.staging import group_in
 
 
 @pytest.fixture

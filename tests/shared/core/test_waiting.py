@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import Steps, WorkLog, pause_after_look
+from photonfarm.core.processes import ended_by_ctrl_c
+from photonfarm.core.waiting import Steps, WorkLog, pause_after_look
 
 
 def test_what_is_done_is_said_again_with_how_far_it_is() -> None:
@@ -70,7 +70,7 @@ def test_what_a_budget_leaves_no_time_for_does_not_count() -> None:
 @pytest.mark.usefixtures("hears_ctrl_c")
 def test_ctrl_c_ends_native_code_at_once() -> None:
     code = (
-        "from photonfarm.shared.core.processes import ended_by_ctrl_c\n"
+        "from photonfarm.core.processes import ended_by_ctrl_c\n"
         "with ended_by_ctrl_c():\n    print('in', flush=True); sum(range(10**12))"  # looks at no signal until it ends
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:

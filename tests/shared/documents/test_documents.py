@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel
 
-from photonfarm.shared.cli.main import options_by_command, umbrella
-from photonfarm.shared.cli.settings import file_defaults
-from photonfarm.shared.core import errors
-from photonfarm.shared.scene import spec as scene_spec
-from photonfarm.shared.scene.free_space import FreeSpace
+from photonfarm.cli.main import options_by_command, umbrella
+from photonfarm.cli.settings import file_defaults
+from photonfarm.core import errors
+from photonfarm.scene import spec as scene_spec
+from photonfarm.scene.free_space import FreeSpace
 
 ROOT = Path(__file__).parents[3]
 DOCS = ROOT / "docs"

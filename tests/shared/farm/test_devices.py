@@ -10,10 +10,10 @@ import nvidia_driver
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import BackendError
-from photonfarm.shared.farm import devices
-from photonfarm.shared.farm.devices import Card, Cards, cards_here, of_workers, shown_alone
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import BackendError
+from photonfarm.farm import devices
+from photonfarm.farm.devices import Card, Cards, cards_here, of_workers, shown_alone
 
 Driver = Callable[..., Cards]
 TWO = Cards((Card(0, "Test Card A", "8.9", 8 << 30), Card(1, "Test Card B", "8.9", 8 << 30)), "", 1208)

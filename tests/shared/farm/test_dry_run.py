@@ -12,17 +12,17 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli.farm_verbs import submit
-from photonfarm.shared.cli.show import bytes_per_sample
-from photonfarm.shared.core.errors import BackendError, SpecError
-from photonfarm.shared.farm import dry_run
-from photonfarm.shared.farm.dry_run import DryRun, costs_by_renderer, rehearse
-from photonfarm.shared.plan.allocation import KAPPA, Allocation, excess, seconds
-from photonfarm.shared.plan.request import Extent, Request
-from photonfarm.shared.plan.sample_costs import SampleCosts
-from photonfarm.shared.scene.spec_loading import NamedSpec, load_spec
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.format.schema import bytes_of_rows
+from photonfarm.cli.farm_verbs import submit
+from photonfarm.cli.show import bytes_per_sample
+from photonfarm.core.errors import BackendError, SpecError
+from photonfarm.farm import dry_run
+from photonfarm.farm.dry_run import DryRun, costs_by_renderer, rehearse
+from photonfarm.plan.allocation import KAPPA, Allocation, excess, seconds
+from photonfarm.plan.request import Extent, Request
+from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.scene.spec_loading import NamedSpec, load_spec
+from photonfarm.store import Store
+from photonfarm.store.format.schema import bytes_of_rows
 
 COSTS = SampleCosts("0" * 32, 0.5, 0.25, 0.125, 0.0625, 1000.0 * KAPPA)  # so noisy that 8 spp are too few
 STATIC_NOISE = 50**2 * KAPPA * 0.0625 / 0.375  # for which 50 spp are best
@@ -134,7 +134,7 @@ def test_equal_configurations_are_counted_once(tmp_path: Path) -> None:
 def test_cost_and_time_follow_from_what_the_verb_measured(tmp_path: Path, verb: Verb) -> None:
     asked = verb()
     found = rehearsed(tmp_path, tmp_path / "none", passes=3)
-    assert asked.read_text() == f"-m photonfarm.shared.cli scene cost --json --seconds 20 -- {tmp_path / 'spec.json'}\n"
+    assert asked.read_text() == f"-m photonfarm.cli scene cost --json --seconds 20 -- {tmp_path / 'spec.json'}\n"
     assert found.costs == COSTS
     assert found.core_s == pytest.approx(6 * 0.5 + 12 * 0.25 + 36 * (0.125 + 8 * 0.0625))
     assert found.wall_s == pytest.approx(found.core_s / 4)

@@ -3,12 +3,12 @@
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.farm import submission
-from photonfarm.shared.farm.submission import rows_per_job, sample_seconds
-from photonfarm.shared.plan.request import SHARD_ROWS, Request
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import Store
+from photonfarm.farm import submission
+from photonfarm.farm.submission import rows_per_job, sample_seconds
+from photonfarm.plan.request import SHARD_ROWS, Request
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import Store
 
 
 def spec_of(side: int, half_spp: int) -> SceneSpec:

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import connect
+from photonfarm.core.errors import QueueError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import connect
 
 
 def alive(pid: int) -> bool:
@@ -87,7 +87,7 @@ def test_a_folder_that_cannot_be_made_is_a_queue_error(tmp_path: Path) -> None:
 def test_it_does_not_outlive_a_killed_parent_and_its_folder_can_be_used_again(tmp_path: Path) -> None:
     code = """
 import sys, time
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.redis_server import EmbeddedRedis
 with EmbeddedRedis(sys.argv[1]) as server:
     print(server.pid, flush=True)
     time.sleep(60)
@@ -132,7 +132,7 @@ def test_a_redis_of_ones_own_is_one_process_and_ends_with_it(tmp_path: Path) -> 
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    command = [sys.executable, "-m", "photonfarm.shared.cli", "redis", "--port", str(port)]
+    command = [sys.executable, "-m", "photonfarm.cli", "redis", "--port", str(port)]
     with subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL) as server:
         url, end = f"redis://127.0.0.1:{port}/0", time.monotonic() + 20
         while True:

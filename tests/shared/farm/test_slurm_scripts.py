@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import SchedulerError, SpecError, StoreError
-from photonfarm.shared.farm.slurm.launch import check_slurm
-from photonfarm.shared.farm.slurm.scripts import limit_s
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SchedulerError, SpecError, StoreError
+from photonfarm.farm.slurm.launch import check_slurm
+from photonfarm.farm.slurm.scripts import limit_s
 
 Launcher = Callable[..., Result]
 
@@ -164,7 +164,7 @@ scontrol() {{ echo "scontrol $*" >> {tmp_path}/asked; }}
 def test_the_launcher_needs_neither_mitsuba_nor_torch(tmp_path: Path) -> None:
     code = """
 import sys
-from photonfarm.shared.cli.main import umbrella
+from photonfarm.cli.main import umbrella
 umbrella.main(["slurm", "cornell", "--dry-run"], standalone_mode=False)
 assert not {"mitsuba", "torch", "redis", "zarr"} & sys.modules.keys(), sorted(sys.modules)
 """

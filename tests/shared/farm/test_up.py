@@ -13,16 +13,16 @@ from typing import Any
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.cli.show_up import FarmTalk, progress_line
-from photonfarm.shared.core.errors import IncompleteError, SpecError
-from photonfarm.shared.farm import up
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.status import StoreQueue
-from photonfarm.shared.farm.training import RunFolder
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.queue import Activity, QueueStatus
-from photonfarm.shared.store import Store
+from photonfarm.cli.show_up import FarmTalk, progress_line
+from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.farm import up
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.status import StoreQueue
+from photonfarm.farm.training import RunFolder
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.queue import Activity, QueueStatus
+from photonfarm.store import Store
 
 
 def test_further_passes_are_told_apart_from_samples(store: Store, tmp_path: Path) -> None:

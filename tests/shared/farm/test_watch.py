@@ -15,18 +15,18 @@ import store_samples as samples
 from click.testing import CliRunner
 from rich.console import Console
 
-from photonfarm.shared import queue
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.cli.show_watch import drawn, lines
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.farm import running_farm, status
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.farm.running_farm import announced
-from photonfarm.shared.farm.status import RECENT_S, NoQueue, StoreQueue, queue_of, since_commit_s
-from photonfarm.shared.farm.training import RunFolder
-from photonfarm.shared.farm.watch import STEADY_S, FarmWatch
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm import queue
+from photonfarm.cli.main import umbrella
+from photonfarm.cli.show_watch import drawn, lines
+from photonfarm.core.errors import QueueError
+from photonfarm.farm import running_farm, status
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.running_farm import announced
+from photonfarm.farm.status import RECENT_S, NoQueue, StoreQueue, queue_of, since_commit_s
+from photonfarm.farm.training import RunFolder
+from photonfarm.farm.watch import STEADY_S, FarmWatch
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture
@@ -156,7 +156,7 @@ def test_a_redis_that_fails_on_the_way_ends_no_watch(
     def fail(*_: Any) -> None:
         raise redis.TimeoutError("Timeout reading from socket")
 
-    monkeypatch.setattr("photonfarm.shared.farm.status.queue_of", fail)
+    monkeypatch.setattr("photonfarm.farm.status.queue_of", fail)
     view = FarmWatch(store, "unix:///none").look()
     assert isinstance(view.queue, NoQueue)
     assert view.scenes[0].samples == (0, 8)
@@ -187,7 +187,7 @@ def test_status_without_a_redis_is_no_error_for_who_named_none(
 ) -> None:
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("photonfarm.shared.queue.connect", _refuses)
+    monkeypatch.setattr("photonfarm.queue.connect", _refuses)
     done = CliRunner().invoke(umbrella, ["status"])
     assert done.exit_code == 0
     assert "no Redis" not in done.output
@@ -199,7 +199,7 @@ def test_what_workers_without_redis_commit_shows_that_they_are_at_work(
 ) -> None:
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("photonfarm.shared.queue.connect", _refuses)
+    monkeypatch.setattr("photonfarm.queue.connect", _refuses)
     assert since_commit_s(store) is None
     now = [0.0]
     watch = FarmWatch(store, f"unix://{tmp_path}/none", named_redis=False, clock=lambda: now[0])

@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonfarm.shared.plan.allocation import MOST_SPP, MOST_VIEWS, Allocation, CostModel, excess, seconds
-from photonfarm.shared.plan.sample_costs import SampleCosts
+from photonfarm.plan.allocation import MOST_SPP, MOST_VIEWS, Allocation, CostModel, excess, seconds
+from photonfarm.plan.sample_costs import SampleCosts
 
 NAMES = ("configuration_s", "view_s", "pass_s", "spp_s", "relative_variance")
 ROOM = SampleCosts("room", 0.04, 0.035, 0.005, 0.032, 0.3)

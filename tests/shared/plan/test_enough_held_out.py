@@ -4,7 +4,7 @@ import hashlib
 
 import pytest
 
-from photonfarm.shared.plan.hold_out import HOLD_OUT, are_held_out, enough, places_of
+from photonfarm.plan.hold_out import HOLD_OUT, are_held_out, enough, places_of
 
 UNITS = [hashlib.sha256(bytes([i])).digest()[:16] for i in range(200)]
 

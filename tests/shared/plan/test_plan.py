@@ -13,13 +13,13 @@ import store_samples as samples
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import Stream, make_key
-from photonfarm.shared.plan.request import UNUSED, PlannedContent, PlannedRows, Request, expand
-from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import sample_view, sample_views
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import Stream, make_key
+from photonfarm.plan.request import UNUSED, PlannedContent, PlannedRows, Request, expand
+from photonfarm.scene.modification import Modification, rest, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import sample_view, sample_views
+from photonfarm.store import SceneStore, Store
 
 Triple = tuple[bytes, bytes, int]
 
@@ -169,8 +169,8 @@ def test_a_request_larger_than_memory_should_hold_is_refused() -> None:
 def test_racing_submitters_plan_every_sample_exactly_once(store: Store) -> None:
     code = """
 import importlib.util, sys
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import Store
+from photonfarm.plan.request import Request
+from photonfarm.store import Store
 spec = importlib.util.spec_from_file_location("store_samples", sys.argv[1])
 samples = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(samples)

@@ -6,8 +6,8 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.plan.sample_costs import SECONDS, SampleCosts, relative_variance
+from photonfarm.core.errors import StoreError
+from photonfarm.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 
 COSTS = SampleCosts("0" * 32, 0.04, 0.035, 0.0, 0.032, 0.3, 0.01)
 

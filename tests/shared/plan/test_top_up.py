@@ -11,14 +11,14 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.plan.hold_out import are_held_out
-from photonfarm.shared.plan.request import MAX_SAMPLES, Request
-from photonfarm.shared.plan.top_up import TopUp, spp_per_pass
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import make_key
+from photonfarm.plan.hold_out import are_held_out
+from photonfarm.plan.request import MAX_SAMPLES, Request
+from photonfarm.plan.top_up import TopUp, spp_per_pass
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.store import SceneReader, SceneStore, Store
 
 SPP = 8  # of a pass of the small spec: two halves of half_spp = 4
 
@@ -141,8 +141,8 @@ def test_racing_top_ups_plan_no_pass_twice_and_leave_none_out(scene: SceneStore)
     """Each adds three times and asks four times for one total: 1 + 2 · 3 passes, or that total."""
     code = """
 import sys
-from photonfarm.shared.store import Store
-from photonfarm.shared.plan.top_up import TopUp
+from photonfarm.store import Store
+from photonfarm.plan.top_up import TopUp
 scene = Store(sys.argv[1]).scene(sys.argv[2])
 sys.stdin.readline()
 for spp in ("+8", "40", "+8", "40", "+8", "40", "40"):

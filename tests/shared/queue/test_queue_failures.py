@@ -9,10 +9,10 @@ import redis
 from redis.connection import AbstractConnection as Connection
 from rq.results import Result
 
-from photonfarm.shared import queue
-from photonfarm.shared.queue import TRIES, Failure, job_name, queue_status, reconcile
-from photonfarm.shared.queue.rq_adapter import open_queue
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm import queue
+from photonfarm.queue import TRIES, Failure, job_name, queue_status, reconcile
+from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.store import SceneStore, Store
 
 scene = queue_samples.scene
 SCENE_ID = queue_samples.SCENE_ID

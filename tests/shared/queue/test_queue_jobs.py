@@ -11,17 +11,17 @@ import redis
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.queue import TRIES, RenderArguments, queue_status
-from photonfarm.shared.queue.job import FUNCTION
-from photonfarm.shared.queue.rq_adapter import add, fail, fail_lost, fail_of_worker, finish, keep_alive, open_queue
+from photonfarm.core.errors import QueueError
+from photonfarm.queue import TRIES, RenderArguments, queue_status
+from photonfarm.queue.job import FUNCTION
+from photonfarm.queue.rq_adapter import add, fail, fail_lost, fail_of_worker, finish, keep_alive, open_queue
 
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
 OTHER_ID = "ab" * 16
 taken, queued = queue_samples.taken, queue_samples.queued
 
 
-@pytest.mark.parametrize("function", ["os.system", "photonfarm.shared.core.errors.QueueError", "builtins.eval"])
+@pytest.mark.parametrize("function", ["os.system", "photonfarm.core.errors.QueueError", "builtins.eval"])
 def test_a_foreign_function_in_redis_is_neither_run_nor_imported_and_its_entry_thrown_away(
     connection: redis.Redis, function: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

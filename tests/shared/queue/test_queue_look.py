@@ -7,11 +7,11 @@ import queue_samples
 import redis
 import store_samples as samples
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import look, reconcile, reconciliation
-from photonfarm.shared.queue.rq_adapter import fail_of_worker
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.plan.request import Request
+from photonfarm.queue import look, reconcile, reconciliation
+from photonfarm.queue.rq_adapter import fail_of_worker
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.io.local import LocalStorage
 
 scene = queue_samples.scene
 

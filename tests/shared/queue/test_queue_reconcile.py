@@ -9,13 +9,13 @@ import store_samples as samples
 from rq.job import Job
 from rq.serializers import JSONSerializer
 
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, job_name, queue_status, reconcile, reconciliation
-from photonfarm.shared.queue.job import FUNCTION
-from photonfarm.shared.queue.rq_adapter import open_queue
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.core.errors import QueueError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, job_name, queue_status, reconcile, reconciliation
+from photonfarm.queue.job import FUNCTION
+from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.store import SceneStore, Store
 
 scene = queue_samples.scene
 queued = queue_samples.queued

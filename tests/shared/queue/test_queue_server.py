@@ -17,15 +17,15 @@ import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.farm import submission
-from photonfarm.shared.farm.redis_server import EmbeddedRedis, server_binary
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, look, queue_status, reconcile, rq_adapter, with_password_of
-from photonfarm.shared.queue.rq_adapter import open_queue
-from photonfarm.shared.scene.spec_loading import NamedSpec
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm import queue
+from photonfarm.core.errors import QueueError
+from photonfarm.farm import submission
+from photonfarm.farm.redis_server import EmbeddedRedis, server_binary
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, look, queue_status, reconcile, rq_adapter, with_password_of
+from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import SceneStore, Store
 
 scene = queue_samples.scene
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME

@@ -10,10 +10,10 @@ import queue_samples
 import redis
 from rq import Worker
 
-from photonfarm.shared import queue
-from photonfarm.shared.queue import Activity, WorkerReport, queue_status, read_workers, reconcile
-from photonfarm.shared.queue.workers import WORKER
-from photonfarm.shared.store import Store
+from photonfarm import queue
+from photonfarm.queue import Activity, WorkerReport, queue_status, read_workers, reconcile
+from photonfarm.queue.workers import WORKER
+from photonfarm.store import Store
 
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
 FAR = WorkerReport(host="elsewhere", process=1)

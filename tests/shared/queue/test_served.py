@@ -9,10 +9,10 @@ import pytest
 import queue_samples
 import redis
 
-from photonfarm.shared import queue
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.queue import connect
-from photonfarm.shared.store import Store
+from photonfarm import queue
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import connect
+from photonfarm.store import Store
 
 
 @pytest.fixture

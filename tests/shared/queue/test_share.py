@@ -5,8 +5,8 @@ from itertools import pairwise
 
 import pytest
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.queue import Share
+from photonfarm.core.errors import SpecError
+from photonfarm.queue import Share
 
 
 @pytest.mark.parametrize("text", ["4/4", "1", "/3", "-1/3", "1/0", "a/b", "1/2/3", "١/٢"])

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.camera_path import ORBIT, CameraPath, orbit
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.core.errors import SpecError
+from photonfarm.scene.camera_path import ORBIT, CameraPath, orbit
+from photonfarm.scene.spec_loading import load_spec
 
 KEYS = np.array([[0, 0, 0, 5, 1, 0], [1, 0, 2, 5, 1, 1], [3, 1, 2, 5, 2, 2], [4, 1, 0, 5, 1, 0]], np.float32)
 

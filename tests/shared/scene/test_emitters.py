@@ -10,11 +10,11 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import Emitters, SceneSpec
-from photonfarm.shared.scene.spec_loading import find_spec, load_spec, parse_spec
-from photonfarm.shared.store import Store
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError
+from photonfarm.scene.spec import Emitters, SceneSpec
+from photonfarm.scene.spec_loading import find_spec, load_spec, parse_spec
+from photonfarm.store import Store
 
 ROOT = Path(__file__).parents[3]
 

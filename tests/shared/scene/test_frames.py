@@ -6,15 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.errors import SpecError, StoreError
-from photonfarm.shared.core.records import Guides, Photons, arrays_of
-from photonfarm.shared.farm.configuration import named_configuration
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.camera_path import Frames
-from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import Store
+from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.records import Guides, Photons, arrays_of
+from photonfarm.farm.configuration import named_configuration
+from photonfarm.plan.request import Request
+from photonfarm.scene.camera_path import Frames
+from photonfarm.scene.modification import Modification, rest, sample_modification
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import View
+from photonfarm.store import Store
 
 
 def made(*, photons: bool) -> Frames:

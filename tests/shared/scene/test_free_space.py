@@ -7,21 +7,21 @@ import pytest
 import store_samples as samples
 from scipy import stats
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.plan.request import PlannedContent, Request, expand
-from photonfarm.shared.scene.camera_path import CameraPath, kept_clear, orbit
-from photonfarm.shared.scene.free_space import FreeSpace, packed
-from photonfarm.shared.scene.modification import (
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import make_key
+from photonfarm.plan.request import PlannedContent, Request, expand
+from photonfarm.scene.camera_path import CameraPath, kept_clear, orbit
+from photonfarm.scene.free_space import FreeSpace, packed
+from photonfarm.scene.modification import (
     Modification,
     modification_keys,
     rest,
     sample_modification,
     sample_modifications,
 )
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.scene.view import in_free_space, sample_view, sample_views
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.view import in_free_space, sample_view, sample_views
 
 BOX = {"min": [0.0, 0.0, 0.0], "max": [4.0, 1.0, 2.0]}
 FREE = np.ones((8, 2, 4), np.bool_)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.scene.modification import Modification, rest, sample_modification
+from photonfarm.scene.spec import SceneSpec
 
 COUNT = 4000
 

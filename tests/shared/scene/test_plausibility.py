@@ -6,9 +6,9 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.scene.plausibility import doubts, warnings
-from photonfarm.shared.scene.spec_loading import NamedSpec, find_spec, lines_of, parse_with_lights
+from photonfarm.cli.main import umbrella
+from photonfarm.scene.plausibility import doubts, warnings
+from photonfarm.scene.spec_loading import NamedSpec, find_spec, lines_of, parse_with_lights
 
 ROOM: dict[str, Any] = {
     "name": "checked",

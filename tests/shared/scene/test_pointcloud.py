@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.shared.core.keys import Stream, make_key
-from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry
-from photonfarm.shared.scene.modification import draw, rebuild, sample_modification, sample_surface
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.core.keys import Stream, make_key
+from photonfarm.core.records import STATIC, BasePointCloud, Geometry
+from photonfarm.scene.modification import draw, rebuild, sample_modification, sample_surface
+from photonfarm.scene.spec import SceneSpec
 
 COUNT = 40_000
 

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.spec import BUILTIN_ROOMS, Emitters, Light
-from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, load_spec
+from photonfarm.core.errors import SpecError
+from photonfarm.scene.spec import BUILTIN_ROOMS, Emitters, Light
+from photonfarm.scene.spec_loading import SCENES_VARIABLE, load_spec
 
 ROOT = Path(__file__).parents[3]
 READY = sorted((ROOT / "scenes").glob("*.toml"))

@@ -5,10 +5,10 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.models import sentences
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec, scene_folder
+from photonfarm.core.errors import SpecError
+from photonfarm.core.models import sentences
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec, scene_folder
 
 SCENE = """<scene version="3.0.0">
   <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>

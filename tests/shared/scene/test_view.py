@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.scene.view import Camera, View, sample_view
+from photonfarm.core.keys import make_key
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.view import Camera, View, sample_view
 
 COUNT = 4000
 

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, consumed_samples, serve
-from photonfarm.shared.store import Store
+from photonfarm.core.errors import IncompleteError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, consumed_samples, serve
+from photonfarm.store import Store
 from photonfarm.trainer import service, train
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training import loop

@@ -8,13 +8,13 @@ import pytest
 import torch
 from analytic_room_samples import known
 
-from photonfarm.shared.core.errors import CorruptError, IncompleteError
-from photonfarm.shared.core.records import LIT_POINTS, ViewBuffers, Visibility
-from photonfarm.shared.plan.hold_out import are_held_out, rows_held_out
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store import Figures, SceneReader, Store
-from photonfarm.shared.store.check.check import check_store
+from photonfarm.core.errors import CorruptError, IncompleteError
+from photonfarm.core.records import LIT_POINTS, ViewBuffers, Visibility
+from photonfarm.plan.hold_out import are_held_out, rows_held_out
+from photonfarm.plan.request import Request
+from photonfarm.scene.view import Camera
+from photonfarm.store import Figures, SceneReader, Store
+from photonfarm.store.check.check import check_store
 from photonfarm.trainer.data.feed import Feed
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.cli.main import umbrella
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
 from photonfarm.trainer.dry_run import dry_run
 from photonfarm.trainer.dry_run.dry_run import DryRun, rehearse
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene

@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from photonfarm.shared.core.errors import StoreError
+from photonfarm.core.errors import StoreError
 from photonfarm.trainer.metrics import FIDInceptionV3, InceptionWeights, find_weights, load_inception
 from photonfarm.trainer.metrics.inception import network_input
 

@@ -9,7 +9,7 @@ import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.metrics import (
     Features,
     FIDInceptionV3,

@@ -10,7 +10,7 @@ from flip_evaluator import evaluate
 from numpy.typing import NDArray
 from scipy import stats
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.metrics import confidence_interval, flip, image_metrics, metric_space, mse, mssim
 from photonfarm.trainer.metrics.image_metrics import CHUNK
 from photonfarm.trainer.metrics.intervals import PerImage, t_975

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from photonfarm.shared.core.records import LIT_POINTS
+from photonfarm.core.records import LIT_POINTS
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.projection import Optics

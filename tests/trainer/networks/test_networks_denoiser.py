@@ -5,7 +5,7 @@ import pytest
 import torch
 from read_batches import batch_of
 
-from photonfarm.shared.core.statistics import Estimate, clean_error, clean_error_having_seen_a
+from photonfarm.core.statistics import Estimate, clean_error, clean_error_having_seen_a
 from photonfarm.trainer.data.batch import TrainingBatch, kept_pixels
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build

@@ -2,8 +2,8 @@
 
 import pytest
 
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
 from photonfarm.trainer.networks.summary import NetworkPart, summary, table
 from photonfarm.trainer.runs.settings import NetworkSettings
 

@@ -9,10 +9,10 @@ import pytest
 import read_batches
 import torch
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import Photons, arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import Photons, arrays_of
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build

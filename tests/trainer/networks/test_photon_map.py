@@ -8,7 +8,7 @@ import pytest
 import torch
 from read_batches import batch_of
 
-from photonfarm.shared.scene.view import Camera
+from photonfarm.scene.view import Camera
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area

@@ -9,7 +9,7 @@ import pytest
 import torch
 from read_batches import batch_of
 
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.view import Camera, View
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs

@@ -12,16 +12,16 @@ from analytic_room_samples import commit_job, known
 from click.testing import CliRunner
 from PIL import Image
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import PhotonfarmError, SpecError, StoreError
-from photonfarm.shared.core.pictures import display
-from photonfarm.shared.core.records import LIT_POINTS, Guides, arrays_of
-from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.camera_path import Frames, orbit
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import PhotonfarmError, SpecError, StoreError
+from photonfarm.core.pictures import display
+from photonfarm.core.records import LIT_POINTS, Guides, arrays_of
+from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.plan.request import Request
+from photonfarm.scene.camera_path import Frames, orbit
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.view import View
+from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.trainer.predict import animation, infer
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.training.loop import train
@@ -153,7 +153,7 @@ def test_a_path_becomes_pictures_an_animation_and_a_film(
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     without = infer.show_frames(store, TrainedRun.load(tmp_path / "run"), path, tmp_path / "other")
     assert not (tmp_path / "other/path.mp4").exists()
-    assert "pip install photonfarm-trainer[video]" in without.sentence
+    assert "pip install photonfarm[video]" in without.sentence
 
 
 def test_odd_sizes_become_even_in_a_film_and_stay_odd_in_pictures(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import sys
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predict.evaluation import batches, measure
@@ -69,7 +69,7 @@ def test_equal_images_give_equal_bits_and_the_input_is_not_changed(oidn: Oidn) -
 
 def test_without_its_package_it_says_what_to_install(monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(SpecError, match=r"photonfarm-trainer\[oidn\]"):
+    with pytest.raises(SpecError, match=r"photonfarm\[oidn\]"):
         Oidn()
 
 

@@ -2,10 +2,10 @@
 
 import pytest
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader
-from photonfarm.shared.store.read.find import Query
-from photonfarm.shared.store.read.merge import merge_views
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader
+from photonfarm.store.read.find import Query
+from photonfarm.store.read.merge import merge_views
 from photonfarm.trainer.training.loop import train
 
 

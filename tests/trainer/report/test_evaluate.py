@@ -12,14 +12,14 @@ import torch
 from click.testing import CliRunner
 from PIL import Image
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.core.pictures import display
-from photonfarm.shared.plan.hold_out import are_held_out, rows_held_out
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.store import SceneReader, SceneStore
-from photonfarm.shared.store.read.merge import MergedView, merge_view
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.core.pictures import display
+from photonfarm.plan.hold_out import are_held_out, rows_held_out
+from photonfarm.plan.request import Request
+from photonfarm.scene.modification import sample_modification
+from photonfarm.store import SceneReader, SceneStore
+from photonfarm.store.read.merge import MergedView, merge_view
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import EVALUATION, compare
 from photonfarm.trainer.compare.evaluation_samples import References

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.archives import PARTS, FrameCosts, Seconds
+from photonfarm.core.archives import PARTS, FrameCosts, Seconds
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.frame_times import frame_time, points_used

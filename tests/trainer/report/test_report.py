@@ -18,14 +18,14 @@ from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from read_batches import batch_of
 
-from photonfarm.shared.core.archives import Seconds
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.store import SceneReader, Store, store_status
-from photonfarm.shared.store.read.merge import MergedView
+from photonfarm.core.archives import Seconds
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.records import F32
+from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.store import SceneReader, Store, store_status
+from photonfarm.store.read.merge import MergedView
 from photonfarm.trainer.compare.evaluate import PredictorRow
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
 from photonfarm.trainer.predict.trained import TrainedRun

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from chromium import chromium, needs_chromium
 
-from photonfarm.shared.core.records import Guides
-from photonfarm.shared.core.statistics import Estimate, group_means
-from photonfarm.shared.store import SceneReader
+from photonfarm.core.records import Guides
+from photonfarm.core.statistics import Estimate, group_means
+from photonfarm.store import SceneReader
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report

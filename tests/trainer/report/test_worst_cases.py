@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.archives import Surface
-from photonfarm.shared.core.records import ViewBuffers
+from photonfarm.core.archives import Surface
+from photonfarm.core.records import ViewBuffers
 from photonfarm.trainer.report.views import caption as caption_of
 from photonfarm.trainer.report.worst_cases import (
     ALL,

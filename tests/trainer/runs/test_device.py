@@ -5,7 +5,7 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.device import described, round_convolutions, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT

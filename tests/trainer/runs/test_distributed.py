@@ -19,8 +19,8 @@ import pytest
 import torch
 from torch.nn.parallel import DistributedDataParallel
 
-from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError
-from photonfarm.shared.plan.request import Request
+from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError
+from photonfarm.plan.request import Request
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs import distributed as processes
 from photonfarm.trainer.runs.distributed import Ranks, leading, ranks
@@ -317,7 +317,7 @@ def test_torchrun_trains_a_store_with_two_processes(scene, commit, run) -> None:
         "cnn",
     ]
     launched = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone", "-m"]
-    command = [*launched, "--", "photonfarm.shared.cli", *told]
+    command = [*launched, "--", "photonfarm.cli", *told]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=240, check=False)
     assert done.returncode == 0, done.stderr

@@ -7,10 +7,10 @@ import pytest
 import torch
 from click.testing import CliRunner, Result
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
 from photonfarm.trainer import train
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS

@@ -8,8 +8,8 @@ import torch
 from click.testing import CliRunner
 from pydantic import ValidationError
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer import service
 from photonfarm.trainer.cli.train_verb import train
 from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, preset, settings_of, small

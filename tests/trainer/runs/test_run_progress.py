@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from photonfarm.shared.core.pictures import display
-from photonfarm.shared.farm.training import PROGRESS, VIEWS, RunFolder
+from photonfarm.core.pictures import display
+from photonfarm.farm.training import PROGRESS, VIEWS, RunFolder
 from photonfarm.trainer.runs import run_progress, shown_views
 from photonfarm.trainer.runs.run_progress import RunProgress, followed
 from photonfarm.trainer.runs.shown_views import MOST, write_views

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.trainer import service
 from photonfarm.trainer.cli import train_verb as cli
 from photonfarm.trainer.predict.trained import TrainedRun

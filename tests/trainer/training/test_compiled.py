@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings

@@ -18,18 +18,18 @@ import pytest
 import torch
 from torch import Tensor
 
+from photonfarm.core.keys import view_key
+from photonfarm.core.records import F32, BasePointCloud, Geometry
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.keys import view_key
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry
-from photonfarm.shared.scene.modification import rebuild, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import load_spec
-from photonfarm.shared.scene.view import View, sample_view
-from photonfarm.shared.store import Sample
+from photonfarm.scene.modification import rebuild, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import View, sample_view
+from photonfarm.store import Sample
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.frame import SceneFrame

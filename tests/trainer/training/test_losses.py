@@ -14,7 +14,7 @@ import torch
 from held_out_errors import held_out_errors
 from read_batches import batch_of
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Needs

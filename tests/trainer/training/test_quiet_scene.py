@@ -14,11 +14,11 @@ from typing import Any
 import pytest
 import torch
 
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.write.lease import lease
-from photonfarm.shared.store.write.withdrawal import forget
+from photonfarm.core.errors import IncompleteError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.write.lease import lease
+from photonfarm.store.write.withdrawal import forget
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.distributed import leading, ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
@@ -104,7 +104,7 @@ def repair(scene: SceneStore, job: int) -> str:
     """Damage a job, and have it repaired by the verb."""
     path = next((scene.folder / "plans/000000/radiance").glob(f"c.{job}.*"))
     path.write_bytes(path.read_bytes()[:-1])
-    code = "import sys; from photonfarm.shared.cli.main import main; sys.argv[0] = 'photonfarm'; sys.exit(main())"
+    code = "import sys; from photonfarm.cli.main import main; sys.argv[0] = 'photonfarm'; sys.exit(main())"
     verb = [sys.executable, "-c", code, "store", "check", "--repair", "--store", str(scene.storage.root)]
     ended = subprocess.run(verb, capture_output=True, text=True, timeout=100)
     assert ended.returncode == IncompleteError.exit_code, ended.stderr

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.core.statistics import Estimate, group_means
+from photonfarm.core.errors import StoreError
+from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun

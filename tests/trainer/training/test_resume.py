@@ -17,9 +17,9 @@ import torch
 from held_out_errors import held_out_errors
 from safetensors import safe_open
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, Store
+from photonfarm.core.errors import SpecError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.growth import Growth
 from photonfarm.trainer.data.sampler import RoundSampler
 from photonfarm.trainer.runs import checkpoint, metrics_log

@@ -12,9 +12,9 @@ import pytest
 import torch
 from held_out_errors import held_out_errors
 
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.core.errors import IncompleteError
+from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.scene.spec_loading import load_spec
 from photonfarm.trainer import service
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.data.growth import Growth

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.shared.core.statistics import Estimate, clean_error, group_means, noise_floor
+from photonfarm.core.statistics import Estimate, clean_error, group_means, noise_floor
 from photonfarm.trainer.training.losses import LOSSES, linear_loss
 
 

@@ -44,8 +44,8 @@ def train(
     written, IncompleteError if `max_seconds` were over before anything was rendered, and DivergedError if training
     diverges.
     """
-    from photonfarm.shared.store import Store  # torch is slow to load, and settings are read without it
-    from photonfarm.shared.store.read.find import scene_named
+    from photonfarm.store import Store  # torch is slow to load, and settings are read without it
+    from photonfarm.store.read.find import scene_named
     from photonfarm.trainer import service
     from photonfarm.trainer.predict.trained import TrainedRun
 

@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import ValidationError
 from redis import Redis, RedisError
 
-from photonfarm.shared.core.errors import IncompleteError, QueueError, SpecError, StoreError
-from photonfarm.shared.core.processes import Stop, repeating
-from photonfarm.shared.scene.spec import Film
-from photonfarm.shared.scene.spec_loading import load_spec, scene_folder
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.io.storage import is_vacant
-from photonfarm.shared.store.read.other_scenes import other_scenes
-from photonfarm.shared.store.write.scene_store import held as scenes_held
+from photonfarm.core.errors import IncompleteError, QueueError, SpecError, StoreError
+from photonfarm.core.processes import Stop, repeating
+from photonfarm.scene.spec import Film
+from photonfarm.scene.spec_loading import load_spec, scene_folder
+from photonfarm.store import Store
+from photonfarm.store.io.storage import is_vacant
+from photonfarm.store.read.other_scenes import other_scenes
+from photonfarm.store.write.scene_store import held as scenes_held
 from photonfarm.trainer.runs.run_folder import held, note_scene_folder
 from photonfarm.trainer.runs.run_progress import RunProgress, followed
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
@@ -27,8 +27,8 @@ from photonfarm.trainer.runs.shown_views import write_views
 from photonfarm.trainer.runs.user_code import named_in_errors
 
 if TYPE_CHECKING:
-    from photonfarm.shared.core.records import F32
-    from photonfarm.shared.scene.spec import SceneSpec
+    from photonfarm.core.records import F32
+    from photonfarm.scene.spec import SceneSpec
     from photonfarm.trainer.dry_run.dry_run import DryRun
     from photonfarm.trainer.runs.distributed import TrainingGroup
 
@@ -63,7 +63,7 @@ def run(
     Raises IncompleteError if the time is over before there is anything to train on, and with `until_complete` also if a
     signal stops it.
     """
-    from photonfarm.shared.store import SceneReader
+    from photonfarm.store import SceneReader
     from photonfarm.trainer.runs.device import described
     from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, leading, ranks
     from photonfarm.trainer.training.loop import stop_on_signals
@@ -100,7 +100,7 @@ def _lead(
     on_record: Callable[[dict[str, Any]], object] | None,
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
-    from photonfarm.shared.store import SceneReader
+    from photonfarm.store import SceneReader
     from photonfarm.trainer.runs.tensorboard import event_files
     from photonfarm.trainer.training.loop import Hooks, train
 
@@ -215,7 +215,7 @@ def rehearse(
     `film` is the side of images in pixels, if it shall be another than the spec's. Raises SpecError without a spec,
     unless the store has one scene, and in one of several processes.
     """
-    from photonfarm.shared.core.models import sentences
+    from photonfarm.core.models import sentences
     from photonfarm.trainer.dry_run.dry_run import rehearse
     from photonfarm.trainer.runs.distributed import processes
 
@@ -332,7 +332,7 @@ class _ConsumptionReporter:
         """Report the last numbers, if there are any and a Redis."""
         if self._url is None or self._used is None:
             return
-        from photonfarm.shared import queue
+        from photonfarm import queue
 
         try:
             self._connection = self._connection or queue.connect(self._url)

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from photonfarm.core.errors import store_errors
+from photonfarm.core.files import write_whole
 from photonfarm.export.columns import Column
 from photonfarm.export.folder import DATA
 from photonfarm.export.manifest import Manifest
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.files import write_whole
 
 CROISSANT = "croissant.json"
 

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
+from photonfarm.core.archives import write_arrays
+from photonfarm.core.errors import store_errors
+from photonfarm.core.exr import write_layers
+from photonfarm.core.files import write_whole
 from photonfarm.export.columns import HALVES, Contents, rows_in
 from photonfarm.export.folder import SAMPLES
 from photonfarm.export.formats.format import Exported
 from photonfarm.export.snapshot import Snapshot, Values, camera_to_world, plain
-from photonfarm.shared.core.archives import write_arrays
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.exr import write_layers
-from photonfarm.shared.core.files import write_whole
 
 SUFFIX = ".exr"
 PACKAGES = ("OpenEXR",)

@@ -8,11 +8,11 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
+from photonfarm.core.errors import StoreError
 from photonfarm.export.columns import Contents
 from photonfarm.export.manifest import Manifest
 from photonfarm.export.settings import FormatName
 from photonfarm.export.snapshot import Snapshot, Values
-from photonfarm.shared.core.errors import StoreError
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +51,7 @@ def format_named(name: FormatName) -> Format:
         try:
             import_module(package)
         except ModuleNotFoundError as error:
-            raise StoreError(
-                f"--to {name}: needs the package {package}; pip install 'photonfarm-shared[export]'"
-            ) from error
+            raise StoreError(f"--to {name}: needs the package {package}; pip install 'photonfarm[export]'") from error
     return found
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from photonfarm.core.archives import write_arrays
 from photonfarm.export.columns import Contents
 from photonfarm.export.formats.format import nothing_more
 from photonfarm.export.snapshot import Values
-from photonfarm.shared.core.archives import write_arrays
 
 SUFFIX = ".npz"
 PACKAGES = ()

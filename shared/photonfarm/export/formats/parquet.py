@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from photonfarm.core.errors import store_errors
+from photonfarm.core.files import whole_file
 from photonfarm.export.columns import Column, Contents
 from photonfarm.export.formats.croissant import write_croissant
 from photonfarm.export.formats.format import Exported
 from photonfarm.export.snapshot import Values
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.files import whole_file
 
 if TYPE_CHECKING:
     import pyarrow as pa

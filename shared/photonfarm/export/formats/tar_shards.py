@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from photonfarm.core.errors import store_errors
+from photonfarm.core.files import whole_file
 from photonfarm.export.columns import Contents
 from photonfarm.export.formats.format import nothing_more
 from photonfarm.export.snapshot import Values, plain
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.files import whole_file
 
 SUFFIX = ".tar"
 PACKAGES = ()

@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.job_check import JobCheck
-from photonfarm.shared.store.format import schema
-from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check.job_check import JobCheck
+from photonfarm.store.format import schema
+from photonfarm.store.io.local import LocalStorage
 
 scene = stores.scene
 samples, checked, found, noted = stores.samples, stores.checked, stores.found, stores.noted
@@ -125,8 +125,8 @@ def test_a_marker_of_a_job_that_no_plan_has_is_found_and_set_aside(store: Store,
 
 def test_a_value_that_is_not_finite_is_found(store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """No writer of ours stores one."""
-    monkeypatch.setattr("photonfarm.shared.store.write.commit.as_array", lambda halves, _: ("radiance", halves))
-    monkeypatch.setattr("photonfarm.shared.store.write.commit.stays_finite", lambda *_: True)
+    monkeypatch.setattr("photonfarm.store.write.commit.as_array", lambda halves, _: ("radiance", halves))
+    monkeypatch.setattr("photonfarm.store.write.commit.stays_finite", lambda *_: True)
 
     def poison(given: Any) -> None:
         given.radiance[1][1, 2, 3, 0] = np.nan
@@ -142,7 +142,7 @@ def test_rows_that_are_missing_or_that_the_plan_does_not_use_are_found(
     store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last job has two samples; of another plan, it has three."""
-    from photonfarm.shared.store.write.commit import JobWriter
+    from photonfarm.store.write.commit import JobWriter
 
     monkeypatch.setattr(JobWriter, "_claim", lambda *_: None)
     monkeypatch.setattr(JobWriter, "_check_complete", lambda _: None)

@@ -8,12 +8,12 @@ import checked_store as stores
 import numpy as np
 import pytest
 
-from photonfarm.shared.core.records import ViewBuffers
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store import JobWriter, SceneReader, SceneStore, Store
-from photonfarm.shared.store.check import repeated_seeds
-from photonfarm.shared.store.check.check import StoreReport, halves_in_words
+from photonfarm.core.records import ViewBuffers
+from photonfarm.plan.request import Request
+from photonfarm.scene.view import Camera
+from photonfarm.store import JobWriter, SceneReader, SceneStore, Store
+from photonfarm.store.check import repeated_seeds
+from photonfarm.store.check.check import StoreReport, halves_in_words
 
 scene = stores.scene
 samples, outputs, checked, found = stores.samples, stores.outputs, stores.checked, stores.found

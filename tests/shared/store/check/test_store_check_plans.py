@@ -10,10 +10,10 @@ from pathlib import Path
 import checked_store as stores
 import pytest
 
-from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.store import SceneReader, SceneStore, Store, store_status
 
 scene = stores.scene
 samples, commit_all, checked, found = stores.samples, stores.commit_all, stores.checked, stores.found

@@ -14,10 +14,10 @@ import checked_store as stores
 import numpy as np
 import pytest
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check import check
-from photonfarm.shared.store.write.quarantine import Quarantine
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check import check
+from photonfarm.store.write.quarantine import Quarantine
 
 scene, outputs = stores.scene, stores.outputs
 commit_all, checked, found, data = stores.commit_all, stores.checked, stores.found, stores.data
@@ -161,8 +161,8 @@ def test_two_repairs_at_once_set_each_job_aside_once(store: Store, scene: SceneS
     clean = data(scene)
     for job in range(3):
         flip(shard(scene, "depth", job), 20)
-    code = "import sys; from photonfarm.shared.store import Store\n"
-    code += "from photonfarm.shared.store.check.check import check_store\n"
+    code = "import sys; from photonfarm.store import Store\n"
+    code += "from photonfarm.store.check.check import check_store\n"
     code += "check_store(Store(sys.argv[1]), when='then', repair=True)"
     both = [subprocess.Popen([sys.executable, "-c", code, str(store.root)]) for _ in range(2)]
     assert [process.wait(60) for process in both] == [0, 0]

@@ -11,10 +11,10 @@ import pytest
 import store_samples as samples
 from obstore.store import from_url
 
-from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format import markers
+from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.format import markers
 
 
 @pytest.fixture

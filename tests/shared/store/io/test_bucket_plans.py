@@ -7,11 +7,11 @@ import pytest
 import store_samples as samples
 from bucket_samples import planned
 
-from photonfarm.shared.farm.join import join
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.write.withdrawal import withdraw
+from photonfarm.farm.join import join
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.write.withdrawal import withdraw
 
 
 class KilledError(Exception):

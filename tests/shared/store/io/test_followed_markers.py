@@ -11,10 +11,10 @@ import s3_server
 import store_samples as samples
 from obstore.store import from_url
 
-from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.format.markers import WHOLE_S, FollowedMarkers
-from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.io.objects import ObjectStorage
+from photonfarm.store.format import markers
+from photonfarm.store.format.markers import WHOLE_S, FollowedMarkers
+from photonfarm.store.io.local import LocalStorage
+from photonfarm.store.io.objects import ObjectStorage
 
 SCENE = "scenes/0123"
 

@@ -12,9 +12,9 @@ import zarr
 from obstore.store import from_url
 from zarr.storage import ObjectStore
 
-from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, Store, store_status
+from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, Store, store_status
 
 planned, at_once = bucket_samples.planned, bucket_samples.at_once
 

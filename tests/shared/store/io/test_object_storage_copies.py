@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.errors import CorruptError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.io import object_cache
-from photonfarm.shared.store.io.objects import ObjectStorage
-from photonfarm.shared.store.read.find import Query, find_samples
-from photonfarm.shared.store.write.findings import Cause
+from photonfarm.core.errors import CorruptError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.io import object_cache
+from photonfarm.store.io.objects import ObjectStorage
+from photonfarm.store.read.find import Query, find_samples
+from photonfarm.store.write.findings import Cause
 
 planned, put = bucket_samples.planned, bucket_samples.put
 

@@ -16,10 +16,10 @@ import store_samples as samples
 from obstore.exceptions import AlreadyExistsError, GenericError
 from obstore.store import from_url
 
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.io import object_requests, objects
-from photonfarm.shared.store.io.objects import ObjectStorage
+from photonfarm.core.errors import StoreError
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.io import object_requests, objects
+from photonfarm.store.io.objects import ObjectStorage
 
 planned, put, at_once = bucket_samples.planned, bucket_samples.put, bucket_samples.at_once
 

@@ -12,13 +12,13 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.statistics import clean_error
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.read.merge import MAX_PASSES, MergedView, Moments, merge_rows, merge_view
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.statistics import clean_error
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.read.merge import MAX_PASSES, MergedView, Moments, merge_rows, merge_view
 
 HALF = np.float32(np.finfo(np.float16).smallest_subnormal)
 TINY, HUGE = np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max

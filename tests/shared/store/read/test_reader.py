@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.errors import CorruptError, IncompleteError
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format import shards
-from photonfarm.shared.store.read.batch import Batch
+from photonfarm.core.errors import CorruptError, IncompleteError
+from photonfarm.core.records import arrays_of
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.format import shards
+from photonfarm.store.read.batch import Batch
 
 WIDE = (5, 6)  # rows with a value beyond float16
 BRIGHT = np.float32(1e9)

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.errors import CorruptError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.core.errors import CorruptError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
 
 
 @pytest.fixture

@@ -14,13 +14,13 @@ import store_samples as samples
 import zarr
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import SpecError, StoreError
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.plan.request import PlannedRows, Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.read.find import Matches, Query, find_samples, scene_named
-from photonfarm.shared.store.write.plans import StoredPlan
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.records import arrays_of
+from photonfarm.plan.request import PlannedRows, Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.read.find import Matches, Query, find_samples, scene_named
+from photonfarm.store.write.plans import StoredPlan
 
 
 @pytest.fixture

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneStore, Store
+from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneStore, Store
 
 scene, reader_of = samples.scene, samples.reader_of
 

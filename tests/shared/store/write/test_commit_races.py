@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.format import markers
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.format import markers
 
 
 @pytest.fixture

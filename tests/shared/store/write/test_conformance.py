@@ -12,13 +12,13 @@ import plain_reader
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.keys import make_key, seed_of
-from photonfarm.shared.core.records import arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format import schema
-from photonfarm.shared.store.write.withdrawal import withdraw
+from photonfarm.core.keys import make_key, seed_of
+from photonfarm.core.records import arrays_of
+from photonfarm.plan.request import Request
+from photonfarm.scene.view import Camera
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.format import schema
+from photonfarm.store.write.withdrawal import withdraw
 
 ROOT = Path(__file__).parents[4]
 PLAIN_READER = Path(__file__).parents[2] / "plain_reader.py"
@@ -174,12 +174,8 @@ def test_the_example_of_the_page_reads_the_store(store: Store) -> None:
 
 
 def test_tensorstore_is_needed_by_tests_only() -> None:
-    files = [ROOT / "shared/pyproject.toml", *ROOT.glob("services/*/pyproject.toml")]
-    assert len(files) == 3
-    for file in files:
-        project = tomllib.loads(file.read_text())["project"]
-        optional = project.get("optional-dependencies", {})
-        needed = [*project["dependencies"], *(name for extra in optional if extra != "dev" for name in optional[extra])]
-        assert not [name for name in needed if name.startswith("tensorstore")], file
-    dev = tomllib.loads((ROOT / "shared/pyproject.toml").read_text())["project"]["optional-dependencies"]["dev"]
-    assert "tensorstore" in dev
+    about = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    extras = about["project"]["optional-dependencies"].values()
+    needed = [*about["project"]["dependencies"], *(name for extra in extras for name in extra)]
+    assert not [name for name in needed if name.startswith("tensorstore")]
+    assert "tensorstore" in about["dependency-groups"]["test"]

@@ -7,9 +7,9 @@ import pytest
 import store_samples as samples
 import zarr
 
-from photonfarm.shared.core.errors import CorruptError
-from photonfarm.shared.store import SceneStore
-from photonfarm.shared.store.format import schema
+from photonfarm.core.errors import CorruptError
+from photonfarm.store import SceneStore
+from photonfarm.store.format import schema
 
 scene = samples.scene
 TURN = {"name": "turn", "unit": "degrees", "rest": 0.0, "zero": "as modelled"}

@@ -11,21 +11,21 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.store_verbs import forget as verb
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import job_name, keep_failure, times_failed
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.read import reader as reading
-from photonfarm.shared.store.write.withdrawal import forget
+from photonfarm.cli.store_verbs import forget as verb
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.plan.request import Request
+from photonfarm.queue import job_name, keep_failure, times_failed
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.format import markers
+from photonfarm.store.read import reader as reading
+from photonfarm.store.write.withdrawal import forget
 
 FORGET = """
 import os, signal, sys
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.write.withdrawal import forget
+from photonfarm.store import Store
+from photonfarm.store.io.local import LocalStorage
+from photonfarm.store.write.withdrawal import forget
 left = int(sys.argv[3])
 for name in ("delete", "delete_folder", "adopt"):
     def dying(*args, plain=getattr(LocalStorage, name), **options):

@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 from numcodecs import blosc
 from zarr.codecs import BloscCodec, Crc32cCodec
 
-from photonfarm.shared.core.errors import CorruptError
-from photonfarm.shared.store.format import schema, shards
-from photonfarm.shared.store.format.schema import ArraySchema
-from photonfarm.shared.store.format.shards import Shard, ShardWriter, encode
+from photonfarm.core.errors import CorruptError
+from photonfarm.store.format import schema, shards
+from photonfarm.store.format.schema import ArraySchema
+from photonfarm.store.format.shards import Shard, ShardWriter, encode
 
 SHARD_ROWS = 4
 any_case = settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.records import ViewBuffers, Visibility, arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
-from photonfarm.shared.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.records import ViewBuffers, Visibility, arrays_of
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store.format.shards import NOISY_GUIDES, rounded
 
 scene, reader_of = samples.scene, samples.reader_of
 

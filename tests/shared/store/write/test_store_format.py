@@ -12,13 +12,13 @@ import pytest
 import store_samples as samples
 import zarr
 
-from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.core.records import LIT_POINTS, arrays_of
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.scene.spec import Emitters, GuideSpec
-from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
-from photonfarm.shared.store.format import declarations, markers, schema
-from photonfarm.shared.store.io.local import LocalStorage
+from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.core.records import LIT_POINTS, arrays_of
+from photonfarm.plan.request import Request
+from photonfarm.scene.spec import Emitters, GuideSpec
+from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store.format import declarations, markers, schema
+from photonfarm.store.io.local import LocalStorage
 
 DOCUMENT = Path(__file__).parents[4] / "docs/store-format.md"
 

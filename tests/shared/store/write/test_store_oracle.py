@@ -10,8 +10,8 @@ import pytest
 import store_samples as samples
 import zarr
 
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.store import SceneReader, SceneStore, Store
+from photonfarm.plan.request import Request
+from photonfarm.store import SceneReader, SceneStore, Store
 
 
 @pytest.fixture

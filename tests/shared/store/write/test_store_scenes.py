@@ -10,15 +10,15 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.main import umbrella
-from photonfarm.shared.core.errors import CorruptError, StoreError
-from photonfarm.shared.farm.redis_server import EmbeddedRedis
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.queue import connect, queue_status, reconcile
-from photonfarm.shared.store import SceneReader, SceneStore, Store, store_status
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.read.find import Query, find_samples, scene_named
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.plan.request import Request
+from photonfarm.queue import connect, queue_status, reconcile
+from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store.check.check import check_store
+from photonfarm.store.io.local import LocalStorage
+from photonfarm.store.read.find import Query, find_samples, scene_named
 
 
 @pytest.fixture(scope="module")

@@ -9,16 +9,16 @@ import pytest
 import store_samples as samples
 from click.testing import CliRunner
 
-from photonfarm.shared.cli.store_verbs import withdraw as verb
-from photonfarm.shared.core.errors import CorruptError, SpecError
-from photonfarm.shared.plan.request import Request
-from photonfarm.shared.plan.top_up import TopUp
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.check.check import check_store
-from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.write.lease import at_work
-from photonfarm.shared.store.write.status import scene_status
-from photonfarm.shared.store.write.withdrawal import withdraw
+from photonfarm.cli.store_verbs import withdraw as verb
+from photonfarm.core.errors import CorruptError, SpecError
+from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import TopUp
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.check.check import check_store
+from photonfarm.store.format import markers
+from photonfarm.store.write.lease import at_work
+from photonfarm.store.write.status import scene_status
+from photonfarm.store.write.withdrawal import withdraw
 
 REQUEST = Request(modifications=8, views_per_modification=1)
 

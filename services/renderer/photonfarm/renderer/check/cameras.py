@@ -14,13 +14,13 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.records import F32
 from photonfarm.renderer.scene.arrays import floats, points
 from photonfarm.renderer.scene.gbuffer import reflects_here, sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import LEAVING, NONE
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.scene.spec import Film, SceneSpec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.spec import Film, SceneSpec
+from photonfarm.scene.view import Camera, View
 
 SIDE = 16
 """The rays along each side of a camera's image."""

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.pictures import Picture
+from photonfarm.core.records import F32, Geometry
 from photonfarm.renderer.check.orthographic import Projection, whole
 from photonfarm.renderer.check.shapes import Placed, group_vertices
-from photonfarm.shared.core.pictures import Picture
-from photonfarm.shared.core.records import F32, Geometry
-from photonfarm.shared.scene.spec import Box, SceneSpec
+from photonfarm.scene.spec import Box, SceneSpec
 
 WIDTH = 400
 """The width of a drawing in its own units, in which a letter is about `LETTER` wide and a line `LINE` high."""

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from photonfarm.core.records import F32
 from photonfarm.renderer.check.cameras import Cameras
 from photonfarm.renderer.check.samples import Samples
 from photonfarm.renderer.check.shapes import Placed
 from photonfarm.renderer.measure.exposure import TARGET
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.scene.plausibility import doubts, group_key
-from photonfarm.shared.scene.spec import Movable, SceneSpec
-from photonfarm.shared.scene.spec_loading import SpecLines
+from photonfarm.scene.plausibility import doubts, group_key
+from photonfarm.scene.spec import Movable, SceneSpec
+from photonfarm.scene.spec_loading import SpecLines
 
 MEANS = (0.2, 0.7)
 """Display means between which nothing is said."""

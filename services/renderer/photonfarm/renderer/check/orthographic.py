@@ -13,9 +13,9 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.pictures import Picture
+from photonfarm.core.records import F32
 from photonfarm.renderer.scene.arrays import floats, integers, points, rows, shape_numbers
-from photonfarm.shared.core.pictures import Picture
-from photonfarm.shared.core.records import F32
 
 PAPER = 248
 """The grey of what no ray hits."""

@@ -11,14 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import store_errors
+from photonfarm.core.pictures import Picture, display_values, rendered
 from photonfarm.renderer.check.drawings import COLOURS
 from photonfarm.renderer.check.findings import CUT_AT_ALL, INSIDE, LEAST_SEEN, MEANS, OUTSIDE, percent
 from photonfarm.renderer.check.scene_check import SceneCheck
 from photonfarm.renderer.check.shapes import ShapeFacts
 from photonfarm.renderer.measure.exposure import TARGET
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.pictures import Picture, display_values, rendered
-from photonfarm.shared.scene.spec_loading import SpecLines
+from photonfarm.scene.spec_loading import SpecLines
 
 TEMPLATE = Path(__file__).with_name("check.html.j2")
 

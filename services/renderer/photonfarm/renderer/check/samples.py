@@ -9,16 +9,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photonfarm.core.pictures import Picture, display
+from photonfarm.core.records import BasePointCloud
+from photonfarm.core.waiting import Steps, WorkLog
 from photonfarm.renderer.check import cameras
 from photonfarm.renderer.check.cameras import Cameras
 from photonfarm.renderer.measure import exposure
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.pictures import Picture, display
-from photonfarm.shared.core.records import BasePointCloud
-from photonfarm.shared.core.waiting import Steps, WorkLog
-from photonfarm.shared.scene.modification import Modification, rebuild, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View, sample_view
+from photonfarm.scene.modification import Modification, rebuild, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View, sample_view
 
 COUNT = 16
 """The rendered configurations."""

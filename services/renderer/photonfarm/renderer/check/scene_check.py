@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from photonfarm.core.pictures import Picture
+from photonfarm.core.records import F32
+from photonfarm.core.waiting import Log, WorkLog
 from photonfarm.renderer.check import drawings, samples, shape_pictures
 from photonfarm.renderer.check.drawings import Drawing
 from photonfarm.renderer.check.findings import Finding, Measured, findings
 from photonfarm.renderer.check.shapes import ShapeFacts, facts_of, groups_by_shape, placements
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.pictures import Picture
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.waiting import Log, WorkLog
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import NamedSpec
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import NamedSpec
 
 PICTURED = 240
 """The most shapes that get a picture: those of movable groups, and then the largest."""

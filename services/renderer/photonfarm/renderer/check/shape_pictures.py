@@ -11,12 +11,12 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from photonfarm.core.pictures import Picture, display_values
+from photonfarm.core.records import F32, Geometry
 from photonfarm.renderer.check.orthographic import Projection, alone
 from photonfarm.renderer.scene.arrays import rows
 from photonfarm.renderer.scene.base_cloud import surfaces_at
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.shared.core.pictures import Picture, display_values
-from photonfarm.shared.core.records import F32, Geometry
 
 WIDTH = 88
 

@@ -19,12 +19,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.records import F32, Geometry
 from photonfarm.renderer.scene.arrays import floats, points, shape_numbers
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import surroundings
-from photonfarm.shared.core.records import F32, Geometry
-from photonfarm.shared.scene.spec import Movable, SceneSpec, shape_ids
-from photonfarm.shared.scene.spec_loading import load_spec, parse_spec
+from photonfarm.scene.spec import Movable, SceneSpec, shape_ids
+from photonfarm.scene.spec_loading import load_spec, parse_spec
 
 _PLUGINS = {
     "SmoothDiffuse": "diffuse",
@@ -90,7 +90,7 @@ def listed(name: str) -> list[ShapeFacts]:
     Raises SpecError as loading does.
     """
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec_loading import find_spec
+    from photonfarm.scene.spec_loading import find_spec
 
     path = Path(name)
     if path.suffix == ".xml":

@@ -11,7 +11,7 @@ from typing import Any
 
 import click
 
-from photonfarm.shared.cli.options import device_option, json_option, redis_option, store_option
+from photonfarm.cli.options import device_option, json_option, redis_option, store_option
 
 
 @click.command()
@@ -24,8 +24,8 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     from rich import markup
     from rich.console import Console
 
+    from photonfarm.cli import show
     from photonfarm.renderer.tools.doctor import examine
-    from photonfarm.shared.cli import show
 
     console, found = Console(soft_wrap=True), []
     for check in examine(store, redis_url, partial(click.echo, err=True)):
@@ -46,8 +46,8 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
 
 
 def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:  # noqa: ARG001
-    from photonfarm.shared.core.errors import SpecError
-    from photonfarm.shared.queue.share import Share
+    from photonfarm.core.errors import SpecError
+    from photonfarm.queue.share import Share
 
     try:
         return None if text is None else Share.parse(text)
@@ -139,7 +139,7 @@ def _check_share(
 
 def _scene_ids(specs: tuple[str, ...]) -> tuple[str, ...]:
     """The scenes of specs. The child, which has no spec's file, will find scene files that lie beside one."""
-    from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE, NamedSpec
+    from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec
 
     named = [NamedSpec.load(spec) for spec in specs]
     folders = [os.environ.get(SCENES_VARIABLE), *(spec.scenes for spec in named)]

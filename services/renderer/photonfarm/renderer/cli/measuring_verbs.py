@@ -8,9 +8,9 @@ from functools import partial
 
 import click
 
-from photonfarm.shared.cli.options import device_option, json_option
-from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import WorkLog
+from photonfarm.cli.options import device_option, json_option
+from photonfarm.core.processes import ended_by_ctrl_c
+from photonfarm.core.waiting import WorkLog
 
 
 @click.command()
@@ -30,7 +30,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
     each view of it, `pass` by each sample of such a view, and `spp` by each sample per pixel of that.
     """
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+    from photonfarm.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
@@ -57,7 +57,7 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
     How far views differ in brightness decides how well it is known; more of them help.
     """
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+    from photonfarm.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)
@@ -82,7 +82,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     out of them.
     """
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+    from photonfarm.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec, measured_again=True)
     backend.load(threads=1)
@@ -124,7 +124,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 def scene_plan(spec: str, seconds: int, purpose: str, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.scene.spec_loading import find_spec, load_spec
+    from photonfarm.scene.spec_loading import find_spec, load_spec
 
     loaded = load_spec(spec)
     backend.load(threads=1)

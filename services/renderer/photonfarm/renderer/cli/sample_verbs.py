@@ -9,9 +9,9 @@ from pathlib import Path
 
 import click
 
-from photonfarm.shared.cli.options import device_option, json_option, store_option
-from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import waiting
+from photonfarm.cli.options import device_option, json_option, store_option
+from photonfarm.core.processes import ended_by_ctrl_c
+from photonfarm.core.waiting import waiting
 
 
 @click.command()
@@ -27,9 +27,9 @@ def preview(scene: str, store: str | Path, count: int, out: Path) -> None:
     if out.suffix not in (".html", ".htm"):
         raise click.BadParameter(f"{str(out)!r}: the sheet is a page; name it like preview.html", param_hint="--out")
     from photonfarm.renderer.tools.preview import write_contact_sheet
-    from photonfarm.shared.store import Store
-    from photonfarm.shared.store.read.find import scene_or_spec
-    from photonfarm.shared.store.read.reader import SceneReader
+    from photonfarm.store import Store
+    from photonfarm.store.read.find import scene_or_spec
+    from photonfarm.store.read.reader import SceneReader
 
     write_contact_sheet(SceneReader(store, scene_or_spec(Store(store), scene).scene_id), count, out)
     click.echo(out)
@@ -60,7 +60,7 @@ def buffers(
     Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
     """
     from photonfarm.renderer.jobs.path_buffers import write_buffers
-    from photonfarm.shared.scene.camera_path import CameraPath
+    from photonfarm.scene.camera_path import CameraPath
 
     if (path is None) == (orbit is None):
         raise click.UsageError("one of --camera-path and --orbit is required")

@@ -9,9 +9,9 @@ from shlex import quote
 
 import click
 
-from photonfarm.shared.cli.options import device_option, json_option
-from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import waiting
+from photonfarm.cli.options import device_option, json_option
+from photonfarm.core.processes import ended_by_ctrl_c
+from photonfarm.core.waiting import waiting
 
 
 @click.command()
@@ -66,9 +66,9 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
     """
     if out.suffix not in (".html", ".htm"):
         raise click.BadParameter(f"{str(out)!r}: it is a page; name it like check.html", param_hint="--out")
+    from photonfarm.cli import show
     from photonfarm.renderer.scene import backend
-    from photonfarm.shared.cli import show
-    from photonfarm.shared.scene.spec_loading import NamedSpec, SpecLines
+    from photonfarm.scene.spec_loading import NamedSpec, SpecLines
 
     named = NamedSpec.load(spec)
     backend.load()
@@ -90,8 +90,8 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 @ended_by_ctrl_c()
 def scene_shapes(spec: str, as_json: bool) -> None:
     """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
+    from photonfarm.cli import show
     from photonfarm.renderer.check import shapes
-    from photonfarm.shared.cli import show
 
     with waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
         found = shapes.listed(spec)

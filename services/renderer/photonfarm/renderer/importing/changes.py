@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from shlex import quote
 from typing import Literal
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 
 Effect = Literal["geometry", "light", "colour"]
 """What of the picture differs: surfaces that are missing, moved or of another shape; light; a surface's appearance."""

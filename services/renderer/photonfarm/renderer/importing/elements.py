@@ -14,7 +14,7 @@ import numpy as np
 
 from photonfarm.renderer.importing import images
 from photonfarm.renderer.importing.meshes import Floats
-from photonfarm.shared.scene.files import Located, line_of
+from photonfarm.scene.files import Located, line_of
 
 
 def scene() -> Element:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image as Pillow
 from PIL import UnidentifiedImageError
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 
 Pillow.MAX_IMAGE_PIXELS = None  # textures of 16384² are beyond it
 

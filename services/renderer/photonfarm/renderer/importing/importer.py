@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from photonfarm.core.errors import SpecError, store_errors
+from photonfarm.core.files import write_whole
+from photonfarm.core.waiting import Log, WorkLog
 from photonfarm.renderer.importing import elements, readers
 from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.imported import ImportedScene, Vector
@@ -23,10 +26,7 @@ from photonfarm.renderer.importing.proposal.surfaces import Frame
 from photonfarm.renderer.importing.spec_text import SpecText
 from photonfarm.renderer.measure import exposure, free_space
 from photonfarm.renderer.measure.exposure import DarkError
-from photonfarm.shared.core.errors import SpecError, store_errors
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.waiting import Log, WorkLog
-from photonfarm.shared.scene.spec_loading import load_spec
+from photonfarm.scene.spec_loading import load_spec
 
 AXES: dict[str, Vector] = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
 

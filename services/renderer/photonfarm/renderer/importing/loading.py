@@ -14,13 +14,13 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import listed
 from photonfarm.renderer.importing.imported import Ids, ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh, of_shape
 from photonfarm.renderer.importing.readers.mitsuba_parts import effect_of
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.waiting import Log
 
 FAR = 10.0
 """A scene whose middle is farther from the origin than so many of its diagonals is moved there. Coordinates are single

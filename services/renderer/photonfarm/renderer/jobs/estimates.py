@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.keys import Key, seed_of
-from photonfarm.shared.core.records import F32, Photons, arrays_of
-from photonfarm.shared.scene.view import View
+from photonfarm.core.errors import IncompleteError
+from photonfarm.core.keys import Key, seed_of
+from photonfarm.core.records import F32, Photons, arrays_of
+from photonfarm.scene.view import View
 
 ATTEMPTS = 3
 """The seeds tried for one render; three non-finite renders in a row are a fault of the scene, not bad luck."""

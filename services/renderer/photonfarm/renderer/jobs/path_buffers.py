@@ -7,6 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from photonfarm.core.errors import IncompleteError
+from photonfarm.core.keys import view_key
+from photonfarm.core.records import BasePointCloud, Guides, arrays_of
+from photonfarm.farm.configuration import named_configuration
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import (
     SceneLoader,
@@ -16,16 +20,12 @@ from photonfarm.renderer.jobs.render import (
     located,
     visibility_of,
 )
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.keys import view_key
-from photonfarm.shared.core.records import BasePointCloud, Guides, arrays_of
-from photonfarm.shared.farm.configuration import named_configuration
-from photonfarm.shared.scene.camera_path import CameraPath, Frames, kept_clear, orbit
-from photonfarm.shared.scene.modification import Modification, rebuild
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.read.find import scene_named
+from photonfarm.scene.camera_path import CameraPath, Frames, kept_clear, orbit
+from photonfarm.scene.modification import Modification, rebuild
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View
+from photonfarm.store import Store
+from photonfarm.store.read.find import scene_named
 
 
 def write_buffers(store: str | Path, scene: str, modification: str | None, path: CameraPath | int, out: Path) -> int:

@@ -19,11 +19,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.jobs.estimates import Estimator, halves_of, photons_of
-from photonfarm.renderer.scene import backend
-from photonfarm.shared.core.errors import CorruptError, IncompleteError, QueueError, SceneNotHereError, SpecError
-from photonfarm.shared.core.keys import Key, view_key
-from photonfarm.shared.core.records import (
+from photonfarm.core.errors import CorruptError, IncompleteError, QueueError, SceneNotHereError, SpecError
+from photonfarm.core.keys import Key, view_key
+from photonfarm.core.records import (
     F32,
     LIT_POINTS,
     BasePointCloud,
@@ -34,12 +32,14 @@ from photonfarm.shared.core.records import (
     Visibility,
     arrays_of,
 )
-from photonfarm.shared.scene.modification import Modification, rebuild
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
-from photonfarm.shared.scene.spec_loading import parse_spec
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
-from photonfarm.shared.store.write.lease import at_work
+from photonfarm.renderer.jobs.estimates import Estimator, halves_of, photons_of
+from photonfarm.renderer.scene import backend
+from photonfarm.scene.modification import Modification, rebuild
+from photonfarm.scene.spec import GuideSpec, SceneSpec
+from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.view import View
+from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
+from photonfarm.store.write.lease import at_work
 
 SCENES_KEPT = 2
 """The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""
@@ -49,7 +49,7 @@ COMPILES = "compiles kernels, renders samples"
 RENDERS_SAMPLES = "renders samples"
 COMMITS = "commits"
 
-_PACKAGES = ("photonfarm-renderer", "photonfarm-shared", "mitsuba", "drjit", "numpy", "zarr")
+_PACKAGES = ("photonfarm", "mitsuba", "drjit", "numpy", "zarr")
 
 log = logging.getLogger(__name__)
 

@@ -11,27 +11,27 @@ from typing import Any
 
 import numpy as np
 
+from photonfarm.core import pictures
+from photonfarm.core.archives import write_arrays
+from photonfarm.core.errors import SpecError, StoreError, store_errors
+from photonfarm.core.exr import write_layers
+from photonfarm.core.files import whole_file
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import block_z_test
+from photonfarm.core.waiting import Log, waiting
+from photonfarm.plan.request import sample_key
 from photonfarm.renderer.jobs.estimates import halves_of
 from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
 from photonfarm.renderer.scene import backend
-from photonfarm.shared.core import pictures
-from photonfarm.shared.core.archives import write_arrays
-from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
-from photonfarm.shared.core.exr import write_layers
-from photonfarm.shared.core.files import whole_file
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import block_z_test
-from photonfarm.shared.core.waiting import Log, waiting
-from photonfarm.shared.plan.request import sample_key
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import scene_folder
-from photonfarm.shared.scene.view import View
-from photonfarm.shared.store import SceneReader, SceneStore, Store
-from photonfarm.shared.store.format import markers
-from photonfarm.shared.store.format.shards import as_stored
-from photonfarm.shared.store.read.find import Query, SceneMatch, is_spec_file, scene_or_spec
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import scene_folder
+from photonfarm.scene.view import View
+from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.format import markers
+from photonfarm.store.format.shards import as_stored
+from photonfarm.store.read.find import Query, SceneMatch, is_spec_file, scene_or_spec
 
 SUFFIXES = (".npz", ".exr", ".png")
 """The kinds of files that a pass is written as."""

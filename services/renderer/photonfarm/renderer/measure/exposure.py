@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.pictures import display_values
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import Estimate
+from photonfarm.core.waiting import Steps, WorkLog
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.pictures import display_values
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import Estimate
-from photonfarm.shared.core.waiting import Steps, WorkLog
-from photonfarm.shared.scene.modification import sample_modification
-from photonfarm.shared.scene.spec import Film, SceneSpec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.scene.modification import sample_modification
+from photonfarm.scene.spec import Film, SceneSpec
+from photonfarm.scene.view import sample_view
 
 TARGET = 0.45
 """The display mean of a picture that is neither dark nor bright."""

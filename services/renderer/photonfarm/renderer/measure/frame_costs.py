@@ -30,20 +30,20 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.archives import PARTS, FrameCosts, Surface
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.keys import Key, view_key
+from photonfarm.core.records import F32, BasePointCloud, Guides, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, located
 from photonfarm.renderer.scene.gbuffer import first_surfaces
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
-from photonfarm.shared.core.archives import PARTS, FrameCosts, Surface
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.keys import Key, view_key
-from photonfarm.shared.core.records import F32, BasePointCloud, Guides, arrays_of
-from photonfarm.shared.scene.modification import Modification, rebuild, rest
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera, View
-from photonfarm.shared.store import SceneReader, Store
-from photonfarm.shared.store.read.find import scene_named
+from photonfarm.scene.modification import Modification, rebuild, rest
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.read.find import scene_named
 
 
 def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:

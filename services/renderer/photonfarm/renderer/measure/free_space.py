@@ -17,16 +17,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import F32
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.scene.gbuffer import sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.waiting import Log
-from photonfarm.shared.scene.free_space import FreeSpace, packed
-from photonfarm.shared.scene.modification import Modification, rest, sample_modifications
-from photonfarm.shared.scene.spec import Box, SceneSpec, shape_ids
-from photonfarm.shared.scene.view import in_free_space
+from photonfarm.scene.free_space import FreeSpace, packed
+from photonfarm.scene.modification import Modification, rest, sample_modifications
+from photonfarm.scene.spec import Box, SceneSpec, shape_ids
+from photonfarm.scene.view import in_free_space
 
 ALONG = 48
 """The cells along the longest side of the box of origins."""

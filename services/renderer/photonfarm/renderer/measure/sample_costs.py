@@ -18,6 +18,12 @@ import drjit as dr
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.files import write_whole
+from photonfarm.core.keys import view_key
+from photonfarm.core.records import F32, BasePointCloud, Photons
+from photonfarm.core.waiting import Log, Steps, WorkLog
+from photonfarm.plan.sample_costs import SampleCosts, relative_variance
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.measure.frame_costs import WARM_UPS
@@ -25,15 +31,9 @@ from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy.budget import Budget
 from photonfarm.renderer.strategy.measurement import digest_here, file_of
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.keys import view_key
-from photonfarm.shared.core.records import F32, BasePointCloud, Photons
-from photonfarm.shared.core.waiting import Log, Steps, WorkLog
-from photonfarm.shared.plan.sample_costs import SampleCosts, relative_variance
-from photonfarm.shared.scene.modification import Modification, rebuild, sample_modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import View, sample_view
+from photonfarm.scene.modification import Modification, rebuild, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View, sample_view
 
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""

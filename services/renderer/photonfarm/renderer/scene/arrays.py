@@ -9,7 +9,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.records import F32
+from photonfarm.core.records import F32
 
 ALIGNMENT_BYTES = 64
 """The width of the widest vector register."""

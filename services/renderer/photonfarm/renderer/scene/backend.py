@@ -22,10 +22,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from photonfarm.core.errors import BackendError
+from photonfarm.farm import devices
+from photonfarm.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
 from photonfarm.renderer.scene.native import gathers
-from photonfarm.shared.core.errors import BackendError
-from photonfarm.shared.farm import devices
-from photonfarm.shared.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "PHOTONFARM_VARIANT"
@@ -162,7 +162,7 @@ def _import(name: str) -> Any:
             f"{name} cannot be imported ({error}); its libraries need libatomic: install libatomic1 (Debian and Ubuntu)"
         ) from error
     except ModuleNotFoundError as error:
-        raise BackendError(f"{name} is not installed ({error}); install photonfarm-renderer") from error
+        raise BackendError(f"{name} is not installed ({error}); pip install 'photonfarm[render]'") from error
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         raise BackendError(f"{name} cannot be imported: {error}") from error
 

@@ -10,12 +10,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.keys import Stream, make_key
+from photonfarm.core.records import STATIC, BasePointCloud, Geometry
 from photonfarm.renderer.scene.arrays import floats, integers, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
 from photonfarm.renderer.scene.tessellation import SECTIONS, triangles_of
-from photonfarm.shared.core.keys import Stream, make_key
-from photonfarm.shared.core.records import STATIC, BasePointCloud, Geometry
-from photonfarm.shared.scene.modification import sample_surface
+from photonfarm.scene.modification import sample_surface
 
 
 def geometry_of(shapes: list[Any], group_of: Mapping[str, int], sections: int = SECTIONS) -> Geometry:

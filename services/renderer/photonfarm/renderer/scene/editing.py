@@ -20,12 +20,12 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import F32
 from photonfarm.renderer.bdpt.lights.selection import BRIGHTNESS
 from photonfarm.renderer.scene.arrays import floats, matrix, zeros_like
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.scene.files import ENVIRONMENT
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.scene.files import ENVIRONMENT
+from photonfarm.scene.spec import SceneSpec
 
 PARKED_SCALE = 1e-4
 

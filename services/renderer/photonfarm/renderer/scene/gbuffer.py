@@ -33,10 +33,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from photonfarm.core.records import F32, ViewBuffers
 from photonfarm.renderer.scene.arrays import floats, points, rows
-from photonfarm.shared.core.records import F32, ViewBuffers
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
 
 if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.renderer.scene import backend
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec, Transport, shape_ids
-from photonfarm.shared.scene.view import View
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import GuideSpec, SceneSpec, Transport, shape_ids
+from photonfarm.scene.view import View
 
 if TYPE_CHECKING:
     from photonfarm.renderer.scene.surroundings import Surroundings

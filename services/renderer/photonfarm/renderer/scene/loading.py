@@ -17,17 +17,17 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.bdpt.lights.selection import is_flat
 from photonfarm.renderer.bdpt.scenes import check_scene
 from photonfarm.renderer.scene import rooms
 from photonfarm.renderer.scene.arrays import matrix
 from photonfarm.renderer.scene.editing import dim, factor_of
 from photonfarm.renderer.scene.rooms.solids import rectangle_light
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.files import SceneFile
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.spec_loading import find_scene
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.files import SceneFile
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import find_scene
+from photonfarm.scene.view import Camera, View
 
 
 class AimedSensor:

@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.shared.core.records import F32
+from photonfarm.core.records import F32
 
 ROUGHNESS = frozenset({"alpha", "alpha_u", "alpha_v", "roughness"})
 """The names under which Mitsuba's materials state roughness."""

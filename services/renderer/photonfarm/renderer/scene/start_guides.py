@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from photonfarm.core.keys import seed_of
 from photonfarm.renderer.bdpt.guiding.learning import Effort
 from photonfarm.renderer.scene.loading import AimedSensor
-from photonfarm.shared.core.keys import seed_of
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import sample_view
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import sample_view
 
 VIEWS = 4
 """The views that a guide is learned from."""

@@ -30,8 +30,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.records import F32
 from photonfarm.renderer.scene.arrays import points as mi_points
-from photonfarm.shared.core.records import F32
 
 DIRECTIONS = 64
 

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 
 SECTIONS = 128
 

@@ -9,10 +9,10 @@ from typing import TypeVar
 
 import numpy as np
 
+from photonfarm.core.errors import IncompleteError
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidates import Candidate, Render
 from photonfarm.renderer.strategy.pilot import LEAST_PAIRS, SCOUTS
-from photonfarm.shared.core.errors import IncompleteError
 
 T = TypeVar("T")
 

@@ -10,9 +10,9 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.models import Frozen
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.core.models import Frozen
+from photonfarm.core.records import F32
+from photonfarm.scene.spec import SceneSpec
 
 CLEAR = 2.0
 """The standard errors by which two candidates must differ to be distinguished."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate
-from photonfarm.shared.scene.spec import PhotonSpec, ViewSpec
+from photonfarm.scene.spec import PhotonSpec, ViewSpec
 
 _LIGHTS = {
     "AreaLight": "area",

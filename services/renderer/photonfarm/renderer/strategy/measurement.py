@@ -14,6 +14,11 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
+from photonfarm.core.files import write_whole
+from photonfarm.core.keys import make_key
+from photonfarm.core.models import Frozen
+from photonfarm.core.records import F32
+from photonfarm.core.waiting import Log, WorkLog
 from photonfarm.renderer.jobs.render import versions
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
@@ -23,14 +28,9 @@ from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, RANGE, Budge
 from photonfarm.renderer.strategy.candidates import DEFAULT, GRID, PLAIN, Candidate, RelativeErrors, Render, present
 from photonfarm.renderer.strategy.noise import Purpose
 from photonfarm.renderer.strategy.pilot import SCOUTS
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.keys import make_key
-from photonfarm.shared.core.models import Frozen
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.waiting import Log, WorkLog
-from photonfarm.shared.scene.modification import Modification, rest, sample_modification
-from photonfarm.shared.scene.spec import Film, SceneSpec, Transport
-from photonfarm.shared.scene.view import View, sample_view
+from photonfarm.scene.modification import Modification, rest, sample_modification
+from photonfarm.scene.spec import Film, SceneSpec, Transport
+from photonfarm.scene.view import View, sample_view
 
 SEED = 0
 """The master seed of a pilot's configurations, views and images."""

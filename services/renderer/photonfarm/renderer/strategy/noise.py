@@ -26,8 +26,8 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import block_means
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import block_means
 
 EPSILON = 0.01
 """ε, which bounds the weights of dark pixels in images."""

@@ -14,10 +14,10 @@ from itertools import count
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.records import F32
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, MeasuredCandidate, RelativeErrors, Render
 from photonfarm.renderer.strategy.noise import BlockSums, Weigh, missed, pair_errors, view_weights
-from photonfarm.shared.core.records import F32
 
 LEAST_PAIRS = 4
 """The least number of pairs of images in the first round, over all views: fewer would give no standard error."""

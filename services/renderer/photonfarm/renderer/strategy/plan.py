@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.strategy.candidates import (
     DEFAULT,
     PLAIN,
@@ -20,8 +21,7 @@ from photonfarm.renderer.strategy.content import recommend_photons
 from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement, find, keep, measure
 from photonfarm.renderer.strategy.noise import Purpose
 from photonfarm.renderer.strategy.pilot import longest
-from photonfarm.shared.core.waiting import Log
-from photonfarm.shared.scene.spec import PhotonSpec, SceneSpec
+from photonfarm.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0
 """The factor between times of half-estimates up to which a measurement still applies.

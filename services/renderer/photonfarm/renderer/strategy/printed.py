@@ -18,7 +18,7 @@ from photonfarm.renderer.strategy.candidates import (
 from photonfarm.renderer.strategy.noise import Purpose
 from photonfarm.renderer.strategy.pilot import SUSPICIOUS
 from photonfarm.renderer.strategy.plan import CandidateAtCost, TransportPlan, best, fitting
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.scene.spec import SceneSpec
 
 BLACK = "every view of the pilot is black: there is no light to model, so plain path tracing does"
 

@@ -12,15 +12,15 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from photonfarm.core.errors import PhotonfarmError, QueueError, StoreError, store_errors
+from photonfarm.core.processes import ended_by_ctrl_c
+from photonfarm.core.waiting import Log, waiting
+from photonfarm.farm.devices import Cards, cards_here
 from photonfarm.renderer.worker.settings import WorkerSettings
-from photonfarm.shared.core.errors import PhotonfarmError, QueueError, StoreError, store_errors
-from photonfarm.shared.core.processes import ended_by_ctrl_c
-from photonfarm.shared.core.waiting import Log, waiting
-from photonfarm.shared.farm.devices import Cards, cards_here
-from photonfarm.shared.store.io.storage import open_storage
+from photonfarm.store.io.storage import open_storage
 
 if TYPE_CHECKING:
-    from photonfarm.shared.store.io.objects import ObjectStorage
+    from photonfarm.store.io.objects import ObjectStorage
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ def examine(store: str | Path, redis_url: str, log: Log = lambda _: None) -> Ite
 
 
 def _packages() -> MachineCheck:
-    names = ("photonfarm-shared", "mitsuba", "drjit", "zarr", "rq", "redis")
+    names = ("photonfarm", "mitsuba", "drjit", "zarr", "rq", "redis")
     return MachineCheck("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
 
 
@@ -76,8 +76,8 @@ def _cards(found: Cards) -> MachineCheck:
 def _renders(log: Log) -> str:
     from photonfarm.renderer.scene import backend
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
-    from photonfarm.shared.scene.spec_loading import load_spec
-    from photonfarm.shared.scene.view import sample_view
+    from photonfarm.scene.spec_loading import load_spec
+    from photonfarm.scene.view import sample_view
 
     mi = backend.load(threads=1)
     spec = load_spec("cornell")
@@ -117,7 +117,7 @@ def _writes_to_bucket(url: str) -> str:
 
 
 def _starts_redis() -> str:
-    from photonfarm.shared.farm.redis_server import EmbeddedRedis
+    from photonfarm.farm.redis_server import EmbeddedRedis
 
     with tempfile.TemporaryDirectory() as folder, EmbeddedRedis(Path(folder)) as server:
         return _reaches(server.url)
@@ -126,7 +126,7 @@ def _starts_redis() -> str:
 def _reaches(url: str) -> str:
     from redis import RedisError
 
-    from photonfarm.shared.queue import connect
+    from photonfarm.queue import connect
 
     try:
         return f"version {connect(url).info('server')['redis_version']}"
@@ -137,7 +137,7 @@ def _reaches(url: str) -> str:
 
 
 def _scenes() -> MachineCheck:
-    from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
+    from photonfarm.scene.spec_loading import SCENES_VARIABLE
 
     folders = [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
     found = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))

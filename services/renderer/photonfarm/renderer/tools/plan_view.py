@@ -12,10 +12,10 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.records import Geometry
-from photonfarm.shared.scene.modification import Modification, rest
-from photonfarm.shared.scene.spec import Box, SceneSpec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.core.records import Geometry
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import Box, SceneSpec
+from photonfarm.scene.view import Camera, View
 
 F64 = NDArray[np.float64]
 

@@ -9,16 +9,16 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from photonfarm.core import pictures
+from photonfarm.core.errors import store_errors
+from photonfarm.core.pictures import Picture, rendered
+from photonfarm.core.records import Geometry, Photons
 from photonfarm.renderer.tools.plan_view import PlanView, hue
-from photonfarm.shared.core import pictures
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.pictures import Picture, rendered
-from photonfarm.shared.core.records import Geometry, Photons
-from photonfarm.shared.scene.modification import Modification
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera
-from photonfarm.shared.store.read.batch import Sample
-from photonfarm.shared.store.read.reader import SceneReader
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera
+from photonfarm.store.read.batch import Sample
+from photonfarm.store.read.reader import SceneReader
 
 COLUMNS = ("A", "B", "albedo", "normal", "depth", "photons")
 

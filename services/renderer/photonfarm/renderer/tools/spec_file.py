@@ -13,9 +13,9 @@ import tomlkit
 import tomlkit.items
 from tomlkit.exceptions import TOMLKitError
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.files import whole_file
-from photonfarm.shared.scene import spec_loading as scene
+from photonfarm.core.errors import SpecError
+from photonfarm.core.files import whole_file
+from photonfarm.scene import spec_loading as scene
 
 BYTE_ORDER_MARK = "\ufeff"
 """The character with which some editors begin a file."""

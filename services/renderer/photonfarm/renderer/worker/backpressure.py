@@ -14,12 +14,12 @@ from pathlib import Path
 
 from redis import Redis
 
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.waiting import pause_after_look
-from photonfarm.shared.store import SceneStore, Store
-from photonfarm.shared.store.io.local import LocalStorage
-from photonfarm.shared.store.write.scene_store import Progress
+from photonfarm import queue
+from photonfarm.core.errors import store_errors
+from photonfarm.core.waiting import pause_after_look
+from photonfarm.store import SceneStore, Store
+from photonfarm.store.io.local import LocalStorage
+from photonfarm.store.write.scene_store import Progress
 
 AHEAD_MINIMUM = 256
 """The samples that may be committed before any is used, as a trainer first waits for some, held-out ones included."""

@@ -12,6 +12,10 @@ from collections.abc import Mapping
 
 import redis
 
+from photonfarm import queue
+from photonfarm.core.errors import PhotonfarmError
+from photonfarm.core.processes import Stop
+from photonfarm.queue import Activity, RenderArguments, job_name
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.heartbeat import deadline
 from photonfarm.renderer.worker.outcomes import Outcomes, WorkerLog, is_complete, missing_jobs, send_line
@@ -19,12 +23,8 @@ from photonfarm.renderer.worker.queue_source import QueueSource
 from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, REFUSED, WorkerSettings
 from photonfarm.renderer.worker.share_source import ShareSource
 from photonfarm.renderer.worker.source import Ending, JobSource, TakenError
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import PhotonfarmError
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.queue import Activity, RenderArguments, job_name
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.write.lease import leases
+from photonfarm.store import Store
+from photonfarm.store.write.lease import leases
 
 log = logging.getLogger(__name__)
 

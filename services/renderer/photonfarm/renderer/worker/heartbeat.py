@@ -6,9 +6,9 @@ import contextlib
 import faulthandler
 from collections.abc import Callable, Iterator
 
+from photonfarm.core.processes import repeating
 from photonfarm.renderer.worker.outcomes import send_line
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
-from photonfarm.shared.core.processes import repeating
 
 STDERR = 2
 

@@ -13,11 +13,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm.renderer.worker.backpressure import DiskReserve, is_full
-from photonfarm.renderer.worker.settings import JOBS_SO_FAR, RECYCLED, WorkerSettings
-from photonfarm.renderer.worker.source import Ending
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import (
+from photonfarm import queue
+from photonfarm.core.errors import (
     BackendError,
     CorruptError,
     IncompleteError,
@@ -26,9 +23,12 @@ from photonfarm.shared.core.errors import (
     SceneNotHereError,
     StoreError,
 )
-from photonfarm.shared.queue import RenderArguments
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.write.lease import LeasedError
+from photonfarm.queue import RenderArguments
+from photonfarm.renderer.worker.backpressure import DiskReserve, is_full
+from photonfarm.renderer.worker.settings import JOBS_SO_FAR, RECYCLED, WorkerSettings
+from photonfarm.renderer.worker.source import Ending
+from photonfarm.store import Store
+from photonfarm.store.write.lease import LeasedError
 
 
 @dataclass(frozen=True, slots=True)

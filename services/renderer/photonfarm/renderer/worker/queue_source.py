@@ -11,15 +11,15 @@ from dataclasses import replace
 
 import redis
 
+from photonfarm import queue
+from photonfarm.core.errors import QueueError
+from photonfarm.core.processes import Stop
+from photonfarm.queue import Activity, RenderArguments, rq_adapter
 from photonfarm.renderer.worker.backpressure import TrainerPace
 from photonfarm.renderer.worker.heartbeat import heartbeat
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.source import Ending, JobSource
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.queue import Activity, RenderArguments, rq_adapter
-from photonfarm.shared.store import Store
+from photonfarm.store import Store
 
 POLL_S = 0.2
 """The seconds between looks at an empty queue."""

@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import ConfigDict, Field
 
-from photonfarm.shared.core.errors import QueueError
-from photonfarm.shared.core.models import Count, Frozen, Positive
-from photonfarm.shared.queue import Share
+from photonfarm.core.errors import QueueError
+from photonfarm.core.models import Count, Frozen, Positive
+from photonfarm.queue import Share
 
 GRACE_S = 5.0
 """The seconds that a job in hand has to end after its worker was asked to stop.

@@ -11,14 +11,14 @@ import time
 from collections import deque
 from collections.abc import Mapping
 
+from photonfarm import queue
+from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.waiting import pause_after_look
+from photonfarm.queue import TRIES, Activity, RenderArguments, Share, job_name
 from photonfarm.renderer.worker.outcomes import missing_jobs
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.source import Ending, JobSource, TakenError
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import StoreError, store_errors
-from photonfarm.shared.core.waiting import pause_after_look
-from photonfarm.shared.queue import TRIES, Activity, RenderArguments, Share, job_name
-from photonfarm.shared.store import Store
+from photonfarm.store import Store
 
 LOOK_S = 30.0
 """The seconds after which the markers are looked at again; in between a job costs one question to the store.

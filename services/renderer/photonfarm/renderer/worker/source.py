@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from typing import Literal
 
-from photonfarm.shared.queue import Activity, RenderArguments
+from photonfarm.queue import Activity, RenderArguments
 
 Ending = Literal["done", "again", "failed"]
 """What a job came to: there is nothing left to do; it is put back, and was no try; or it was a try."""

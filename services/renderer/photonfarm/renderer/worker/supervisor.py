@@ -15,15 +15,15 @@ from types import FrameType
 
 import redis
 
+from photonfarm import queue
+from photonfarm.core.errors import BackendError, IncompleteError, QueueError, StoreError
+from photonfarm.core.processes import Stop
+from photonfarm.queue.rq_adapter import fail_of_worker
 from photonfarm.renderer.worker.outcomes import JobCounts
 from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, JOBS_SO_FAR, RECYCLED, REFUSED, WorkerSettings
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import BackendError, IncompleteError, QueueError, StoreError
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.queue.rq_adapter import fail_of_worker
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.io.storage import is_vacant
-from photonfarm.shared.store.read.find import scene_named
+from photonfarm.store import Store
+from photonfarm.store.io.storage import is_vacant
+from photonfarm.store.read.find import scene_named
 
 
 class Registration:

@@ -16,16 +16,16 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from photonfarm import queue
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.processes import process_space
+from photonfarm.queue import Share
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.worker.settings import LOG_FORMAT, WorkerSettings
 from photonfarm.renderer.worker.supervisor import Supervisor
-from photonfarm.shared import queue
-from photonfarm.shared.core.errors import IncompleteError, StoreError
-from photonfarm.shared.core.processes import process_space
-from photonfarm.shared.queue import Share
-from photonfarm.shared.store import Store
-from photonfarm.shared.store.read.find import scene_named
+from photonfarm.store import Store
+from photonfarm.store.read.find import scene_named
 
 CHILD = (sys.executable, "-m", "photonfarm.renderer.worker.child")
 

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import click
 
-from photonfarm.shared.cli.options import json_option, store_option
+from photonfarm.cli.options import json_option, store_option
 from photonfarm.trainer.cli.train_verb import run_option
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
@@ -167,7 +167,7 @@ def infer(
 
     The views of a path are in no store: the renderer makes their buffers, where it is installed, or a file has them.
     """
-    from photonfarm.shared.scene.camera_path import CameraPath, Frames
+    from photonfarm.scene.camera_path import CameraPath, Frames
     from photonfarm.trainer.predict import infer as shows
     from photonfarm.trainer.predict.trained import TrainedRun
 

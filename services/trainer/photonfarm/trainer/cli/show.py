@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photonfarm.shared.core.statistics import stated
+from photonfarm.core.statistics import stated
 from photonfarm.trainer.runs import wait_times
 
 if TYPE_CHECKING:
@@ -21,8 +21,8 @@ from rich import markup
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from photonfarm.shared.core.processes import repeating
-from photonfarm.shared.core.waiting import SILENCE_S, Steps
+from photonfarm.core.processes import repeating
+from photonfarm.core.waiting import SILENCE_S, Steps
 
 
 def record(of: dict[str, Any]) -> None:

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import click
 
-from photonfarm.shared.cli.options import json_option, redis_option, store_option
+from photonfarm.cli.options import json_option, redis_option, store_option
 from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision
 from photonfarm.trainer.runs.user_code import is_own
 

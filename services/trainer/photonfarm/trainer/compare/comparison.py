@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from photonfarm.shared.core.pictures import Picture
+from photonfarm.core.pictures import Picture
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.predict.animation import enlarged
 

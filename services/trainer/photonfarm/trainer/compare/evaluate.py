@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from photonfarm.shared.core.archives import Seconds
-from photonfarm.shared.core.errors import IncompleteError, SpecError, store_errors
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import Estimate, group_means
-from photonfarm.shared.store import SceneReader
+from photonfarm.core.archives import Seconds
+from photonfarm.core.errors import IncompleteError, SpecError, store_errors
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import Estimate, group_means
+from photonfarm.store import SceneReader
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
 from photonfarm.trainer.data.batch import TrainingBatch, kept_count

@@ -9,12 +9,12 @@ from typing import Self
 
 import numpy as np
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError, StoreError
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.hold_out import rows_held_out, units_of
-from photonfarm.shared.store import SceneReader
-from photonfarm.shared.store.read.merge import MergedView
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32
+from photonfarm.plan.hold_out import rows_held_out, units_of
+from photonfarm.store import SceneReader
+from photonfarm.store.read.merge import MergedView
 
 SHOWN = 4  # samples shown as pictures
 

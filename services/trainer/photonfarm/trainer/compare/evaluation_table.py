@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from photonfarm.shared.core.statistics import Estimate
+from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import References

@@ -14,10 +14,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import Key, Stream
 from photonfarm.data.torch_dataset import SampleTensors
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.keys import Key, Stream
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, map_tensors
 
 FREE_SHARE = 0.25

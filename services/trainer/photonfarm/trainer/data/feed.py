@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from photonfarm.core.keys import Key
+from photonfarm.core.records import BasePointCloud, Geometry
+from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import Samples, SceneDataset
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.core.waiting import pause_after_look
-from photonfarm.shared.plan.hold_out import Keyed, are_held_out, enough, units_of
+from photonfarm.plan.hold_out import Keyed, are_held_out, enough, units_of
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, empty_memory, kept_pixels
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs

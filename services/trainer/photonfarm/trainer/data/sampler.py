@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.keys import Stream, make_key
+from photonfarm.core.keys import Stream, make_key
 
 
 class RoundSampler:

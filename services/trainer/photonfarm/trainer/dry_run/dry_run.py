@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch, size_bytes
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
 from photonfarm.trainer.runs.device import described, usable_device

@@ -19,10 +19,10 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+from photonfarm.core.records import F32, STATIC, BasePointCloud, Geometry
 from photonfarm.data.torch_dataset import SampleTensors
-from photonfarm.shared.core.records import F32, STATIC, BasePointCloud, Geometry
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
 from photonfarm.trainer.data.batch import TrainingBatch, empty_memory
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Inputs

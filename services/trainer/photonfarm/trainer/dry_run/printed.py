@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from photonfarm.shared.core.waiting import in_words
+from photonfarm.core.waiting import in_words
 from photonfarm.trainer.dry_run.dry_run import DryRun
 
 

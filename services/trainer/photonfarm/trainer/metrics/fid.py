@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.statistics import Estimate
+from photonfarm.core.statistics import Estimate
 
 FULL_RANK = 2048
 """The least number of images with which FID can be compared with published figures [method §4]."""

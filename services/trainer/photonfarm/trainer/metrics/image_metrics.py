@@ -20,10 +20,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.pictures import display_values
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import Estimate
+from photonfarm.core.errors import SpecError
+from photonfarm.core.pictures import display_values
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.metrics.fid import FEWEST, Fid, fid, kid
 from photonfarm.trainer.metrics.inception import Features, Inception, InceptionWeights
 from photonfarm.trainer.metrics.intervals import PerImage

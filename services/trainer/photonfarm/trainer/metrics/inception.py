@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from photonfarm.shared.core.errors import StoreError
-from photonfarm.shared.core.processes import usable_cores
+from photonfarm.core.errors import StoreError
+from photonfarm.core.processes import usable_cores
 
 SIDE = 299  # pixels
 BLOCK_ENDS = ("pool0", "pool1", "mixed_7", "mixed_10")

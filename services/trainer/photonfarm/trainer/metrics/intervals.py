@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.statistics import Estimate, group_means
+from photonfarm.core.statistics import Estimate, group_means
 
 NORMAL_975 = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks.baselines import Cnn, Denoiser, FeatureProjection
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.guided import Guided

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonfarm.shared.core.records import F32, BasePointCloud, Geometry
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.core.records import F32, BasePointCloud, Geometry
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks.projection import Optics
 from photonfarm.trainer.runs.settings import NetworkSettings
 

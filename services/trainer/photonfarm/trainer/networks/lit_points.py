@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from photonfarm.shared.core.records import LIT_POINTS
+from photonfarm.core.records import LIT_POINTS
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, given
 from photonfarm.trainer.networks.network import with_octaves

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, given
 from photonfarm.trainer.networks.projection import Footprint, Optics, footprint

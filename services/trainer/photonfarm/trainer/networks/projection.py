@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
 from photonfarm.trainer.runs.settings import Occlusion
 
 

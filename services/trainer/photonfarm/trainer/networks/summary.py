@@ -12,7 +12,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from photonfarm.data.torch_dataset import SampleTensors
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour

@@ -15,9 +15,9 @@ from typing import IO
 
 import numpy as np
 
-from photonfarm.shared.core.errors import StoreError, store_errors
-from photonfarm.shared.core.pictures import Picture, display
-from photonfarm.shared.core.records import F32
+from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.pictures import Picture, display
+from photonfarm.core.records import F32
 
 FFMPEG = "imageio_ffmpeg"
 PICTURE_WIDTH = 256  # px, at least

@@ -12,11 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from photonfarm.shared.core.archives import Seconds
-from photonfarm.shared.core.errors import IncompleteError
-from photonfarm.shared.core.keys import Key
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
+from photonfarm.core.archives import Seconds
+from photonfarm.core.errors import IncompleteError
+from photonfarm.core.keys import Key
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import image_of

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
+from photonfarm.core.processes import command, is_installed
+from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
-from photonfarm.shared.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.shared.core.processes import command, is_installed
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.plan.hold_out import rows_held_out
-from photonfarm.shared.scene.camera_path import Frames
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import Sample, SceneReader, Store
-from photonfarm.shared.store.read.find import Query, find_samples
+from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.scene.camera_path import Frames
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import Sample, SceneReader, Store
+from photonfarm.store.read.find import Query, find_samples
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import given
@@ -155,7 +155,7 @@ def show_frames(
     sentence = f"{len(frames)} frames, {1e3 * seconds / len(frames):.1f} ms each for the network and what it reads"
     animation.write_gif(map(animation.read_png, files), out / "path.gif", fps)
     if not animation.can_write_mp4():
-        sentence += "; no MP4: pip install photonfarm-trainer[video]"
+        sentence += "; no MP4: pip install photonfarm[video]"
         return InferResult((*files, out / "path.gif"), sentence)
     animation.write_mp4(map(animation.read_png, files), out / "path.mp4", fps)
     return InferResult((*files, out / "path.gif", out / "path.mp4"), sentence)

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import F32
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import F32
 from photonfarm.trainer.networks.inputs import Inputs, given
 from photonfarm.trainer.predict.fill_in import fill_in
 
@@ -72,5 +72,5 @@ def _package() -> ModuleType:
     except (ImportError, OSError) as error:  # the latter if its library cannot be loaded
         raise SpecError(
             f"the denoiser oidn: needs the package {PACKAGE}, which cannot be imported ({error}); "
-            "pip install photonfarm-trainer[oidn]"
+            "pip install photonfarm[oidn]"
         ) from error

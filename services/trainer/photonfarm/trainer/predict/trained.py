@@ -10,10 +10,10 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneReader
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import BasePointCloud, Geometry
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneReader
 from photonfarm.trainer.networks import build, kind_of
 from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.inputs import Inputs, Needs, given

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.errors import store_errors
+from photonfarm.core.errors import store_errors
 from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import MeasureProgress
 from photonfarm.trainer.predict.animation import write_png

@@ -12,11 +12,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from photonfarm.shared.core.archives import FrameCosts
-from photonfarm.shared.core.errors import BackendError
-from photonfarm.shared.core.records import F32, Guides, ViewBuffers
-from photonfarm.shared.core.statistics import Estimate
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.core.archives import FrameCosts
+from photonfarm.core.errors import BackendError
+from photonfarm.core.records import F32, Guides, ViewBuffers
+from photonfarm.core.statistics import Estimate
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.compare import evaluate
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.plan.request import UNUSED
-from photonfarm.shared.scene.spec import SceneSpec
-from photonfarm.shared.store import SceneStatus, SceneStore, Store
-from photonfarm.shared.store.write.status import scene_status
+from photonfarm.plan.request import UNUSED
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneStatus, SceneStore, Store
+from photonfarm.store.write.status import scene_status
 
 SAMPLES = "samples"
 """The kind of plans whose rows are of new views; others add passes to these, which need no photons and no buffers."""

@@ -15,9 +15,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.archives import FrameCosts, Seconds
-from photonfarm.shared.core.errors import BackendError
-from photonfarm.shared.core.processes import command, is_installed
+from photonfarm.core.archives import FrameCosts, Seconds
+from photonfarm.core.errors import BackendError
+from photonfarm.core.processes import command, is_installed
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.run_folder import with_scenes
 

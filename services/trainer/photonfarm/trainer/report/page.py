@@ -11,8 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from photonfarm.shared.core.pictures import reduced, rendered
-from photonfarm.shared.core.records import F32
+from photonfarm.core.pictures import reduced, rendered
+from photonfarm.core.records import F32
 from photonfarm.trainer.compare import evaluation_table
 from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.report.contents import ReportContents

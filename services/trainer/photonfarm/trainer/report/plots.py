@@ -10,7 +10,7 @@ from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
-from photonfarm.shared.core.statistics import Estimate
+from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.metrics.image_metrics import TITLES
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-from photonfarm.shared.core.archives import Seconds
-from photonfarm.shared.core.statistics import Estimate
+from photonfarm.core.archives import Seconds
+from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.compare.evaluation_table import counted, notes, place_of_networks
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE, TITLES

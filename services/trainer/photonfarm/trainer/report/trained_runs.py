@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.core.errors import IncompleteError
+from photonfarm.core.errors import IncompleteError
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import (
     HeldOutErrors,

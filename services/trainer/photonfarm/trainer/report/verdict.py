@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.statistics import group_means
+from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.compare.evaluation_table import counted
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval

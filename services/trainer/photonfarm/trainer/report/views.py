@@ -10,8 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photonfarm.shared.core.pictures import Picture, display, display_values, of_albedo, of_depth, of_normal
-from photonfarm.shared.core.records import F32, Guides
+from photonfarm.core.pictures import Picture, display, display_values, of_albedo, of_depth, of_normal
+from photonfarm.core.records import F32, Guides
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.worst_cases import ALL, WorstCase

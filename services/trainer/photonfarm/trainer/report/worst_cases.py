@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.archives import Surface
-from photonfarm.shared.core.pictures import display_values
-from photonfarm.shared.core.records import F32, ViewBuffers
+from photonfarm.core.archives import Surface
+from photonfarm.core.pictures import display_values
+from photonfarm.core.records import F32, ViewBuffers
 
 Mask = NDArray[np.bool_]
 

@@ -23,10 +23,10 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from photonfarm.shared.core.errors import SpecError, StoreError, store_errors
-from photonfarm.shared.core.models import Changes, differing, sentences
-from photonfarm.shared.farm.training import METADATA
-from photonfarm.shared.store.io.local import sync
+from photonfarm.core.errors import SpecError, StoreError, store_errors
+from photonfarm.core.models import Changes, differing, sentences
+from photonfarm.farm.training import METADATA
+from photonfarm.store.io.local import sync
 from photonfarm.trainer.runs.run_folder import GOOD, SETTINGS
 from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings
 
@@ -155,7 +155,7 @@ def snapshot(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) ->
 def versions() -> dict[str, str]:
     """The versions of the packages that a run's arithmetic depends on."""
     return {
-        "photonfarm-trainer": version("photonfarm-trainer"),
+        "photonfarm": version("photonfarm"),
         "python": platform.python_version(),
         "torch": torch.__version__,
         "numpy": np.__version__,

@@ -6,7 +6,7 @@ import re
 
 import torch
 
-from photonfarm.shared.core.errors import SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs.settings import Precision
 
 AUTO = "auto"

@@ -19,7 +19,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor, distributed, nn
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError
+from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.trainer.runs.device import AUTO, usable_device
 
 COMMAND_PATIENCE = timedelta(days=30)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.errors import StoreError, store_errors
+from photonfarm.core.errors import StoreError, store_errors
 
 
 class MetricsLog:

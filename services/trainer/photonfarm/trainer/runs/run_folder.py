@@ -8,9 +8,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from photonfarm.shared.core.errors import StoreError, store_errors
-from photonfarm.shared.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS
-from photonfarm.shared.scene.spec_loading import SCENES_VARIABLE
+from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS
+from photonfarm.scene.spec_loading import SCENES_VARIABLE
 
 __all__ = ["CHECKPOINT", "INITIAL", "METRICS", "SETTINGS", "held", "note_scene_folder", "with_scenes"]
 

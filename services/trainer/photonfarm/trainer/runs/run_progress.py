@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from photonfarm.shared.core.files import write_whole
-from photonfarm.shared.core.processes import repeating
-from photonfarm.shared.core.waiting import in_words
-from photonfarm.shared.farm.training import PROGRESS, TRAINS, WAITS, counted
+from photonfarm.core.files import write_whole
+from photonfarm.core.processes import repeating
+from photonfarm.core.waiting import in_words
+from photonfarm.farm.training import PROGRESS, TRAINS, WAITS, counted
 from photonfarm.trainer.runs.wait_times import TimeKind
 
 FILE_S = 2.0  # between two versions of the file

@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal, Self, get_args
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 from pydantic_core import PydanticCustomError
 
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.models import Count, Frozen, Positive, sentences
-from photonfarm.shared.plan.hold_out import HOLD_OUT
+from photonfarm.core.errors import SpecError
+from photonfarm.core.models import Count, Frozen, Positive, sentences
+from photonfarm.plan.hold_out import HOLD_OUT
 from photonfarm.trainer.runs import biased
 from photonfarm.trainer.runs.user_code import is_own
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from photonfarm.shared.core.errors import store_errors
-from photonfarm.shared.core.files import whole_file
-from photonfarm.shared.core.pictures import display
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.farm.training import VIEWS
+from photonfarm.core.errors import store_errors
+from photonfarm.core.files import whole_file
+from photonfarm.core.pictures import display
+from photonfarm.core.records import F32
+from photonfarm.farm.training import VIEWS
 
 SHOWN = 4  # the most views
 MOST = 24  # the most pictures kept; beyond, every second one goes, so that early ones become rare

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.shared.core.pictures import display
-from photonfarm.shared.core.records import F32
+from photonfarm.core.pictures import display
+from photonfarm.core.records import F32
 
 FOLDER = "tensorboard"
 SHOWN = 4  # the most pictures of one validation

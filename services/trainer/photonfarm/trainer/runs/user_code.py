@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from photonfarm.shared.core.errors import PhotonfarmError, SpecError
+from photonfarm.core.errors import PhotonfarmError, SpecError
 
 _PATTERN = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*:[^\W\d]\w*")
 

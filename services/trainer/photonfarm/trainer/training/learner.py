@@ -10,9 +10,9 @@ from typing import Any, Protocol
 import torch
 from torch import nn
 
-from photonfarm.shared.core.errors import IncompleteError, SpecError
-from photonfarm.shared.core.records import BasePointCloud, Geometry
-from photonfarm.shared.scene.spec import SceneSpec
+from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.records import BasePointCloud, Geometry
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import build, image_of
 from photonfarm.trainer.networks.frame import SceneFrame

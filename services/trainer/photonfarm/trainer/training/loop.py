@@ -14,10 +14,10 @@ from typing import Any, TypeVar
 
 import torch
 
-from photonfarm.shared.core.errors import SpecError, store_errors
-from photonfarm.shared.core.models import Changes
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.core.statistics import group_means
+from photonfarm.core.errors import SpecError, store_errors
+from photonfarm.core.models import Changes
+from photonfarm.core.processes import Stop
+from photonfarm.core.statistics import group_means
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.data.growth import BatchStream, Growth

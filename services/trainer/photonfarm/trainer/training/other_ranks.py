@@ -14,9 +14,9 @@ from typing import Self
 
 import torch
 
-from photonfarm.shared.core.processes import Stop
-from photonfarm.shared.core.waiting import pause_after_look
-from photonfarm.shared.store.write.lease import LeasedError
+from photonfarm.core.processes import Stop
+from photonfarm.core.waiting import pause_after_look
+from photonfarm.store.write.lease import LeasedError
 from photonfarm.trainer.data.batch import ResidentSamples
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.runs import checkpoint

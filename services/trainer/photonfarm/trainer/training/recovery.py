@@ -10,7 +10,7 @@ from typing import Any
 
 from torch import Tensor
 
-from photonfarm.shared.core.errors import store_errors
+from photonfarm.core.errors import store_errors
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import GOOD

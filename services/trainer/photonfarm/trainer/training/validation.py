@@ -10,8 +10,8 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.core.statistics import Estimate, group_means
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, measure
 

@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.importing.proposal.groups import PLANE, Found, Thing, find_things
 from photonfarm.renderer.importing.proposal.room import NEAR_FLOOR, Room, find_room, outdoors, trace
 from photonfarm.renderer.importing.proposal.surfaces import Box, Frame, Pieces, Points, Surfaces
 from photonfarm.renderer.scene.surroundings import LEAVING, NONE, surroundings
-from photonfarm.shared.core.waiting import Log
 
 Mask = NDArray[np.bool_]
 

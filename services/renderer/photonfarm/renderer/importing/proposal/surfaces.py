@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing.imported import Vector
-from photonfarm.shared.core.errors import SpecError
 
 Points = NDArray[np.float64]
 """Coordinates (…, 3): two along the floor, in the order of the world's axes, and the height."""

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.importing.changes import listed
 from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.waiting import Log
 
 BLENDER = (".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
 """What Blender reads for us."""

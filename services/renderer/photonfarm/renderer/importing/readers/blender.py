@@ -13,12 +13,12 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
+from photonfarm.core.errors import BackendError, SpecError
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.importing.changes import Changes
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.readers import gltf
 from photonfarm.renderer.importing.readers.blender_lamps import Lamps
-from photonfarm.shared.core.errors import BackendError, SpecError
-from photonfarm.shared.core.waiting import Log
 
 _NAMES = {
     "KHR_materials_anisotropy": "Anisotropic", "KHR_materials_clearcoat": "Coat Weight",

@@ -14,14 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.elements import WIDEST, cone_image, put_cone
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh
 from photonfarm.renderer.importing.readers.gltf_file import COMPRESSED, GltfFile, Node, extension, normalised, numbers
 from photonfarm.renderer.importing.readers.gltf_materials import Look, Materials, Textures
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.waiting import Log
 
 OBJECT_SHARE = 0.34
 """A node is an object as a whole up to this share of all meshes; above, it is a folder of objects."""

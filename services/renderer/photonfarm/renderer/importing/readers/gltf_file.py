@@ -13,9 +13,9 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.meshes import Floats
-from photonfarm.shared.core.errors import SpecError
 
 Node = Mapping[str, Any]
 

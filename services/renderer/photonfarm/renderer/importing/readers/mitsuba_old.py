@@ -14,10 +14,10 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing import elements, images
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.readers.mitsuba_spectra import numbers_of, of_old, put
-from photonfarm.shared.core.errors import SpecError
 
 _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 

@@ -9,13 +9,13 @@ from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.imported import Ids
 from photonfarm.renderer.importing.meshes import Floats, of_shape, write_ply
 from photonfarm.renderer.importing.readers import mitsuba_spectra
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.scene.files import POLARISED, SHAPES
+from photonfarm.scene.files import POLARISED, SHAPES
 
 _SHAPES = (*SHAPES, "instance", "shapegroup")  # the last two become others
 

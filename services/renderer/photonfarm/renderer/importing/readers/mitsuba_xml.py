@@ -11,14 +11,14 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.importing import elements
 from photonfarm.renderer.importing.changes import Changes, listed
 from photonfarm.renderer.importing.imported import Ids, ImportedScene, Vector
 from photonfarm.renderer.importing.readers import mitsuba_old, mitsuba_parts
 from photonfarm.renderer.importing.readers.mitsuba_old import value_of
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.waiting import Log
-from photonfarm.shared.scene.files import line_of, parse
+from photonfarm.scene.files import line_of, parse
 
 OLDEST, MITSUBA_2 = (0, 4), (2,)
 """The oldest version that is read, and the first one that Mitsuba 3 reads as it is."""

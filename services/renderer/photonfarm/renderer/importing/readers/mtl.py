@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from PIL import Image as Pillow
 
+from photonfarm.core.errors import SpecError
 from photonfarm.renderer.importing import images
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.surfaces import Lie, Map
-from photonfarm.shared.core.errors import SpecError
 
 Meaning = tuple[Effect | None, str]
 """What of the picture a statement changes that is not carried over, if anything, and how."""

@@ -16,14 +16,14 @@ import numpy as np
 from mapbox_earcut import triangulate_float64
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
+from photonfarm.core.waiting import Log
 from photonfarm.renderer.importing import images
 from photonfarm.renderer.importing.changes import Changes, Effect
 from photonfarm.renderer.importing.imported import ImportedScene
 from photonfarm.renderer.importing.meshes import Floats, Mesh, unit
 from photonfarm.renderer.importing.readers.mtl import WHITE, Material, read_libraries, statements
 from photonfarm.renderer.importing.readers.mtl_surfaces import Surface
-from photonfarm.shared.core.errors import SpecError
-from photonfarm.shared.core.waiting import Log
 
 _WIDTHS = {"v": 6, "vt": 2, "vn": 3}
 """How many numbers are kept of the statements that tables are made of; colours follow the coordinates of points."""

@@ -13,15 +13,15 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from photonfarm.core.keys import Key, Stream
+from photonfarm.core.records import F32
 from photonfarm.renderer.bdpt.lights.emission import Lights, hit_densities, read_lights, sample_direct
 from photonfarm.renderer.bdpt.recording import traced_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, reflects_here
 from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, GuideSettings, PatternSampler, pattern_of, shifted
 from photonfarm.renderer.scene.materials import has_other_lobes
-from photonfarm.shared.core.keys import Key, Stream
-from photonfarm.shared.core.records import F32
-from photonfarm.shared.scene.spec import GuideSpec
+from photonfarm.scene.spec import GuideSpec
 
 if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder

@@ -11,16 +11,16 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.keys import Key, Stream
+from photonfarm.core.records import F32, Guides
 from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.scene.arrays import floats, points
 from photonfarm.renderer.scene.gbuffer import GRID, RAYS
 from photonfarm.renderer.scene.guides.pattern import FOLLOWED, NO_LIMIT, SUB_PIXELS, GuideSettings, pattern_of
 from photonfarm.renderer.scene.guides.specular_paths import trace
 from photonfarm.renderer.scene.materials import Materials
-from photonfarm.shared.core.keys import Key, Stream
-from photonfarm.shared.core.records import F32, Guides
-from photonfarm.shared.scene.spec import GuideSpec, SceneSpec
-from photonfarm.shared.scene.view import Camera, View
+from photonfarm.scene.spec import GuideSpec, SceneSpec
+from photonfarm.scene.view import Camera, View
 
 if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder

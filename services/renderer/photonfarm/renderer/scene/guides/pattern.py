@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from photonfarm.core.records import F32
 from photonfarm.renderer.scene.gbuffer import GRID
-from photonfarm.shared.core.records import F32
 
 FOLLOWED = 8
 """The most mirrors and panes of glass that are followed."""

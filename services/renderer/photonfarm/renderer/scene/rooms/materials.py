@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.shared.core.keys import Stream, make_key
+from photonfarm.core.keys import Stream, make_key
 
 Colour = tuple[float, float, float]
 

@@ -1,0 +1,283 @@
+"""The verbs `scene`, `submit`, `top-up`, `reconcile`, `status`, `redis` and `up`: without Mitsuba and without torch."""
+
+from __future__ import annotations
+
+import os
+import sys
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import click
+
+from photonfarm.cli.options import (
+    device_option,
+    json_option,
+    names_redis,
+    redis_option,
+    request_options,
+    store_option,
+)
+from photonfarm.plan.hold_out import HOLD_OUT
+
+if TYPE_CHECKING:
+    from photonfarm.plan.request import Request
+
+
+@click.group()
+def scene() -> None:
+    """Scene specs."""
+
+
+@scene.command("show")
+@click.argument("spec")
+@json_option
+def scene_show(spec: str, as_json: bool) -> None:
+    """Check SPEC (a scene.toml, or the name of a ready one) and show what it says."""
+    from photonfarm.cli import show
+    from photonfarm.scene.spec import Emitters
+    from photonfarm.scene.spec_loading import load_spec
+
+    loaded = load_spec(spec)
+    show.scene(loaded, as_json)
+    if not as_json and loaded.emitters != Emitters():
+        click.echo(f"\nthe scene's own lights: {loaded.emitters}")
+
+
+@click.command()
+@click.argument("spec")
+@request_options
+@store_option
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
+@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
+@click.option("--halves-from", metavar="ID", help="The scene whose halves jobs take over; it may differ in buffers, "
+              "guides, photons and points alone.  [default: the one that has most]")  # fmt: skip
+@click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
+              "more at that cost; write nothing.")  # fmt: skip
+@click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
+@json_option
+def submit(
+    spec: str,
+    store: str | Path,
+    redis_url: str,
+    no_queue: bool,
+    retry: bool,
+    halves_from: str | None,
+    dry_run: bool,
+    no_measure: bool,
+    as_json: bool,
+    request: Request,
+    shard_rows: int | None,
+) -> None:
+    """Plan samples of SPEC and queue them; what is planned already is not planned again.
+
+    SPEC is a scene.toml, or the name of a ready one: room and cornell are built in, others need their files.
+    """
+    from photonfarm.cli import show
+    from photonfarm.farm import dry_run as dry
+    from photonfarm.farm import submission
+    from photonfarm.farm.submission import hold_out_warning
+    from photonfarm.scene.plausibility import warnings
+    from photonfarm.scene.spec_loading import NamedSpec
+
+    named = NamedSpec.load(spec)
+    for warning in filter(None, (*warnings(named), hold_out_warning(named.spec, store, request))):
+        click.echo(f"warning: {warning}", err=True)
+    result: submission.Submission
+    if dry_run:
+        log = partial(click.echo, err=True)
+        result = dry.rehearse(named, store, request, measure=not no_measure, log=log, shard_rows=shard_rows)
+    else:
+        url = None if no_queue else redis_url
+        result = submission.submit(
+            named, store, url, request, retry=retry, shard_rows=shard_rows, halves_from=halves_from
+        )
+    show.submission(result, as_json)
+
+
+@click.command("top-up")
+@click.argument("spec")
+@click.option(
+    "--spp",
+    required=True,
+    metavar="[+]N",
+    help="Samples per pixel: +64 adds 64 to what is planned of each view, 256 goes up to 256 in all.",
+)
+@click.option("--where", multiple=True, metavar="CONDITION", help="Which views, instead of all; see above.")
+@store_option
+@redis_option
+@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
+@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
+@click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
+@json_option
+def top_up(
+    spec: str,
+    spp: str,
+    where: tuple[str, ...],
+    store: str | Path,
+    redis_url: str,
+    no_queue: bool,
+    as_json: bool,
+    **options: bool,
+) -> None:
+    """Plan more noisy passes of views of SPEC that are planned already, and queue them.
+
+    A pass has 2 × half_spp samples per pixel, so N is rounded up to whole passes. New passes are independent of
+    the old ones and share the buffers and photons that are there. Repeating +N adds again; repeating N adds nothing.
+
+    \b
+    Conditions, of which a view must meet every one that is given:
+      views=first:N      the first N that were planned, of those that meet the others
+      view=KEY           the view with this content key, or with one that begins so
+      modification=KEY   views of the configuration with this content key, or beginning
+      rows=A-B           views that the samples in rows A to B show; rows=A for one
+      plan=P             views that plan P brought
+      held-out[=SHARE]   views that training with this hold-out never sees (default 0.125)
+    """  # noqa: D301 - click wants the character
+    from photonfarm.cli import show
+    from photonfarm.farm import submission
+    from photonfarm.scene.spec_loading import NamedSpec
+
+    url = None if no_queue else redis_url
+    result = submission.top_up(NamedSpec.load(spec), store, url, spp, where=where, **options)
+    show.submission(result, as_json)
+    noun = "pass" if result.passes == 1 else "passes"
+    click.echo(f"{spp} samples per pixel: {result.passes} {noun} of {result.spp_per_pass} each", err=True)
+
+
+@click.command()
+@store_option
+@redis_option
+@click.option("--run", "runs", type=click.Path(path_type=Path), multiple=True,
+              help="Folder of a training run; may be repeated.  [default: that of an `up` at work here]")  # fmt: skip
+@click.option("--watch", is_flag=True, help="Keep showing it, with rates and time left, until Ctrl-C.")
+@json_option
+def status(
+    store: str | Path, redis_url: str, runs: tuple[Path, ...] = (), watch: bool = False, as_json: bool = False
+) -> None:
+    """Show what is planned, committed, queued and failed.
+
+    Where `photonfarm up` is at work on the store here, its queue is shown, unless --redis names another.
+    """
+    from photonfarm.cli import show_status
+    from photonfarm.farm.running_farm import running_farm
+    from photonfarm.farm.status import check_read, queue_of, since_commit_s
+    from photonfarm.farm.training import RunFolder
+    from photonfarm.store import Store, store_status
+
+    opened, named = Store(store), names_redis()
+    if watch:
+        from photonfarm.cli.show_watch import keep_watching
+        from photonfarm.farm.watch import FarmWatch
+
+        keep_watching(FarmWatch(opened, redis_url, runs, named_redis=named))
+        return
+    scenes, running = store_status(opened), running_farm(opened)
+    url = redis_url if named or running is None else running.redis_url
+    folders = runs or ((Path(running.run),) if running and running.run else ())
+    trainings = [RunFolder(folder).look() for folder in folders]
+    if as_json:
+        show_status.document(scenes, queue_of(opened, url), store, running, trainings)
+    else:
+        show_status.scenes(scenes)  # before Redis is asked, which may not answer
+        since_s = since_commit_s(opened)
+        show_status.queue(queue_of(opened, url), scenes, store, running, named_redis=named, since_commit_s=since_s)
+        show_status.trainings(trainings)
+    check_read(scenes)
+
+
+@click.command()
+@store_option
+@redis_option
+@json_option
+def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
+    """Queue every job that is planned, and neither committed nor queued, rendered now or failed.
+
+    Idle workers do this by themselves. It is for farms that may have no worker: a timer runs it, and workers are
+    started for what is queued. A job whose worker died is queued again once its heartbeat has run out; jobs that
+    failed too often wait for `submit --retry`.
+    """
+    from photonfarm import queue
+    from photonfarm.cli import show
+    from photonfarm.store import Store
+
+    opened = Store(store)
+    with queue.connect(redis_url) as connection:
+        show.queued(queue.reconcile(opened, connection), as_json)
+
+
+@click.command("redis")
+@click.option("--port", type=click.IntRange(1, 65535), default=6379, show_default=True, help="Of this machine alone.")
+def redis_server(port: int) -> None:
+    """Run a Redis for the queue on this machine, until it is ended: the server that `up` embeds.
+
+    It lets in users of this machine, without a password, and keeps nothing: the queue is filled again from the store.
+    """
+    from photonfarm.farm.redis_server import become_redis
+
+    become_redis(port)
+
+
+@click.command()
+@click.argument("spec")
+@request_options
+@store_option
+@click.option("--workers", type=click.IntRange(1),
+              help="Render workers, a core each, or in turn on the cards.  [default: 2; one a card]")  # fmt: skip
+@device_option
+@click.option(
+    "--run",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="run",
+    show_default=True,
+    help="The trainer's folder.",
+)
+@click.option("--train-steps", type=click.IntRange(0), default=3000, show_default=True, help="0: render only.")
+@click.option(
+    "--hold-out",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=None,
+    help="Share of the configurations never trained on.  "
+    f"[default: the run's; of a new one {HOLD_OUT}, or just enough for one configuration of a small plan]",
+)
+@click.option("--reference-views", type=click.IntRange(0), default=0, show_default=True,
+              help="Held-out views that get references, for the report; 0: none.")  # fmt: skip
+@click.option("--reference-spp", type=click.IntRange(1), default=256, show_default=True,
+              help="Samples per pixel of each reference.")  # fmt: skip
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True,
+              help="Preview and report.")  # fmt: skip
+@click.option("--web/--no-web", default=True, show_default=True, help="Serve pages that show it, on this machine.")
+def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
+    """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.
+
+    Ctrl-C stops it within seconds; the same command goes on from there.
+    """
+    from photonfarm.cli.show_up import FarmTalk
+    from photonfarm.farm.devices import AUTO, CPU, DEVICE_VARIABLE, cards_here, of_workers
+    from photonfarm.farm.up import WORKERS, run_farm, trainer_arguments
+
+    try:
+        _check_arguments(["work", "--until-complete"], "mitsuba", "render")
+        if options["train_steps"]:
+            trainer = {name: options[name] for name in ("run", "train_steps")}
+            arguments = trainer_arguments(spec, hold_out=options["hold_out"] or HOLD_OUT, **trainer)
+            _check_arguments(arguments, "torch", "train", "--train-steps 0 renders only")
+        devices = of_workers(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())
+        options["workers"] = options["workers"] or (WORKERS if devices == (CPU,) else len(devices))
+        run_farm(spec, store, request, FarmTalk(), devices=devices, **options)
+    except KeyboardInterrupt:
+        click.echo("stopped; the same command goes on from here", err=True)
+        sys.exit(130)
+
+
+def _check_arguments(arguments: list[str], package: str, extra: str, *remedies: str) -> None:
+    """Raise UsageError if a verb lacks a package, or would refuse its arguments or its table of the configuration."""
+    if find_spec(package) is None:
+        missing = f"`photonfarm {arguments[0]}` needs the package {package}: pip install 'photonfarm[{extra}]'"
+        raise click.UsageError("; ".join([missing, *remedies]))
+    root = click.get_current_context().find_root()
+    verb = cast(click.Command, cast(click.Group, root.command).get_command(root, arguments[0]))
+    embedded = ["--redis", "unix:///"]  # like that of the embedded Redis, which wants no password
+    verb.make_context(arguments[0], [*arguments[1:], *embedded], parent=root).close()

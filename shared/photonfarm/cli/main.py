@@ -1,0 +1,197 @@
+"""The command `photonfarm`: its verbs, its configuration file, and its exit codes.
+
+Verbs are entry points of the group `photonfarm.commands`, each imported only when it is used. The entry point "scene"
+is the verb `photonfarm scene`, a group, and "scene.plan" is a subcommand of it, even if another distribution provides
+the verb.
+"""
+
+from __future__ import annotations
+
+import difflib
+import io
+import os
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points, requires
+from pathlib import Path
+from typing import NoReturn
+
+import click
+from click.core import ParameterSource
+from rich import markup
+from rich.console import Console
+
+from photonfarm.cli.settings import file_defaults
+from photonfarm.core.errors import PhotonfarmError, QueueError, StoreError
+from photonfarm.core.processes import GROUP
+
+_BARE = {"store": "Look into the sample store, check it, and repair it."}
+"""The help texts of groups that have no entry point of their own."""
+
+
+@cache
+def _installed() -> dict[str, EntryPoint]:
+    return {entry.name: entry for entry in entry_points(group=GROUP)}
+
+
+class Suggesting(click.Group):
+    """A group that answers an unknown verb with those that resemble it, also with `store check` to `check`."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """The verb with its name and the arguments behind it; raises UsageError for an unknown one."""
+        name = args[0]
+        if self.get_command(ctx, name) is None and not ctx.resilient_parsing:
+            near = difflib.get_close_matches(name, self.list_commands(ctx))
+            near += [known.replace(".", " ") for known in sorted(_installed()) if known.endswith(f".{name}")]
+            hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+            raise click.UsageError(f"No such command {name!r}.{hint}", ctx)
+        return super().resolve_command(ctx, args)
+
+
+class Umbrella(Suggesting):
+    """A group whose verbs are those of the services that are installed."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
+        """The installed verbs."""
+        return sorted({name.partition(".")[0] for name in _installed()})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The verb, imported only now."""
+        if cmd_name not in self.list_commands(ctx):
+            return None
+        entry = _installed().get(cmd_name)
+        command = None if entry is None else entry.load()
+        prefix = f"{cmd_name}."
+        below = {name.removeprefix(prefix): sub for name, sub in _installed().items() if name.startswith(prefix)}
+        return Extended(cmd_name, command, below) if below else command
+
+
+class Extended(Suggesting):
+    """A group with subcommands that have entry points of their own."""
+
+    def __init__(self, name: str, own: click.Group | None, below: dict[str, EntryPoint]) -> None:
+        """Take the group of the verb's own entry point, None where it has none."""
+        super().__init__(name, help=own.help if own else _BARE[name], commands=own.commands if own else None)
+        self._below = below
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The verb's own subcommands and those of others."""
+        return sorted({*super().list_commands(ctx), *self._below})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The subcommand; that of another distribution is imported only now."""
+        entry = self._below.get(cmd_name)
+        return super().get_command(ctx, cmd_name) if entry is None else entry.load()
+
+
+def options_by_command(umbrella: click.Group) -> dict[str, dict[str, str]]:
+    """The options of each verb, and of each subcommand as "verb.subcommand": names without dashes → parameters."""
+    return {
+        name: {
+            flag.lstrip("-"): str(option.name)
+            for option in command.params
+            if isinstance(option, click.Option)
+            for flag in option.opts
+        }
+        for name, command in _commands(umbrella, "")
+    }
+
+
+def _commands(group: click.Group, prefix: str) -> Iterator[tuple[str, click.Command]]:
+    ctx = click.Context(group)
+    for name in group.list_commands(ctx):
+        command = group.get_command(ctx, name)
+        if command is not None:
+            yield prefix + name, command
+            if isinstance(command, click.Group):
+                yield from _commands(command, f"{prefix}{name}.")
+
+
+STOPPED = 130
+"""The exit code after Ctrl-C, as shells give it."""
+
+CONFIG_VARIABLE = "PHOTONFARM_CONFIG"
+
+
+@click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(package_name="photonfarm", prog_name="photonfarm")
+@click.option("--config", type=click.Path(path_type=Path), envvar=CONFIG_VARIABLE, default="photonfarm.toml",
+              show_default=True, help="Defaults for options, a table per verb.")  # fmt: skip
+@click.pass_context
+def umbrella(ctx: click.Context, config: Path) -> None:
+    """Unbiased training data for neural light transport, and training on it while it grows.
+
+    Options come from the command line, else from PHOTONFARM_… variables, else from the configuration file. Results go
+    to stdout, all other messages go to stderr. Exit codes: 0 done, 2 wrong usage, 3 bad spec or request, 4 store, 5
+    Redis, 6 this machine cannot render, 7 incomplete, 8 training diverged, 9 SLURM, 130 Ctrl-C, 1 anything else.
+    """
+    named = ctx.get_parameter_source("config") is not ParameterSource.DEFAULT
+    if named or config.is_file():
+        ctx.default_map = file_defaults(config, options_by_command(umbrella))
+    if ctx.get_parameter_source("config") is ParameterSource.COMMANDLINE:
+        ctx.with_resource(_told_to_child_processes(config))
+
+
+@contextmanager
+def _told_to_child_processes(config: Path) -> Iterator[None]:
+    """Name the configuration file in our environment, so that verbs that this verb starts read the same one."""
+    before = os.environ.get(CONFIG_VARIABLE)
+    os.environ[CONFIG_VARIABLE] = str(config.absolute())
+    try:
+        yield
+    finally:
+        del os.environ[CONFIG_VARIABLE]
+        if before is not None:
+            os.environ[CONFIG_VARIABLE] = before
+
+
+def main(args: list[str] | None = None) -> None:
+    """Run the command line; an error of ours, and Ctrl-C, become one sentence and an exit code."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # for terminals that lack × and …
+    try:
+        sys.exit(umbrella.main(args, prog_name="photonfarm", standalone_mode=False) or 0)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except click.Abort:
+        _fail("stopped by Ctrl-C; what is stored stays", STOPPED)
+    except PhotonfarmError as error:
+        _fail(str(error), error.exit_code)
+    except OSError as error:  # a file that a user named, and no code closer to it knew more
+        _fail(f"{error.filename or 'a file, or the output'}: {error.strerror or error}", StoreError.exit_code)
+    except ModuleNotFoundError as error:
+        if (extra := _extra_of(error.name or "")) is None:
+            raise
+        _fail(f"this needs the package {error.name}: pip install 'photonfarm[{extra}]'", click.UsageError.exit_code)
+    except Exception as error:
+        if not _is_of_redis(error):
+            raise
+        _fail(f"Redis failed: {error}", QueueError.exit_code)
+
+
+def _extra_of(package: str) -> str | None:
+    """The extra of photonfarm that brings a package; None if none does."""
+    for requirement in requires("photonfarm") or ():
+        name, _, marker = requirement.partition(";")
+        if re.match(rf"{re.escape(package)}\b", name) and (extra := re.search(r"extra == .(\w+)", marker)):
+            return extra[1]
+    return None
+
+
+def _is_of_redis(error: Exception) -> bool:
+    """Whether an error is one of Redis; whoever met one has imported its package, which takes its time."""
+    redis = sys.modules.get("redis")
+    return redis is not None and isinstance(error, redis.RedisError)
+
+
+def _fail(sentence: str, exit_code: int) -> NoReturn:
+    console = Console(stderr=True, soft_wrap=True)
+    console.print("[bold red]photonfarm:[/]", markup.escape(sentence), highlight=False)
+    sys.exit(exit_code)

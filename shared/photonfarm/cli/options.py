@@ -1,0 +1,179 @@
+"""Options that several verbs share."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+from click.core import ParameterSource
+
+from photonfarm.core.processes import loading
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+class StorePlace(click.Path):
+    """A folder, as a Path; or the URL of a bucket, as it is written."""
+
+    name = "folder or url"
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, file_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The Path or the URL; fails for a URL that is not that of a bucket."""
+        with loading():
+            from photonfarm.store.io.storage import SCHEMES, is_url
+
+        if re.match(r"(s3|gs|az):/?[^/]", str(value)):
+            self.fail(f"{value!r} is no URL of a bucket; write {str(value)[:2]}://BUCKET/PREFIX.", param, ctx)
+        if not is_url(value):
+            return super().convert(value, param, ctx)
+        scheme, _, bucket = value.partition("://")
+        if scheme not in SCHEMES or not bucket.strip("/"):
+            self.fail(f"{value!r} is neither a folder nor {'://…, '.join(SCHEMES)}://… with a bucket.", param, ctx)
+        return value
+
+
+class WholeNumber(click.IntRange):
+    """A whole number in a range, also written like 1e3 or 10_000."""
+
+    name = "integer"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The number; fails for text that is none, and for a fraction."""
+        try:
+            number = float(value)
+        except (TypeError, ValueError, OverflowError):
+            return super().convert(value, param, ctx)  # which says so
+        if not number.is_integer():
+            self.fail(f"{value!r} is not a whole number.", param, ctx)
+        exact = isinstance(value, str) and value.strip().isdigit()  # more digits than a float has
+        return super().convert(int(value if exact else number), param, ctx)
+
+
+def store_option(command: Command) -> Command:
+    """`--store`, the sample store."""
+    return click.option(
+        "--store", type=StorePlace(), metavar="DIR|URL", envvar="PHOTONFARM_STORE", default="store", show_default=True,
+        help="The sample store: a folder, or s3://bucket/prefix (credentials: the AWS_… variables).",
+    )(command)  # fmt: skip
+
+
+def redis_option(command: Command) -> Command:
+    """`--redis URL`, the queue's server; its password may come from the file that a variable names."""
+    return click.option(
+        "--redis", "redis_url", envvar="PHOTONFARM_REDIS_URL", default="redis://localhost:6379/0", show_default=True,
+        help="The queue's Redis. A password is refused here, as command lines can be read by all; it belongs into the "
+        "file that PHOTONFARM_REDIS_PASSWORD_FILE names, and is the user photonfarm's unless the URL names another: "
+        "redis://default@host for a Redis with requirepass.", show_envvar=True, callback=_with_password,
+    )(command)  # fmt: skip
+
+
+def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
+    if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
+        _refuse_password(url)
+    if (file := password_file()) is None:
+        return url
+    from photonfarm.queue import with_password_of
+
+    return with_password_of(file, url)
+
+
+def optional_redis_option(help_text: str) -> Callable[[Command], Command]:
+    """`--redis URL` without a default, as `queue_url`; the file of its password is not read."""
+    return click.option(
+        "--redis", "queue_url", envvar="PHOTONFARM_REDIS_URL", show_envvar=True, callback=_without_password,
+        help=help_text,
+    )  # fmt: skip
+
+
+def _without_password(ctx: click.Context, param: click.Parameter, url: str | None) -> str | None:
+    if url and ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
+        _refuse_password(url)
+    return url or None
+
+
+def password_file() -> Path | None:
+    """The file that holds the password of Redis, if a variable names one."""
+    file = os.environ.get("PHOTONFARM_REDIS_PASSWORD_FILE")
+    return Path(file) if file else None
+
+
+def names_redis() -> bool:
+    """Whether the user of the current command has named its Redis, in any way."""
+    context = click.get_current_context(silent=True)
+    return context is None or context.get_parameter_source("redis_url") is not ParameterSource.DEFAULT
+
+
+def _refuse_password(url: str) -> None:
+    from photonfarm.queue import has_password
+
+    if has_password(url):
+        raise click.BadParameter(
+            "a password on the command line can be read by everybody on this machine, and stays in the shell's "
+            "history; give the URL without it, and put the password into a file that PHOTONFARM_REDIS_PASSWORD_FILE "
+            "names. (A URL with a password may stand in PHOTONFARM_REDIS_URL, or as `redis` in the configuration file.)"
+        )
+
+
+def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
+    """`--device`, what renders; the verb and its child processes find it in the environment."""
+    from photonfarm.farm.devices import AUTO, DEVICE_VARIABLE
+
+    @wraps(command)
+    def on_device(*arguments: Any, device: str, **options: Any) -> Any:
+        if click.get_current_context().get_parameter_source("device") is not ParameterSource.DEFAULT:
+            os.environ[DEVICE_VARIABLE] = device
+        return command(*arguments, **options)
+
+    return click.option(
+        "--device", envvar=DEVICE_VARIABLE, default=AUTO, show_default=True, show_envvar=True,
+        metavar="auto|cpu|cuda[:N]", callback=_device,
+        help="What renders: the processor, the first NVIDIA card, card N as nvidia-smi numbers them; auto: a card, "
+        "where there is one that can.",
+    )(on_device)  # fmt: skip
+
+
+def _device(ctx: click.Context, param: click.Parameter, name: str) -> str:  # noqa: ARG001
+    from photonfarm.farm.devices import NAMES
+
+    if not NAMES.fullmatch(name):
+        raise click.BadParameter(f"{name!r} is none of auto, cpu, cuda and cuda:N.")
+    return name
+
+
+def json_option(command: Command) -> Command:
+    """`--json`: machine-readable results."""
+    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
+
+
+def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The options that make a request, which the command gets as `request`, and `shard_rows`."""
+
+    @wraps(command)
+    def with_request(*, modifications: int, views: int, passes: int, seed: int, **options: Any) -> Any:
+        from photonfarm.plan.request import Request
+
+        asked = {"modifications": modifications, "views_per_modification": views, "passes": passes, "seed": seed}
+        return command(request=Request.of(**asked), **options)
+
+    options = (
+        click.option("--modifications", type=WholeNumber(1), default=128, show_default=True,
+                     help="Random configurations; a static scene has one, of which modifications × views are planned."),
+        click.option("--views", type=WholeNumber(1), default=2, show_default=True, help="Views per configuration."),
+        click.option("--passes", type=WholeNumber(1), default=1, show_default=True, help="Noisy passes per view."),
+        click.option("--seed", type=WholeNumber(0), default=0, show_default=True, help="Master seed; 0 is a seed."),
+        click.option("--shard-rows", type=WholeNumber(1, 4096), default=None,
+                     help="Samples per job, fixed for a scene by its first plan.  [default: some seconds of work, at "
+                     "most 32, and several jobs for every worker]"),
+    )  # fmt: skip
+    found: Callable[..., Any] = with_request
+    for option in reversed(options):
+        found = option(found)
+    return found

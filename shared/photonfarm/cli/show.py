@@ -1,0 +1,159 @@
+"""What the command line prints: tables for people, JSON for programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich import markup
+from rich.console import Console
+from rich.table import Table
+
+from photonfarm.core.waiting import in_words
+from photonfarm.scene.spec import SceneSpec, shape_ids
+
+if TYPE_CHECKING:
+    from photonfarm.farm.dry_run import DryRun
+    from photonfarm.farm.submission import Submission
+
+
+def print_json(document: Any) -> None:
+    """Print JSON for programs."""
+    click.echo(json.dumps(document, indent=2))
+
+
+def print_table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
+    """Print rows of text as a table, with a head or without one."""
+    table = Table(*head, box=None, show_header=bool(head), pad_edge=False)
+    for row in rows:
+        table.add_row(*map(markup.escape, row))
+    console = Console(soft_wrap=True)
+    console.width = max(console.width, 132)  # ids are for copying: never cut
+    console.print(table, highlight=False)
+
+
+# ----------------------------------------------------------------------------------------------------------- scene show
+
+
+def scene(spec: SceneSpec, as_json: bool) -> None:
+    """Print a checked spec: its id, its settings, its movable groups."""
+    if as_json:
+        sizes = {"bytes_per_sample": bytes_per_sample(spec)}
+        print_json({"scene_id": spec.scene_id, **sizes, **spec.model_dump(mode="json")})
+        return
+    t, source = spec.transport, spec.scene
+    print_table(
+        (
+            ("name", spec.name),
+            ("scene id", spec.scene_id),
+            ("source", source.file or f"built-in {source.builtin}"),
+            ("kind", f"dynamic, {len(spec.groups)} movable groups" if spec.groups else "static"),
+            ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.fov_deg:g}°"),
+            ("light transport", f"depth {t.max_depth}, {t.connections} connections, light ratio {t.light_ratio:g}"
+             + ", guided light" * t.guided_light
+             + (f", {t.light_samples} light samples" if t.light_samples > 1 else "")),
+            ("half-estimates", f"2 × {t.half_spp} samples per pixel"),
+            ("views from", _box(spec.view.origin.min, spec.view.origin.max)),
+            ("looking at", _box(spec.view.look_at.min, spec.view.look_at.max)),
+            ("point cloud", f"{spec.points} points"),
+            ("photons", f"{spec.photons.paths} paths, {spec.photons.depth} hits each"),
+            ("exposure", f"{spec.exposure:g}"),
+            ("bytes per sample", f"≤ {bytes_per_sample(spec):,} with its own view and modification"),
+        )
+    )  # fmt: skip
+    if spec.groups:
+        click.echo()
+        print_table(
+            (
+                (g.name, str(len(shape_ids(g))), f"{g.removal_probability:g}", _box(g.box.min, g.box.max))
+                for g in spec.groups
+            ),
+            ("movable", "shapes", "removed", "positions"),
+        )  # fmt: skip
+
+
+def bytes_per_sample(spec: SceneSpec) -> int:
+    """The stored bytes of one sample that has a view and a modification of its own, before compression."""
+    from photonfarm.store.format.schema import bytes_of_rows
+
+    return sum(bytes_of_rows(spec).values())
+
+
+def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
+    return " × ".join(f"{a:g}" if a == b else f"{a:g}…{b:g}" for a, b in zip(low, high, strict=True))
+
+
+# --------------------------------------------------------------------------------------------------------------- submit
+
+
+def submission(result: Submission, as_json: bool) -> None:
+    """Print the outcome of a submission, or of a dry run of one."""
+    from photonfarm.farm.dry_run import DryRun
+
+    if as_json:
+        print_json(asdict(result))
+        return
+    if result.dry_run:
+        click.echo(
+            f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
+        )
+        if isinstance(result, DryRun) and result.planned:
+            _cost(result)
+        return
+    queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
+    click.echo(
+        f"scene {result.scene_id}: {result.planned} samples planned, {result.planned_before} planned before, {queued}"
+    )
+    if result.note:
+        click.echo(result.note, err=True)
+    if result.replaced:
+        click.echo(f"the store's spec is replaced, and no sample changes: {result.replaced}", err=True)
+    if result.halves_from:
+        click.echo(f"jobs take over the halves that scene {result.halves_from} has, and render the rest", err=True)
+    if result.scenes:
+        from photonfarm.scene.spec_loading import SCENES_VARIABLE
+
+        click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
+
+
+def queued(jobs: int, as_json: bool) -> None:
+    """Print how many jobs `reconcile` has queued."""
+    if as_json:
+        print_json({"queued": jobs})
+    else:
+        click.echo("1 job queued" if jobs == 1 else f"{jobs} jobs queued")
+
+
+def _cost(result: DryRun) -> None:
+    """Print the size and the cost of what would be planned, and a better use of the same cost."""
+    size = f"at most {result.size_bytes / 1e6:,.1f} MB before compression"
+    if result.core_s is None or result.wall_s is None:
+        click.echo(size)
+        return
+    cores = "1 core" if result.cores == 1 else f"{result.cores} cores"
+    click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {in_words(result.wall_s)} on the {cores} here")
+    if result.planned:
+        click.echo(_suggestion(result))
+
+
+def _suggestion(result: DryRun) -> str:
+    better = result.suggestion
+    if result.reduction is None:
+        return f"no suggestion: another half_spp would render the {result.planned_before} planned samples again"
+    if better is None:
+        return "what is asked for is within 5 % of the best at this cost"
+    request = f"{better.samples} views of one pass"
+    if better.views is not None:
+        options = f"--modifications {better.modifications} --views {better.views}"
+        request = f"{options} ({better.samples} samples of one pass)"
+    return (
+        f"suggested at this cost: half_spp = {better.half_spp} in [transport], {request}: "
+        f"{100 * result.reduction:.0f} % less excess error predicted for light_transport; guided networks gain less"
+    )
+
+
+def _amount(seconds: float) -> str:
+    return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.1f}"

@@ -1,0 +1,218 @@
+"""The verb `slurm`, which needs neither Mitsuba nor torch."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from photonfarm.cli.options import (
+    json_option,
+    optional_redis_option,
+    password_file,
+    request_options,
+    store_option,
+)
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from photonfarm.farm.slurm.scripts import Surroundings
+    from photonfarm.farm.submission import Submission
+    from photonfarm.plan.request import Request
+    from photonfarm.scene.spec_loading import NamedSpec
+
+
+def _limit(ctx: click.Context, param: click.Parameter, text: str | None) -> str | None:  # noqa: ARG001
+    from photonfarm.core.errors import SpecError
+    from photonfarm.farm.slurm.scripts import LEAST_LIMIT_S, limit_s
+
+    try:
+        if text is not None and limit_s(text) < LEAST_LIMIT_S:
+            raise click.BadParameter(f"{text!r} is too short: SLURM may ask tasks to stop two minutes before the limit")
+    except SpecError as error:
+        raise click.BadParameter(str(error)) from error
+    return text
+
+
+@click.command()
+@click.argument("specs", metavar="SPEC...", nargs=-1, required=True)
+@request_options
+@store_option
+@optional_redis_option(
+    "The queue's Redis, if nodes reach one. A password belongs into the file that "
+    "PHOTONFARM_REDIS_PASSWORD_FILE names.  [default: none; the store alone says what is missing]"
+)
+@click.option("--no-queue", is_flag=True, help="Use no Redis, even if one is named.")
+@click.option("--retry", is_flag=True, help="Also render jobs that were set aside after repeated failures.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    default=4,
+    show_default=True,
+    help="Render workers: tasks of the array, a core each.",
+)
+@click.option("--partition", metavar="NAME", help="SLURM's partition.  [default: the cluster's]")
+@click.option(
+    "--time",
+    callback=_limit,
+    metavar="LIMIT",
+    help="Time limit of a task, as sbatch takes it; at least 3 "
+    "minutes. A task that its limit ends puts itself back into the queue.  [default: the partition's]",
+)
+@click.option("--gpus", is_flag=True, help="Render on GPUs: one for each worker.")
+@click.option(
+    "--sbatch",
+    "further",
+    multiple=True,
+    metavar="OPTION",
+    help="A further option of sbatch, as --sbatch=--account=lab; may be repeated.",
+)
+@click.option(
+    "--logs",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="slurm",
+    show_default=True,
+    help="Folder of the scripts and of a log for each task.",
+)
+@click.option("--train", is_flag=True, help="Also start the trainer, as a job of its own, once the first worker runs.")
+@click.option(
+    "--run",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="run",
+    show_default=True,
+    help="The trainer's folder.",
+)
+@click.option("--train-steps", type=click.IntRange(1), help="Steps to train for.  [default: the preset's]")
+@click.option("--train-gpus", is_flag=True, help="Train on a GPU.")
+@click.option(
+    "--train-sbatch",
+    "train_further",
+    multiple=True,
+    metavar="OPTION",
+    help="As --sbatch, for the trainer's job alone: --train-sbatch=--partition=gpu.",
+)
+@click.option("--dry-run", is_flag=True, help="Print the scripts, and write and submit nothing.")
+@json_option
+def slurm(
+    specs: tuple[str, ...],
+    store: str | Path,
+    queue_url: str | None,
+    request: Request,
+    shard_rows: int | None,
+    dry_run: bool,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    """Plan samples of each SPEC, and render them by workers that SLURM runs as an array.
+
+    Without Redis the workers share the jobs by the store alone (`photonfarm work --share`). A task that is preempted,
+    that loses its node or reaches its time limit goes back into the queue, and loses the job in hand. The same command
+    goes on from what is stored.
+
+    Exit code 9: sbatch is not here, or refuses.
+    """
+    from photonfarm.farm.slurm.launch import check_slurm, launch
+    from photonfarm.scene.spec_loading import NamedSpec
+
+    if options["train"] and len(specs) > 1:
+        raise click.UsageError("--train takes one SPEC: a trainer trains on one scene")
+    queue_url = None if options["no_queue"] else queue_url
+    named = [NamedSpec.load(spec) for spec in specs]
+    scripts = _scripts(named, store, queue_url, options)
+    if dry_run:
+        click.echo("\n".join(scripts.values()), nl=False)
+        return
+    check_slurm()
+    planned = _planned(named, store, queue_url, request, shard_rows, options)
+    started = launch(scripts, options["logs"].absolute())
+    if as_json:
+        from photonfarm.cli import show
+
+        show.print_json({"plans": list(map(asdict, planned)), **asdict(started)})
+        return
+    click.echo(f"job {started.workers}: {options['workers']} workers; logs in {started.logs}")
+    if started.trainer is not None:
+        click.echo(f"job {started.trainer}: the trainer, which begins once the first worker has")
+
+
+def _planned(
+    named: Sequence[NamedSpec],
+    store: str | Path,
+    queue_url: str | None,
+    request: Request,
+    shard_rows: int | None,
+    options: dict[str, Any],
+) -> list[Submission]:
+    """Plan a request for each spec, and queue all that is missing if there is a queue."""
+    from photonfarm.farm.submission import hold_out_warning, queue_missing, submit
+    from photonfarm.scene.plausibility import warnings
+    from photonfarm.store import Store
+
+    planned = []
+    for spec in named:
+        for warning in filter(None, (*warnings(spec), hold_out_warning(spec.spec, store, request))):
+            click.echo(f"warning: {warning}", err=True)
+        settings = {"retry": options["retry"], "shard_rows": shard_rows, "workers": options["workers"]}
+        planned.append(submit(spec, store, None, request, **settings))
+        found = planned[-1]
+        click.echo(f"scene {found.scene_id}: {found.planned} samples planned, {found.planned_before} before", err=True)
+    if queue_url is not None:
+        from photonfarm.queue import with_password_of
+
+        url = with_password_of(password_file(), queue_url)
+        queue_missing(Store(store), url, retry=options["retry"])
+    return planned
+
+
+def _scripts(
+    named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, options: dict[str, Any]
+) -> dict[str, str]:
+    """The scripts by their names."""
+    from photonfarm.farm.slurm.launch import TRAINER, WORKERS
+    from photonfarm.farm.slurm.scripts import Resources, trainer_script, worker_script
+
+    at = _surroundings(named, store, queue_url, options["logs"])
+    words = [_word(spec.name) for spec in named]
+    asked = {"partition": options["partition"], "time": options["time"]}
+    workers = Resources(**asked, gpu=options["gpus"], further=options["further"])
+    only = named[0].spec.scene_id if len(named) == 1 else ""
+    scripts = {WORKERS: worker_script(at, workers, options["workers"], words, only)}
+    if options["train"]:
+        further = options["further"] + options["train_further"]
+        trainer = Resources(**asked, gpu=options["train_gpus"], further=further)
+        arguments = ["train", words[0], "--run", str(options["run"].absolute())]
+        steps = options["train_steps"]
+        scripts[TRAINER] = trainer_script(at, trainer, [*arguments, *(["--steps", str(steps)] if steps else [])])
+    return scripts
+
+
+def _surroundings(named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, logs: Path) -> Surroundings:
+    from photonfarm.farm.slurm.scripts import Surroundings
+
+    place = str(store.absolute()) if isinstance(store, Path) else store
+    scenes = dict.fromkeys(spec.scenes for spec in named if spec.scenes)
+    config, file = os.environ.get("PHOTONFARM_CONFIG"), password_file()
+    variables = {"PHOTONFARM_CONFIG": config, "PHOTONFARM_REDIS_PASSWORD_FILE": str(file) if file else None}
+    absolute = tuple((name, str(Path(path).absolute())) for name, path in variables.items() if path)
+    return Surroundings(
+        Path.cwd(), logs.absolute(), place, queue_url is not None, _to_be_written(queue_url), tuple(scenes), absolute
+    )
+
+
+def _to_be_written(queue_url: str | None) -> str | None:
+    """The URL of Redis for a script; None if it holds a password, which the environment or configuration has."""
+    if queue_url is None:
+        return None
+    from photonfarm.queue import has_password
+
+    return None if has_password(queue_url) else queue_url
+
+
+def _word(name: str) -> str:
+    """A spec as a script names it: absolute, if it is a file."""
+    path = Path(name)
+    return str(path.absolute()) if path.suffix == ".toml" or path.is_file() else name

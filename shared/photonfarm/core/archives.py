@@ -1,0 +1,125 @@
+"""NumPy archives by which one service hands arrays to another: a file is there whole or not at all.
+
+The costs of a frame's parts, and what kind of surface each pixel shows, are such an archive: the renderer measures, and
+reports read it without a renderer. Shape letters: N rows of the store, H W image, T timed frames, K sizes of image.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from enum import IntEnum
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.files import whole_file
+
+_DAMAGED = (ValueError, TypeError, KeyError, IndexError, EOFError, zipfile.BadZipFile, RuntimeError)
+"""The errors that reading raises for a file that is not such an archive."""
+
+
+def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> None:
+    """Store arrays by name; messages call them `what`. Raises StoreError if the disk refuses."""
+    with store_errors(f"write the {what}", file), whole_file(file) as part, part.open("wb") as archive:
+        np.savez(archive, allow_pickle=False, **arrays)
+
+
+@contextmanager
+def stored_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
+    """The arrays of a file by name, each read at its first use.
+
+    Raises StoreError if the file is missing, unreadable or damaged, and if the code inside the `with` raises KeyError,
+    IndexError, TypeError or ValueError on its arrays; the message names `what` the file should hold, and the `verb`
+    that writes it.
+    """
+    try:
+        with file.open("rb") as archive, np.load(archive, allow_pickle=False) as stored:  # it leaves damaged ones open
+            yield stored
+    except FileNotFoundError as error:
+        raise StoreError(f"{file}: there is no such file") from error
+    except OSError as error:
+        raise StoreError(f"{file}: cannot be read: {error.strerror or error}") from error
+    except _DAMAGED as error:
+        raise StoreError(f"{file}: holds no {what} that `photonfarm {verb}` wrote") from error
+
+
+PARTS = ("edit_s", "buffers_s", "guides_s", "points_s", "photons_s", "photons_seen_s")
+"""What a network's frame needs besides samples, in the order in which it is made."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seconds:
+    """Wall time of a piece of work that was timed several times."""
+
+    median: float
+    low: float  # the 10th percentile
+    high: float  # the 90th percentile
+
+    @classmethod
+    def of(cls, times: NDArray[np.float64]) -> Self:
+        """The median and percentiles of some times, (T,); raises ValueError if there are none."""
+        if not len(times):
+            raise ValueError("times is empty; a median needs at least one")
+        low, median, high = np.quantile(times, (0.1, 0.5, 0.9)).tolist()
+        return cls(median, low, high)
+
+
+class Surface(IntEnum):
+    """The kinds of first surface that a ray meets between the near and the far plane, by how they scatter."""
+
+    NOTHING = 0  # there is none
+    DIFFUSE = 1  # diffuse lobes only; also behind a mask
+    SPECULAR = 2  # a glossy lobe, or a diffuse one beside a mirror's: metals, and what is coated
+    MIRROR = 3  # neither diffuse nor glossy: mirrors, clear glass, and surfaces that let everything through
+    EMITTER = 4  # its shape emits, whatever else it does
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FrameCosts:
+    """Wall-clock seconds on one core for each timed frame, and the first surfaces of some rows."""
+
+    scene_id: str
+    rows: NDArray[np.int64]  # (N,) of the store
+    surface: NDArray[np.uint8]  # (N, H, W) a `Surface` at each pixel's centre
+    edit_s: NDArray[np.float64]  # (T,) bringing the scene into the frame's configuration, from another one
+    buffers_s: NDArray[np.float64]  # (T,) depth, albedo, normal
+    guides_s: NDArray[np.float64]  # (T,) the view's guides, mainly direct light
+    points_s: NDArray[np.float64]  # (T,) which points of the base cloud, or of its first ones, the view sees
+    photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without photons
+    photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees; 0 likewise
+    kept: NDArray[np.int64]  # (K,) k: an image of about 1/k of the pixels
+    render_s: NDArray[np.float64]  # (K, T) one half-estimate of it: `half_spp` samples of each of these pixels
+
+    def parts(self) -> dict[str, Seconds]:
+        """The times of each part of a frame, by its name in `PARTS`, over the timed frames."""
+        return {name: Seconds.of(getattr(self, name)) for name in PARTS}
+
+    def renders(self) -> dict[int, Seconds]:
+        """The times of a half-estimate of 1/k of the pixels, by k, over the timed frames."""
+        return {k: Seconds.of(times) for k, times in zip(self.kept.tolist(), self.render_s, strict=True)}
+
+    def medians(self) -> dict[str, float]:
+        """The medians of `parts`."""
+        return {name: part.median for name, part in self.parts().items()}
+
+    def render_medians(self) -> dict[int, float]:
+        """The medians of `renders`."""
+        return {k: render.median for k, render in self.renders().items()}
+
+    def write(self, file: Path) -> None:
+        """Store them as a NumPy archive, whole or not at all; raises StoreError if the disk refuses."""
+        arrays = {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)}
+        write_arrays(file, arrays, "frame costs")
+
+    @classmethod
+    def read(cls, file: Path) -> Self:
+        """Read what `write` stored; raises StoreError for anything else."""
+        with stored_arrays(file, "frame costs", "measure-frames") as stored:
+            arrays: dict[str, Any] = {each.name: stored[each.name] for each in fields(cls)}
+            return cls(**{**arrays, "scene_id": str(arrays["scene_id"])})

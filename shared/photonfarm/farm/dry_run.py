@@ -1,0 +1,134 @@
+"""What a request would plan, store and cost, and how the same cost would be spent best; nothing is written."""
+
+from __future__ import annotations
+
+import subprocess
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from photonfarm.core.errors import BackendError, StoreError
+from photonfarm.core.processes import command, is_installed, usable_cores
+from photonfarm.farm.submission import Submission
+from photonfarm.plan.allocation import Allocation, CostModel
+from photonfarm.plan.request import Extent, Request
+from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import NamedSpec
+from photonfarm.store import Store
+from photonfarm.store.format.schema import bytes_of_rows
+from photonfarm.store.io.storage import is_vacant
+
+VERB = ("scene", "cost")  # of the renderer
+
+LEAST_S, MOST_S, SHARE_S = 20.0, 120.0, 0.1
+"""The processor seconds that measuring may take: a tenth of one for each sample that would be planned, about a tenth of
+what they cost; not below 20, into which most rooms fit, nor above 120, into which all do."""
+
+WORTH_A_CHANGE = 0.05
+"""The share of the excess error that a suggestion must save: costs and noise are medians of a few views."""
+
+
+@dataclass(frozen=True, slots=True)
+class Suggestion:
+    """A `half_spp` and a request with less predicted error than the user's, at the same cost."""
+
+    half_spp: int
+    modifications: int | None  # None of a static scene, as its views are all that there is to choose
+    views: int | None  # None in a static scene, which has only views to choose
+    samples: int  # in all, of one pass each
+
+
+@dataclass(frozen=True, slots=True)
+class DryRun(Submission):
+    """What a request would do. Fields that follow from measured costs are None without them."""
+
+    extent: Extent = field(kw_only=True)
+    size_bytes: int = field(kw_only=True)  # before compression
+    cores: int = field(kw_only=True)  # of this machine, as far as this process may use them
+    costs: SampleCosts | None = field(default=None, kw_only=True)
+    core_s: float | None = field(default=None, kw_only=True)  # to render what would be planned
+    wall_s: float | None = field(default=None, kw_only=True)  # with a worker on each of the cores
+    reduction: float | None = field(default=None, kw_only=True)  # of the excess error, by the best of the same cost
+    suggestion: Suggestion | None = field(default=None, kw_only=True)  # that allocation, if it is worth a change
+
+
+def rehearse(
+    named: NamedSpec,
+    store: str | Path,
+    request: Request,
+    *,
+    measure: bool,
+    log: Callable[[str], None],
+    shard_rows: int | None = None,
+) -> DryRun:
+    """What `submission.submit` would plan.
+
+    With `measure`, also its cost, and how the same cost would be spent best; `log` is called with the reason if the
+    cost is unknown. Raises SpecError and StoreError as `submit` does.
+    """
+    found = _counted(named.spec, request, store, shard_rows)
+    if not (measure and found.planned):
+        return found
+    try:
+        costs = costs_by_renderer(named.name, min(max(SHARE_S * found.planned, LEAST_S), MOST_S))
+    except BackendError as error:
+        log(f"cost and time are not known: {error}")
+        return found
+    return _priced(found, named.spec, request, costs)
+
+
+def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
+    """What would be planned, and its size."""
+    if is_vacant(store):
+        new, known, extent = wanted.samples, 0, wanted.extent(loaded)
+    else:
+        opened = Store(store)
+        planned = opened.plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
+        new, known, extent = planned.new, planned.known, planned.extent
+    of = bytes_of_rows(loaded)
+    size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
+    return DryRun(loaded.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=usable_cores())
+
+
+def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
+    """The costs that the renderer measures for a spec in so much processor time, or has kept.
+
+    Raises BackendError with the reason for none.
+
+    The renderer's own messages go to stderr.
+    """
+    name = " ".join(VERB)
+    if not is_installed(".".join(VERB)):
+        raise BackendError("the renderer, which measures them, is not installed here")
+    done = subprocess.run(
+        command(*VERB, "--json", "--seconds", f"{seconds:g}", "--", spec), stdout=subprocess.PIPE, check=False
+    )
+    if done.returncode:
+        raise BackendError(f"`photonfarm {name}` ended with exit code {done.returncode} here")
+    try:
+        return SampleCosts.read(done.stdout)
+    except StoreError as error:
+        raise BackendError(f"`photonfarm {name}` said {error}") from error
+
+
+def _priced(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
+    """What would be planned, with its cost, and the suggestion.
+
+    There is no suggestion if some samples of the request are planned already: another half_spp makes another scene, in
+    which all of them would be rendered again.
+    """
+    of, spp, static = found.extent, 2 * spec.transport.half_spp, not spec.groups
+    core_s = costs.seconds(spp, configurations=of.configurations, views=of.views, samples=found.planned)
+    timed = replace(found, costs=costs, core_s=core_s, wall_s=core_s / found.cores)
+    if found.planned_before or not found.planned:
+        return timed
+    asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
+    if static:
+        asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
+    reduction, better = CostModel.of(costs, static=static).improved(asked)
+    if reduction < WORTH_A_CHANGE:
+        return replace(timed, reduction=reduction)
+    modifications, views = (None, None) if static else (better.modifications, better.views)
+    suggestion = Suggestion(better.spp // 2, modifications, views, better.samples)
+    return replace(timed, reduction=reduction, suggestion=suggestion)

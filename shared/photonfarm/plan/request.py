@@ -1,0 +1,334 @@
+"""A request for samples, expanded into rows and jobs, without what is planned already.
+
+Shape letters: R rows of a plan, G movable groups. J is `shard_rows`, the samples of one job.
+
+A request names every combination of its modifications, of `views_per_modification` views of each, and of `passes` noisy
+passes of each view. Configurations that come out equal (both objects removed, say) are one modification, which gets the
+views of all of them, so that no view is drawn twice and the share of each configuration among the samples stays that
+of the sampling. In particular a static scene has one modification, and `modifications` × `views_per_modification`
+different views of it. Views that come out equal, since the spec fixes the camera, are one view: no sample is planned
+twice.
+
+The views of a configuration are numbered from 0; growing any number of a request therefore names a superset of the
+old samples, and only the new ones are planned. New views and passes refer to the rows that are there.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError, model_validator
+
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import KEY_BYTES, Key, make_key
+from photonfarm.core.models import Frozen, sentences
+from photonfarm.core.records import F32
+from photonfarm.scene.modification import Modification, modification_keys, rest, sample_modifications
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import sample_views
+
+SHARD_ROWS = 32
+"""The default number of samples per job, if neither the caller nor an older plan of the scene sets it."""
+
+MAX_SHARD_ROWS = 4096
+MAX_SAMPLES = 1_000_000
+"""The most samples of one request: its plan is made in memory, at some 0.5 to 1 kB each, more with many groups."""
+
+UNUSED = -1
+"""The reference in rows that hold nothing."""
+
+SampleCount = Annotated[int, Field(ge=1, le=MAX_SAMPLES)]
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """What is rendered for new samples, apart from their radiance."""
+
+    configurations: int = 0  # of the samples, new or not
+    modifications: int = 0  # the new ones among them: their photons are stored
+    views: int = 0  # new ones: their buffers are stored
+
+
+class Request(Frozen):
+    """What to plan: modifications × views × passes, under one master seed."""
+
+    kind: Literal["samples"] = "samples"  # distinguishes it from other requests in the store
+    modifications: SampleCount = 1
+    views_per_modification: SampleCount = 1
+    passes: Annotated[int, Field(ge=1, le=65536)] = 1
+    seed: Annotated[int, Field(ge=0, lt=1 << 63)] = 0
+
+    @model_validator(mode="after")
+    def _is_not_too_large(self) -> Self:
+        if self.samples > MAX_SAMPLES:
+            raise ValueError(f"names {self.samples} samples; at most {MAX_SAMPLES} fit one request")
+        return self
+
+    @property
+    def samples(self) -> int:
+        """The number of samples it names, planned already or not."""
+        return self.modifications * self.views_per_modification * self.passes
+
+    def extent(self, spec: SceneSpec) -> Extent:
+        """The extent of the request in a scene without plans, if no two of its configurations are equal."""
+        configurations = self.modifications if spec.groups else 1
+        return Extent(configurations, configurations, self.modifications * self.views_per_modification)
+
+    @classmethod
+    def of(cls, **values: Any) -> Request:
+        """The checked request; raises SpecError with a sentence for each broken rule."""
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            raise SpecError(f"the request: {'; '.join(sentences(error))}") from error
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedRows:
+    """The inputs of a plan, R rows each; row numbers run through all plans of a scene."""
+
+    modification: F32  # (R, G, 4) modification vectors; NaN where no modification has its row
+    view: F32  # (R, 6) origin and look-at point; NaN where no view has its row
+    sample_modification: NDArray[np.int64]  # (R,) row of the sample's modification, or UNUSED
+    sample_view: NDArray[np.int64]  # (R,) row of the sample's view, or UNUSED
+    sample_pass: NDArray[np.int32]  # (R,) pass number, or UNUSED
+    sample_key: NDArray[np.uint8]  # (R, 16)
+    modification_density: F32  # (R,) of the configuration, over that of uniform draws from the spec; NaN: unused row
+    view_density: F32  # (R,) likewise of the view, given the configuration
+
+    @classmethod
+    def empty(cls, rows: int, groups: int) -> PlannedRows:
+        """Rows that hold nothing yet."""
+        return cls(
+            np.full((rows, groups, 4), np.nan, np.float32),
+            np.full((rows, 6), np.nan, np.float32),
+            np.full(rows, UNUSED, np.int64),
+            np.full(rows, UNUSED, np.int64),
+            np.full(rows, UNUSED, np.int32),
+            np.zeros((rows, KEY_BYTES), np.uint8),
+            np.full(rows, np.nan, np.float32),
+            np.full(rows, np.nan, np.float32),
+        )
+
+    def without(self, spans: Iterable[range]) -> PlannedRows:
+        """The same rows, but for some spans, which hold nothing."""
+        left = PlannedRows(*(getattr(self, each.name).copy() for each in fields(self)))
+        for span in spans:
+            nothing = PlannedRows.empty(len(span), self.modification.shape[1])
+            for each in fields(self):
+                getattr(left, each.name)[span.start : span.stop] = getattr(nothing, each.name)
+        return left
+
+
+class PlannedContent:
+    """The content of a scene's older plans, for lookup; each table is built at its first use."""
+
+    def __init__(self, plans: Iterable[tuple[int, PlannedRows]] = ()) -> None:
+        """Take the plans in their order, each with the number of its first row."""
+        self.plans = list(plans)
+
+    @cached_property
+    def modifications(self) -> dict[bytes, int]:
+        """The row of each modification, by the bytes of its vector."""
+        found: dict[bytes, int] = {}
+        for first_row, rows in self.plans:
+            row, _ = _own(rows.sample_modification, first_row)
+            _add(found, contents(rows.modification[row - first_row]), row)
+        return found
+
+    @cached_property
+    def views(self) -> dict[bytes, int]:
+        """The row of each view, by its `view_contents`."""
+        found: dict[bytes, int] = {}
+        for first_row, rows in self.plans:
+            row, sample = _own(rows.sample_view, first_row)
+            _add(found, view_contents(rows.sample_modification[sample], rows.view[row - first_row]), row)
+        return found
+
+    @cached_property
+    def samples(self) -> set[Key]:
+        """The keys of all samples."""
+        found: set[Key] = set()
+        for _, rows in self.plans:
+            data = rows.sample_key[rows.sample_modification != UNUSED].tobytes()
+            found.update(data[i : i + KEY_BYTES] for i in range(0, len(data), KEY_BYTES))
+        return found
+
+    def vectors(self, kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
+        """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
+        first_rows = np.array([first_row for first_row, _ in self.plans])
+        of_row = np.searchsorted(first_rows, rows, side="right") - 1
+        vectors = np.empty((len(rows), *getattr(self.plans[0][1], kind).shape[1:]), np.float32)
+        order = np.argsort(of_row, kind="stable")  # by plan: each is looked into once, for its own rows alone
+        numbers, first = np.unique(of_row[order], return_index=True)
+        for number, own in zip(numbers.tolist(), np.split(order, first[1:]), strict=bool(len(rows))):
+            first_row, inputs = self.plans[number]
+            vectors[own] = getattr(inputs, kind)[rows[own] - first_row]
+        return vectors
+
+
+def _add(found: dict[bytes, int], keys: Iterable[bytes], rows: NDArray[np.int64]) -> None:
+    for key, row in zip(keys, rows.tolist(), strict=True):
+        found.setdefault(key, row)
+
+
+def _own(references: NDArray[np.int64], first_row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The distinct rows of a plan that its own samples refer to, and the first sample that does."""
+    rows, first = np.unique(references, return_index=True)
+    own = (rows >= first_row) & (rows < first_row + len(references))
+    return rows[own], first[own]
+
+
+def view_contents(modification_rows: NDArray[np.int64], views: F32) -> list[bytes]:
+    """The lookup keys of views (N, 6), given the rows (N,) of their modifications."""
+    rows = modification_rows.astype("<i8").tobytes()
+    return [rows[8 * i : 8 * i + 8] + view for i, view in enumerate(contents(views))]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SamplesToPlan:
+    """Samples to plan, ordered by modification, view and pass; M modifications, V views, S samples."""
+
+    modification: F32  # (M, G, 4)
+    modification_row: NDArray[np.int64]  # (M,) the row of one that is planned already, or UNUSED
+    view: F32  # (V, 6)
+    view_row: NDArray[np.int64]  # (V,) the row of one that is planned already, or UNUSED
+    sample_modification: NDArray[np.int64]  # (S,) which of the modifications
+    sample_view: NDArray[np.int64]  # (S,) which of the views
+    sample_pass: NDArray[np.int32]  # (S,)
+    sample_key: NDArray[np.uint8]  # (S, 16)
+    modification_density: F32 | None = None  # (M,) as in `PlannedRows`; None: 1
+    view_density: F32 | None = None  # (V,)
+
+    def extent(self) -> Extent:
+        """What is rendered for them."""
+        modifications, views = np.unique(self.sample_modification), np.unique(self.sample_view)
+        new_modifications = np.count_nonzero(self.modification_row[modifications] == UNUSED)
+        new_views = np.count_nonzero(self.view_row[views] == UNUSED)
+        return Extent(len(modifications), int(new_modifications), int(new_views))
+
+
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """A request as rows: `rows` is None where nothing of it is new."""
+
+    rows: PlannedRows | None
+    new: int  # samples
+    known: int  # samples named by the request and planned already
+    extent: Extent = Extent()  # of the new samples; empty for a top-up, which has no new views or modifications
+
+
+def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_job: int, shard_rows: int) -> Expansion:
+    """The rows of a request's new samples, packed into jobs of `shard_rows` from number `first_job` on.
+
+    Samples are ordered by modification, view and pass. A new modification or view gets the next free row of its kind in
+    the job of its first sample; so everything that a job must render lies in its own rows.
+    """
+    candidates, named = _candidates(spec, request, known)
+    planned = named - len(candidates.sample_pass)
+    return expand_samples(candidates, first_job=first_job, shard_rows=shard_rows, known=planned)
+
+
+def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tuple[SamplesToPlan, int]:
+    """The new samples of a request, and the number that it names, new or planned already."""
+    modifications, counts = _configurations(spec, request)
+    of_view = np.repeat(np.arange(len(counts)), counts)
+    index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
+    keys = modification_keys(spec.radiance_id, modifications)
+    views = sample_views(
+        spec, [keys[m] for m in of_view.tolist()], request.seed, index.tolist(), modifications[of_view]
+    )
+    modification_row = np.array([known.modifications.get(c, UNUSED) for c in contents(modifications)], np.int64)
+    view_row = np.array([known.views.get(c, UNUSED) for c in view_contents(modification_row[of_view], views)], np.int64)
+
+    view = np.repeat(np.arange(len(views)), request.passes)
+    pass_ = np.tile(np.arange(request.passes, dtype=np.int32), len(views))
+    keys = sample_keys(spec.radiance_id, modifications[of_view[view]], views[view], pass_)
+    distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
+    new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
+    found = SamplesToPlan(
+        modifications, modification_row, views, view_row, of_view[view[new]], view[new], pass_[new],
+        np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
+    )  # fmt: skip
+    return found, len(distinct)
+
+
+def sample_keys(radiance_id: str, modifications: F32, views: F32, passes: Iterable[int]) -> list[Key]:
+    """The content keys of samples of configurations (N, G, 4) and views (N, 6), by the numbers of their passes (N,)."""
+    samples = zip(modifications, views, passes, strict=True)
+    return [make_key("sample", radiance_id, modification, view, int(pass_)) for modification, view, pass_ in samples]
+
+
+def sample_key(radiance_id: str, modification: Modification, view: F32, pass_: int) -> Key:
+    """The content key of one sample; `view` is the view's vector (6,)."""
+    return sample_keys(radiance_id, modification.vector[None], view[None], [pass_])[0]
+
+
+def contents(array: F32) -> list[bytes]:
+    """The bytes of each row of an array, little-endian."""
+    return [row.tobytes() for row in np.ascontiguousarray(array, "<f4")]
+
+
+def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.int64]]:
+    """The distinct configurations of a request in order of appearance (M, G, 4), each with its number of views (M,).
+
+    The n-th appearance of a configuration stands for views n·V … n·V + V − 1 of it.
+    """
+    each = request.views_per_modification
+    if not spec.groups:
+        return rest(spec).vector[None], np.array([request.modifications * each])
+    vectors = sample_modifications(spec, request.seed, range(request.modifications))
+    counts = Counter(contents(vectors))
+    distinct = np.frombuffer(b"".join(counts), "<f4").reshape(-1, len(spec.groups), 4)
+    return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)
+
+
+def pack(candidates: SamplesToPlan, *, first_row: int, shard_rows: int) -> PlannedRows | None:
+    """Samples as rows from `first_row` on, in their order; None if there are none."""
+    count = len(candidates.sample_pass)
+    if not count:
+        return None
+    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, candidates.modification.shape[1])
+    modification_row, new = _place(candidates.sample_modification, candidates.modification_row, first_row, shard_rows)
+    rows.modification[modification_row[new] - first_row] = candidates.modification[new]
+    density = candidates.modification_density
+    rows.modification_density[modification_row[new] - first_row] = 1 if density is None else density[new]
+    view_row, new = _place(candidates.sample_view, candidates.view_row, first_row, shard_rows)
+    rows.view[view_row[new] - first_row] = candidates.view[new]
+    density = candidates.view_density
+    rows.view_density[view_row[new] - first_row] = 1 if density is None else density[new]
+    rows.sample_modification[:count] = modification_row[candidates.sample_modification]
+    rows.sample_view[:count] = view_row[candidates.sample_view]
+    rows.sample_pass[:count] = candidates.sample_pass
+    rows.sample_key[:count] = candidates.sample_key
+    return rows
+
+
+def expand_samples(samples: SamplesToPlan, *, first_job: int, shard_rows: int, known: int = 0) -> Expansion:
+    """The rows of new samples in jobs from number `first_job` on; `known` others are planned already."""
+    rows = pack(samples, first_row=first_job * shard_rows, shard_rows=shard_rows)
+    return Expansion(rows, len(samples.sample_pass), known, samples.extent())
+
+
+def _place(
+    references: NDArray[np.int64], known_row: NDArray[np.int64], first_row: int, shard_rows: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The row of each thing that samples refer to, and which of the things are new.
+
+    A new one takes the next free row in the job of the first sample that refers to it.
+    """
+    thing, sample = np.unique(references, return_index=True)
+    order = np.argsort(sample)
+    thing, sample = thing[order], sample[order]
+    new = known_row[thing] == UNUSED
+    thing, job = thing[new], sample[new] // shard_rows
+    before = np.searchsorted(job, job)  # new things of earlier jobs: `job` ascends
+    rows = known_row.copy()
+    rows[thing] = first_row + job * shard_rows + np.arange(len(thing)) - before
+    return rows, thing

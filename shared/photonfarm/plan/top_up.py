@@ -1,0 +1,228 @@
+"""Top-up: more noisy passes of views that are planned already; reference images are made in the same way.
+
+A pass is one more sample of a view, with 2 · `half_spp` samples per pixel in its two halves. New passes are numbered on
+from those that are planned, so that their seeds, which follow from the number, are new; they share the stored buffers
+and photons of the view and its modification. A process that loses the race for the next plan counts again.
+
+Shape letters: V views, S samples of all plans.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import KEY_BYTES, Key
+from photonfarm.core.models import Frozen, sentences
+from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
+from photonfarm.plan.request import (
+    MAX_SAMPLES,
+    UNUSED,
+    Expansion,
+    PlannedContent,
+    SamplesToPlan,
+    pack,
+    sample_keys,
+)
+from photonfarm.scene.modification import modification_keys
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import view_keys
+
+_A_SHARE = re.compile(r"(?:\d|\d?\.\d{1,25})(?:e-\d{1,3})?")
+"""A number as Python writes one between 0 and 1, such as 0.3333333333333333 or 1e-05."""
+
+Rows = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+class TopUp(Frozen):
+    """What to plan: more samples per pixel for each of the selected views, by so many or up to a total."""
+
+    kind: Literal["top-up"] = "top-up"
+    spp: Annotated[int, Field(ge=1, le=1 << 30)]
+    adds: bool  # True: `spp` more than is planned; False: up to `spp` in all
+    where: tuple[str, ...] = ()  # conditions that a view must meet, every one
+
+    @classmethod
+    def of(cls, spp: str, where: Sequence[str] = ()) -> TopUp:
+        """The checked request from "+64" or "256"; raises SpecError with a sentence for each broken rule."""
+        if not re.fullmatch(r"\+?\d{1,10}", spp):
+            raise SpecError(f"spp = {spp!r}: write +64 for 64 more samples per pixel, or 256 for 256 in all")
+        for condition in where:
+            _parsed(condition)
+        try:
+            return cls(spp=int(spp), adds=spp.startswith("+"), where=tuple(where))
+        except ValidationError as error:
+            raise SpecError(f"the request: {'; '.join(sentences(error))}") from error
+
+    def passes(self, spec: SceneSpec) -> int:
+        """The number of passes that have `spp` samples per pixel, rounded up."""
+        return -(-self.spp // spp_per_pass(spec))
+
+
+def spp_per_pass(spec: SceneSpec) -> int:
+    """Samples per pixel that one pass adds, both halves together."""
+    return 2 * spec.transport.half_spp
+
+
+def expand_top_up(
+    spec: SceneSpec, request: TopUp, known: PlannedContent, *, first_job: int, shard_rows: int
+) -> Expansion:
+    """The rows of a request's new passes, by modification, view and pass, in jobs from number `first_job` on.
+
+    Raises SpecError if nothing is planned or selected, or if it is too much for one request.
+    """
+    planned = PlannedViews.of(spec, known)
+    views = np.flatnonzero(_selected(planned, request.where))
+    views = views[np.lexsort((planned.view_row[views], planned.modification_row[views]))]
+    wanted = request.passes(spec)
+    have = np.zeros_like(views) if request.adds else np.minimum(planned.passes[views], wanted)
+    count = wanted - have
+    if count.sum() > MAX_SAMPLES:
+        raise SpecError(f"the request names {count.sum()} new samples; at most {MAX_SAMPLES} fit one request")
+    candidates = _candidates(planned, views, count)
+    rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
+    return Expansion(rows, int(count.sum()), int(have.sum()))
+
+
+def _candidates(planned: PlannedViews, views: Rows, count: Rows) -> SamplesToPlan:
+    """The next `count` passes of each of some views."""
+    modification_row, of_view = np.unique(planned.modification_row[views], return_inverse=True)
+    modification = planned.known.vectors("modification", modification_row)
+    view = planned.known.vectors("view", planned.view_row[views])
+    of_sample = np.repeat(np.arange(len(views)), count)
+    number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)
+    pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
+    keys = sample_keys(planned.spec.radiance_id, modification[of_view[of_sample]], view[of_sample], pass_)
+    return SamplesToPlan(
+        modification, modification_row, view, planned.view_row[views], of_view[of_sample], of_sample, pass_,
+        np.frombuffer(b"".join(keys), np.uint8).reshape(-1, KEY_BYTES),
+    )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlannedViews:
+    """The views of a scene in the order of their rows, and the samples that show them."""
+
+    spec: SceneSpec
+    known: PlannedContent
+    sample_row: Rows  # (S,)
+    sample_view: Rows  # (S,) row of the view
+    view_row: Rows  # (V,)
+    modification_row: Rows  # (V,)
+    passes: Rows  # (V,) how many are planned
+    next_pass: Rows  # (V,)
+
+    @classmethod
+    def of(cls, spec: SceneSpec, known: PlannedContent) -> PlannedViews:
+        """Count the passes of every view; raises SpecError if there is none."""
+        if not known.plans:
+            raise SpecError("nothing is planned that could be topped up; `photonfarm submit` plans the first samples")
+        every = [
+            (np.arange(len(rows.sample_view)) + first, rows.sample_view, rows.sample_modification, rows.sample_pass)
+            for first, rows in known.plans
+        ]
+        row, view, modification, pass_ = (np.concatenate(columns) for columns in zip(*every, strict=True))
+        used = view != UNUSED
+        view_row, first, of_sample = np.unique(view[used], return_index=True, return_inverse=True)
+        next_pass = np.zeros(len(view_row), np.int64)
+        np.maximum.at(next_pass, of_sample, pass_[used] + 1)
+        passes = np.bincount(of_sample, minlength=len(view_row))
+        return cls(spec, known, row[used], view[used], view_row, modification[used][first], passes, next_pass)
+
+    def modification_keys(self, views: Rows | Mask) -> list[Key]:
+        """The content key of the configuration of each of some views, by their places here."""
+        rows, of_view = np.unique(self.modification_row[views], return_inverse=True)
+        keys = modification_keys(self.spec.radiance_id, self.known.vectors("modification", rows))
+        return [keys[m] for m in of_view.tolist()]
+
+    def view_keys(self, views: Rows | Mask) -> list[Key]:
+        """The content key of each of some views, by their places here."""
+        return view_keys(self.modification_keys(views), self.known.vectors("view", self.view_row[views]))
+
+
+# ---------------------------------------------------------------------------------------------------------- conditions
+
+
+def _selected(planned: PlannedViews, where: Sequence[str]) -> Mask:
+    """Which of the views meet every condition; `views=first:N` counts those that meet all the others."""
+    selected = np.ones(len(planned.view_row), np.bool_)
+    parsed = [_parsed(condition) for condition in where]
+    for find, value in sorted(parsed, key=lambda condition: condition[0] is _first):  # that one last
+        selected &= find(planned, value, selected)
+    if not selected.any():
+        raise SpecError(f"where {' and '.join(where)}: selects none of the {len(selected)} planned views")
+    return selected
+
+
+def _first(planned: PlannedViews, count: int, selected: Mask) -> Mask:  # noqa: ARG001
+    return np.cumsum(selected) <= count
+
+
+def _of_plan(planned: PlannedViews, number: int, selected: Mask) -> Mask:  # noqa: ARG001
+    if number >= len(planned.known.plans):
+        raise SpecError(f"where plan={number}: the scene has {len(planned.known.plans)} plans, numbered from 0")
+    first, rows = planned.known.plans[number]
+    return np.isin(planned.view_row, rows.sample_view[rows.sample_view >= first])
+
+
+def _of_rows(planned: PlannedViews, ends: tuple[int, int], selected: Mask) -> Mask:  # noqa: ARG001
+    shown = planned.sample_view[(planned.sample_row >= ends[0]) & (planned.sample_row <= ends[1])]
+    return np.isin(planned.view_row, shown)
+
+
+def _with_modification(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
+    keys = planned.modification_keys(selected)
+    return _where(selected, [key.hex().startswith(begin) for key in keys])
+
+
+def _with_view(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
+    return _where(selected, [key.hex().startswith(begin) for key in planned.view_keys(selected)])
+
+
+def _held_out(planned: PlannedViews, share: float, selected: Mask) -> Mask:
+    return _where(selected, rows_held_out(planned, selected, share))
+
+
+def _where(selected: Mask, found: list[bool]) -> Mask:
+    mask = np.zeros_like(selected)
+    mask[selected] = found
+    return mask
+
+
+Condition = tuple[Callable[[PlannedViews, Any, Mask], Mask], Any]
+
+
+def _parsed(condition: str) -> Condition:
+    """The function that selects the views of a condition, and its argument; raises SpecError for an unknown one."""
+    match condition.split("="):
+        case ["views", value] if re.fullmatch(r"first:[1-9]\d{0,8}", value):
+            return _first, int(value.removeprefix("first:"))
+        case ["plan", value] if re.fullmatch(r"\d{1,6}", value):
+            return _of_plan, int(value)
+        case ["rows", value] if ends := re.fullmatch(r"(\d{1,12})(?:-(\d{1,12}))?", value):
+            return _of_rows, (int(ends[1]), int(ends[2] or ends[1]))
+        case ["modification", value] if re.fullmatch(r"[0-9a-f]{1,32}", value):
+            return _with_modification, value
+        case ["view", value] if re.fullmatch(r"[0-9a-f]{1,32}", value):
+            return _with_view, value
+        case ["modification" | "view" as kind, value]:
+            raise SpecError(
+                f"where {condition!r}: {value!r} is no content key of a {kind}, nor how one begins: 1 to 32 "
+                "hexadecimal digits, a to f in lower case"
+            )
+        case ["held-out"]:
+            return _held_out, HOLD_OUT
+        case ["held-out", value] if _A_SHARE.fullmatch(value) and 0 < float(value) < 1:
+            return _held_out, float(value)
+    raise SpecError(
+        f"where {condition!r}: is no condition; allowed are views=first:N, view=KEY, modification=KEY, rows=A-B, "
+        "plan=P, held-out and held-out=SHARE"
+    )

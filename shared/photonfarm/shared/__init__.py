@@ -1,1 +1,0 @@
-"""What every service of photonfarm agrees on: specs, sampling, keys, plans, and the store."""

@@ -1,0 +1,237 @@
+"""The check of stored values: images and views that are certainly or probably wrong, of one sample and of all together.
+
+Shape letters: H W image, P pixels, T tests.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from math import log, sqrt
+from typing import Any
+
+import numpy as np
+from awscrt.checksums import crc32c  # type: ignore[import-untyped]
+from numpy.typing import NDArray
+
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
+from photonfarm.store.format.schema import bit_counts
+from photonfarm.store.write.findings import Cause
+
+_FLOAT = {2: (np.uint16, 0x7FFF, 0x7C00), 4: (np.uint32, 0x7FFFFFFF, 0x7F800000)}
+"""The integer type, the mask of the magnitude and the magnitude of infinity, by the bytes of a float."""
+
+
+BLOCKS = 8
+"""Blocks along each side of an image, whose sides are multiples of 8."""
+
+SIGNIFICANCE = 1e-6
+"""The largest probability of reporting different halves in a store without a fault, over all tests of a check."""
+
+
+@dataclass(frozen=True, slots=True)
+class HalvesResult:
+    """Whether A and B are distributed alike."""
+
+    samples: int
+    statistic: float  # the largest |S| over all blocks and the whole image
+    limit: float  # what |S| reaches by chance with probability SIGNIFICANCE at most, over all tests together
+    where: str  # the block of the largest |S|, or the whole image
+    difference: float  # mean over the samples of (A − B) / (A + B) of whole images
+    standard_error: float  # of `difference`; 0 for a single sample
+    allowed: float  # how far `difference` may be from 0 by chance, as `statistic` may be up to `limit`
+
+    @property
+    def passed(self) -> bool:
+        """Whether nothing differs by more than chance allows."""
+        return self.statistic < self.limit
+
+    @property
+    def is_conclusive(self) -> bool:
+        """Whether there are enough samples for a difference to show: |S| is √n at most."""
+        return sqrt(self.samples) >= self.limit
+
+
+class HalvesTest:
+    """A sign-symmetry test between A and B for each block and for the whole image; takes one sample at a time.
+
+    If A and B are independent and distributed alike, as they are whatever the scene, then d = (a − b) / (a + b) of
+    their means over a block is as likely as −d, for each sample by itself. So S = Σd / √Σd² exceeds x in absolute value
+    with a probability of at most 2·exp(−x²/2) (Hoeffding's inequality for the random signs, given all |d|; Efron,
+    "Student's t-test under symmetry conditions", 1969). That is exact for any number of samples and whatever their
+    noise, where a z-test of so many samples would need their mean's error to be normal, which fireflies forbid. The
+    price: |S| ≤ √n, so that no fewer than `limit`² samples can fail (about 40). Bonferroni's correction for T tests.
+    """
+
+    def __init__(self, scenes: int = 1) -> None:
+        """Begin without samples; the significance is shared with the tests of other scenes."""
+        self._tests = scenes * (BLOCKS * BLOCKS + 1)
+        self._samples = 0
+        self._sum, self._squares = np.zeros((2, BLOCKS * BLOCKS + 1))
+
+    def add(self, halves: NDArray[Any]) -> None:
+        """Add a sample, (2, H, W, 3) of any float type and scale; samples that are not finite count as equal halves."""
+        _, height, width, _ = halves.shape
+        wide = halves.astype(np.float32 if halves.dtype == np.float16 else np.float64)
+        rows = wide.reshape(2, BLOCKS, height // BLOCKS, width * 3).sum(axis=2)
+        blocks = rows.reshape(2, BLOCKS * BLOCKS, -1).sum(axis=2, dtype=np.float64)
+        a, b = np.concatenate([blocks, blocks.sum(axis=1, keepdims=True)], axis=1)
+        size = np.abs(a) + np.abs(b)
+        d = np.divide(a - b, size, out=np.zeros_like(size), where=(size > 0) & np.isfinite(size))
+        self._samples += 1
+        self._sum += d
+        self._squares += d**2
+
+    def merge(self, other: HalvesTest) -> None:
+        """Add the samples of another test of the same scene."""
+        self._samples += other._samples
+        self._sum += other._sum
+        self._squares += other._squares
+
+    def result(self) -> HalvesResult | None:
+        """The test over all samples added; None if there are none."""
+        n = self._samples
+        if not n:
+            return None
+        s = np.divide(self._sum, np.sqrt(self._squares), out=np.zeros_like(self._sum), where=self._squares > 0)
+        place = int(np.argmax(np.abs(s)))
+        y, x = divmod(place, BLOCKS)
+        where = "the whole image" if place == BLOCKS * BLOCKS else f"block x {x}, y {y} of {BLOCKS} × {BLOCKS}"
+        mean = float(self._sum[-1] / n)
+        variance = max(float(self._squares[-1] / n) - mean**2, 0.0)
+        error = sqrt(variance / (n - 1)) if n > 1 else 0.0
+        limit = sqrt(2 * log(2 * self._tests / SIGNIFICANCE))
+        allowed = limit * sqrt(float(self._squares[-1])) / n
+        return HalvesResult(n, float(abs(s[place])), limit, where, mean, error, allowed)
+
+
+class Fingerprints:
+    """Finds halves that may be equal among all samples, by 64 bits of each: 32 bytes a sample."""
+
+    def __init__(self) -> None:
+        self._prints, self._rows = array("Q"), array("q")
+
+    def add(self, row: int, half: NDArray[Any]) -> int:
+        """Add one half of a sample, contiguous; returns its fingerprint: CRC-32C of the first and the second part."""
+        content = np.ravel(half).view(np.uint8)
+        middle = len(content) // 2
+        fingerprint = int(crc32c(content[:middle])) << 32 | int(crc32c(content[middle:]))
+        self._prints.append(fingerprint)
+        self._rows.append(row)
+        return fingerprint
+
+    def merge(self, other: Fingerprints) -> None:
+        """Add the halves of other samples."""
+        self._prints.extend(other._prints)
+        self._rows.extend(other._rows)
+
+    def suspects(self) -> Iterator[list[int]]:
+        """The rows of two or more samples whose halves have equal fingerprints, once for each fingerprint."""
+        prints, rows = np.array(self._prints, np.uint64), np.array(self._rows, np.int64)
+        order = np.argsort(prints, kind="stable")
+        prints, rows = prints[order], rows[order]
+        begin = np.flatnonzero(np.concatenate([[True], prints[1:] != prints[:-1]])) if len(prints) else prints[:0]
+        end = np.append(begin[1:], len(prints))
+        for i in np.flatnonzero(end - begin > 1):
+            distinct = np.unique(rows[begin[i] : end[i]])
+            if len(distinct) > 1:
+                yield distinct.tolist()
+
+
+@dataclass(slots=True)
+class CheckTotals:
+    """Totals over the jobs of a scene."""
+
+    halves: HalvesTest
+    fingerprints: Fingerprints = field(default_factory=Fingerprints)
+    jobs: int = 0
+    samples: int = 0
+    size_bytes: int = 0
+    hit_pixels: int = 0  # first hits, of all views
+    back_facing_pixels: int = 0  # of these, seen from behind
+
+    def add(self, other: CheckTotals) -> None:
+        """Add the totals of other jobs of the scene."""
+        self.halves.merge(other.halves)
+        self.fingerprints.merge(other.fingerprints)
+        for name in ("jobs", "samples", "size_bytes", "hit_pixels", "back_facing_pixels"):
+            setattr(self, name, getattr(self, name) + getattr(other, name))
+
+
+class ContentCheck:
+    """Checks the rows of a scene, one after the other; yields each finding as a cause and a detail."""
+
+    def __init__(self, spec: SceneSpec) -> None:
+        self._spec = spec
+        self._rays: NDArray[np.float32] | None = None
+
+    def radiance(self, row: int, halves: NDArray[Any], totals: CheckTotals) -> Iterator[tuple[Cause, str]]:
+        """Check the halves of a sample, (2, H, W, 3), whose values are finite and scaled as they are stored."""
+        totals.samples += 1
+        totals.halves.add(halves)
+        black = [half for half, values in zip("AB", halves, strict=True) if not largest(values)]
+        prints = [totals.fingerprints.add(row, values) for values in halves if largest(values)]
+        if not prints:
+            yield Cause.BLACK, "all zero"
+        elif black:
+            yield Cause.BLACK_HALF, f"{black[0]} is all zero"
+        elif prints[0] == prints[-1] and np.array_equal(*halves) and not is_constant(halves[0]):
+            yield Cause.EQUAL_HALVES, "A = B in every pixel"
+
+    def view(
+        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, totals: CheckTotals
+    ) -> Iterator[tuple[Cause, str]]:
+        """Check the buffers of a view: depth (H, W) and the modelled normals (H, W, 3).
+
+        Normals are not turned to the camera, so the inside of a box or the back of a leaf is rightly seen from behind.
+        Views from inside an object are allowed too. So such pixels are only counted, and a view is reported only if it
+        shows nothing else.
+        """
+        hit = depth > 0
+        hits = int(np.count_nonzero(hit))
+        if not hits:
+            yield Cause.EMPTY_VIEW, "depth is 0 in every pixel"
+        elif view is not None:
+            behind = int(np.count_nonzero((self._cosine(normal, view) > 0) & hit.reshape(-1)))
+            totals.hit_pixels += hits
+            totals.back_facing_pixels += behind
+            if behind == hits:
+                yield Cause.BACK_FACING, f"all {hits} pixels that meet something"
+
+    def bits(self, name: str, packed: NDArray[np.uint8]) -> Iterator[tuple[Cause, str]]:
+        """Check the stored bits of which points or photons a view sees: `point_seen` or `photon_seen`."""
+        count = bit_counts(self._spec)[name]
+        if count % 8 and packed[-1] >> count % 8:
+            yield Cause.UNUSED_BIT, f"{name} has a bit above those of {count}"
+
+    def _cosine(self, normal: NDArray[Any], view: View) -> NDArray[np.float32]:
+        """The cosine between each pixel's normal and the ray through its centre, (P,): positive where seen from behind.
+
+        It is computed in the camera's axes, in which the rays are the same for every view.
+        """
+        camera = Camera.of(view, self._spec)
+        if self._rays is None:
+            x, y, z = np.eye(3)
+            rays = replace(camera, right=x, down=y, forward=z).rays()
+            self._rays = np.ascontiguousarray(rays.reshape(-1, 3).T)  # (3, P)
+        axes = camera.world_to_camera[:, :3].astype(np.float32)
+        cosine: NDArray[np.float32] = (axes @ normal.reshape(-1, 3).astype(np.float32).T * self._rays).sum(axis=0)
+        return cosine
+
+
+def is_constant(half: NDArray[Any]) -> bool:
+    """Whether all pixels of an image (H, W, 3) are equal: it then has no noise, and does not depend on the seed."""
+    return bool((half == half[0, 0]).all())
+
+
+def is_finite(values: NDArray[Any]) -> bool:
+    """Whether no value of an array of floats is NaN or infinite."""
+    return largest(values) < _FLOAT[values.dtype.itemsize][2]
+
+
+def largest(values: NDArray[Any]) -> int:
+    """The bits of the largest magnitude in an array of floats, 0 if all are zero; NaN is above infinity."""
+    bits, magnitude, _ = _FLOAT[values.dtype.itemsize]
+    return int((values.view(bits) & bits(magnitude)).max())

@@ -1,0 +1,327 @@
+"""`photonfarm store find`: samples by their content (modification, view, keys), or by row and job.
+
+Shape letters: R rows of a scene, N rows that match, G movable groups.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.core.errors import CorruptError, SpecError, StoreError
+from photonfarm.core.keys import Key, view_key
+from photonfarm.core.records import F32
+from photonfarm.plan.request import UNUSED
+from photonfarm.scene.modification import modification_keys
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import view_keys
+from photonfarm.store.format import schema
+from photonfarm.store.format.shards import Shard
+from photonfarm.store.io.storage import renew_copy
+from photonfarm.store.read.other_scenes import scene_of, told_apart
+from photonfarm.store.write import plans
+from photonfarm.store.write.plans import StoredPlan
+from photonfarm.store.write.scene_store import SceneStore
+from photonfarm.store.write.store import Store
+
+_KEY = re.compile(r"[0-9a-fA-F]{32}")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Query:
+    """The conditions on samples; None stands for any value."""
+
+    modification: F32 | Key | None = None  # a vector (4·G,) or (G, 4), or a content key
+    view: F32 | Key | None = None  # a vector (6,), or a content key, which implies the modification
+    sample: Key | None = None
+    row: int | None = None
+    job: int | None = None
+    tolerance: float = 1e-3  # of positions, in scene units; 0: equal bit by bit
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        modification: str | None = None,
+        view: str | None = None,
+        sample: str | None = None,
+        row: int | None = None,
+        job: int | None = None,
+        tolerance: float = 1e-3,
+    ) -> Query:
+        """The query of the command line's options; raises SpecError for text that is neither key nor vector."""
+        if sample is not None and not _KEY.fullmatch(sample):
+            raise SpecError(f"--sample {sample!r}: a key of 32 hexadecimal digits is required")
+        return cls(
+            _vector_or_key("--modification", modification, 4),
+            _vector_or_key("--view", view, 6),
+            None if sample is None else bytes.fromhex(sample),
+            row, job, tolerance,
+        )  # fmt: skip
+
+
+def _vector_or_key(option: str, text: str | None, multiple: int) -> F32 | Key | None:
+    if text is None:
+        return None
+    if _KEY.fullmatch(text.strip()):
+        return bytes.fromhex(text.strip())
+    words = text.replace(",", " ").replace("[", " ").replace("]", " ").split()
+    try:
+        vector = np.array([float(word) for word in words], np.float32)
+    except ValueError as error:
+        raise SpecError(f"{option} {text!r}: neither a key of 32 hexadecimal digits nor numbers") from error
+    if len(vector) % multiple or not np.isfinite(vector).all() or (multiple == 6 and len(vector) != 6):
+        rule = "six finite ones" if multiple == 6 else "four finite ones for each movable group"
+        raise SpecError(f"{option}: has {len(vector)} numbers; {rule} are required")
+    return vector
+
+
+__all__ = ["FoundSample", "Matches", "Place", "Query", "find_samples", "scene_named", "scene_or_spec"]
+
+
+@dataclass(frozen=True, slots=True)
+class Matches:
+    """The result of a search."""
+
+    count: int
+    samples: tuple[FoundSample, ...]  # the nearest, then by scene and row
+    nearest: float | None  # distance of the nearest sample, even if too far; None if there are no samples
+
+
+def scene_named(store: Store, text: str) -> str:
+    """The id of a scene, given its id, the beginning of its id, or its name; StoreError unless exactly one fits."""
+    ids = store.scene_ids()
+    found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
+    found = found or [each for each in ids if _name(store, each) == text]
+    if len(found) > 1 and all(_name(store, each) == text for each in found):
+        apart = told_apart(store, found)
+        raise StoreError(f"{store.storage.where}: {len(found)} scenes have the name {text!r}: {apart}; give an id")
+    if len(found) != 1:
+        held = f"{len(found)} scenes have" if found else "no scene has"
+        each_named = ", ".join(f"{each} ({_name(store, each) or 'unreadable'})" for each in found or ids)
+        known = f"give one of the ids {each_named}" if ids else "the store has no scenes yet"
+        raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
+    return found[0]
+
+
+def is_spec_file(named: str) -> bool:
+    """Whether a user names a scene by a spec's file, and not by its name or id."""
+    return Path(named).suffix in (".toml", ".json")
+
+
+def scene_or_spec(store: Store, named: str) -> SceneStore:
+    """The scene that a user names by a spec's file, or as `scene_named` takes it.
+
+    Raises StoreError, which names the scenes that are there and how one of the spec's name differs from it, and
+    SpecError for a file that is no spec.
+    """
+    return store.scene(scene_of(store, named, load_spec(named)) if is_spec_file(named) else scene_named(store, named))
+
+
+def _name(store: Store, scene_id: str) -> str | None:
+    """The name of a scene; None if its spec is unreadable: then it has to be named by its id."""
+    try:
+        return store.scene(scene_id).spec.name
+    except StoreError:
+        return None
+
+
+def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit: int = 20) -> Matches:
+    """The samples of some scenes that match a query, described for the first `limit` of them.
+
+    A scene whose number of movable groups differs from the query's vector has no match. Raises StoreError.
+    """
+    found = [(index, SceneMatch(store.scene(scene_id), query)) for index, scene_id in enumerate(scene_ids)]
+    order = sorted(
+        ((float(d), index, int(row), match) for index, match in found
+         for row, d in zip(match.rows[:limit], match.distance[:limit], strict=True)),
+        key=lambda entry: entry[:3],
+    )  # fmt: skip
+    nearest = [match.nearest for _, match in found if match.nearest is not None]
+    described = tuple(match.describe(row, distance) for distance, _, row, match in order[:limit])
+    return Matches(sum(len(match.rows) for _, match in found), described, min(nearest, default=None))
+
+
+F64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """The place of a row of an array in the store."""
+
+    array: str
+    file: str  # its name in the store
+    chunk: int  # the inner chunk of that shard
+    index: int  # along the first axis of the plan's array
+    there: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSample:
+    """A sample and everything known of it without reading its arrays."""
+
+    scene_id: str
+    scene_name: str
+    key: str
+    row: int
+    pass_: int
+    modification_row: int
+    modification_key: str
+    modification: tuple[tuple[float, ...], ...]  # G times x, y, z, present
+    view_row: int
+    view_key: str
+    view: tuple[float, ...]  # camera position, look-at point
+    distance: float  # of the queried positions, the farthest, in scene units
+    plan: int
+    jobs: tuple[int, ...]  # of its own row, its view's and its modification's
+    committed: tuple[bool, ...]  # these jobs
+    places: tuple[Place, ...]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all of its jobs are committed."""
+        return all(self.committed)
+
+
+class SceneMatch:
+    """The samples of one scene that match a query: their rows (N,), nearest first, and their distances (N,)."""
+
+    rows: NDArray[np.int64]
+    distance: F64
+
+    def __init__(self, scene: SceneStore, query: Query) -> None:
+        """Search all inputs of the plans at once."""
+        self._scene = scene
+        self._plans = scene.plans()
+        self._committed: set[int] | None = None
+        self.nearest: float | None = None  # distance of the nearest, even if too far
+        self.rows, self.distance = np.zeros(0, np.int64), np.zeros(0)
+        if self._plans:
+            self._look(query)
+
+    def _look(self, query: Query) -> None:
+        modification, view = (_inputs(self._plans, f"sample_{name}") for name in ("modification", "view"))
+        rows = np.flatnonzero(modification != UNUSED)
+        if query.row is not None:
+            rows = rows[rows == query.row]
+        if query.job is not None:
+            rows = rows[rows // self._plans[0].shard_rows == query.job]
+        if query.sample is not None:
+            wanted = np.frombuffer(query.sample, "<u8")
+            rows = rows[(_inputs(self._plans, "sample_key")[rows].view("<u8") == wanted).all(axis=1)]
+        distance = np.zeros(len(rows))
+        for condition, references, of_row in (
+            (query.modification, modification, self._from_modification),
+            (query.view, view, self._from_view),
+        ):
+            if condition is not None and len(rows):
+                distinct, place = np.unique(references[rows], return_inverse=True)
+                distance = np.maximum(distance, of_row(distinct, condition, modification, view)[place])
+        if np.isfinite(distance).any():
+            self.nearest = float(distance.min())
+        fits = distance <= query.tolerance
+        order = np.argsort(distance[fits], kind="stable")
+        self.rows, self.distance = rows[fits][order], distance[fits][order]
+
+    def _from_modification(self, rows: NDArray[np.int64], wanted: F32 | Key, *_: NDArray[np.int64]) -> F64:
+        """The distances of the modifications in some rows from the wanted one; infinite if other groups are present."""
+        vectors = _inputs(self._plans, "modification")[rows]
+        if isinstance(wanted, bytes):
+            return _unless_equal(modification_keys(self._scene.spec.radiance_id, vectors), wanted)
+        if wanted.size != vectors[0].size:
+            return np.full(len(rows), np.inf)
+        target = wanted.reshape(vectors.shape[1:])
+        distance = np.linalg.norm(vectors[..., :3].astype(np.float64) - target[:, :3], axis=-1).max(axis=1, initial=0)
+        return np.where(((vectors[..., 3] != 0) == (target[:, 3] != 0)).all(axis=1), distance, np.inf)
+
+    def _from_view(
+        self, rows: NDArray[np.int64], wanted: F32 | Key, modification: NDArray[np.int64], view: NDArray[np.int64]
+    ) -> F64:
+        """The distances of the views in some rows from the wanted one: the larger of position and look-at point."""
+        vectors = _inputs(self._plans, "view")[rows]
+        if not isinstance(wanted, bytes):
+            apart = (vectors.astype(np.float64) - wanted).reshape(-1, 2, 3)
+            return np.asarray(np.linalg.norm(apart, axis=-1).max(axis=1))
+        seen, first = np.unique(view, return_index=True)  # by some sample
+        of_view = _inputs(self._plans, "modification")[modification[first[np.searchsorted(seen, rows)]]]
+        keys = modification_keys(self._scene.spec.radiance_id, of_view)
+        return _unless_equal(view_keys(keys, vectors), wanted)
+
+    # ------------------------------------------------------------------------------------------------------- describing
+
+    def describe(self, row: int, distance: float) -> FoundSample:
+        """Everything known of the sample in a row."""
+        sample = plans.sample_at(self._plans, row)
+        if sample is None:
+            raise StoreError(f"row {row} of scene {self._scene.scene_id} is not used")
+        if self._committed is None:
+            self._committed = self._scene.committed_jobs()
+        modification = plans.modification_at(self._plans, sample.modification_row)
+        view = plans.view_at(self._plans, sample.view_row)
+        key = modification.key(self._scene.spec.radiance_id)
+        plan = plans.plan_of(self._plans, row)
+        rows = {"sample": row, "view": sample.view_row, "modification": sample.modification_row}
+        jobs = tuple(each // plan.shard_rows for each in rows.values())
+        return FoundSample(
+            scene_id=self._scene.scene_id,
+            scene_name=self._scene.spec.name,
+            key=sample.key.hex(),
+            row=row,
+            pass_=sample.pass_,
+            modification_row=sample.modification_row,
+            modification_key=key.hex(),
+            modification=tuple(tuple(map(float, group)) for group in modification.vector),
+            view_row=sample.view_row,
+            view_key=view_key(key, view.vector).hex(),
+            view=tuple(map(float, view.vector)),
+            distance=distance,
+            plan=plan.number,
+            jobs=jobs,
+            committed=tuple(job in self._committed for job in jobs),
+            places=tuple(self._places(rows)),
+        )
+
+    def _places(self, rows: dict[str, int]) -> list[Place]:
+        found = []
+        for name, array in schema.output_arrays(self._scene.spec).items():
+            row = rows[array.kind]
+            place = self._place(plans.plan_of(self._plans, row), name, array, row)
+            if place.there or name != "radiance_wide":  # few samples need that one
+                found.append(place)
+        if any(place.array == "radiance_wide" for place in found):  # and those have nothing in `radiance`
+            found = [place for place in found if place.array != "radiance" or place.there]
+        return found
+
+    def _place(self, plan: StoredPlan, name: str, array: schema.ArraySchema, row: int) -> Place:
+        job, chunk = divmod(row, plan.shard_rows)
+        file = plan.shard(name, array, job)
+        return Place(name, file, chunk, row - plan.first_row, self._is_there(file, array, chunk, plan.shard_rows))
+
+    def _is_there(self, file: str, array: schema.ArraySchema, chunk: int, shard_rows: int) -> bool:
+        storage = self._scene.storage
+        if not storage.exists(file):
+            return False
+        try:
+            return chunk in Shard(storage.local(file), array, shard_rows)
+        except CorruptError:
+            if not renew_copy(storage, file):
+                return False
+        try:
+            return chunk in Shard(storage.local(file), array, shard_rows)
+        except CorruptError:
+            return False
+
+
+def _inputs(found: list[StoredPlan], name: str) -> NDArray[Any]:
+    """One input of all rows of a scene, (R, …)."""
+    return np.concatenate([getattr(plan.rows, name) for plan in found])
+
+
+def _unless_equal(keys: Sequence[Key], wanted: Key) -> F64:
+    return np.where([key == wanted for key in keys], 0.0, np.inf)

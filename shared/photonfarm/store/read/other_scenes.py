@@ -1,0 +1,102 @@
+"""What to say where a store does not have the scene of a spec: which scenes it has, and how they differ."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from photonfarm.core.errors import StoreError
+from photonfarm.core.models import differing
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store.write.scene_store import SceneStore, held
+from photonfarm.store.write.store import Store
+
+FEW = 4
+"""Up to so many differing keys are named."""
+
+FILES = "the scene's files"
+"""What the digest `content` is of."""
+
+
+def scene_of(store: Store, name: str, spec: SceneSpec) -> str:
+    """The id of a spec's scene, which the store holds; StoreError if it does not. `name` is the spec's for its user."""
+    if not store.has_scene(spec.scene_id):
+        where = store.storage.where
+        raise StoreError(f"{where}: holds no samples of {name} (scene {spec.scene_id}); {other_scenes(store, spec)}")
+    return spec.scene_id
+
+
+def other_scenes(store: Store, spec: SceneSpec) -> str:
+    """The scenes that a store has, in words, and where one of the spec's name differs from it."""
+    nearest, others = _alike(store, spec)
+    if nearest is None:
+        return held(store.storage)
+    more = f"; {others} more have this name" if others else ""
+    return f"scene {nearest.scene_id} of this name is there and differs in {differences(nearest.spec, spec)}{more}"
+
+
+def first_plan_note(store: Store, spec: SceneSpec) -> str | None:
+    """What to say of a scene's first plan where the store has another scene of this name; None where it has none."""
+    nearest, _ = _alike(store, spec)
+    if nearest is None:
+        return None
+    differ = differences(nearest.spec, spec)
+    return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {samples_of(nearest)}"
+
+
+def with_same_radiance(store: Store, spec: SceneSpec) -> str | None:
+    """The id of the other scene that has most complete samples of the same radiance id; None without one."""
+
+    def complete(scene: SceneStore) -> int:
+        alike = scene.spec.radiance_id == spec.radiance_id and scene.scene_id != spec.scene_id
+        return scene.progress().committed_samples if alike else 0
+
+    counted, _ = store.each(complete)
+    best = max(counted, key=lambda scene_id: counted[scene_id], default=None)
+    return best if best and counted[best] else None
+
+
+def told_apart(store: Store, scene_ids: Sequence[str]) -> str:
+    """Scenes of one name in words: how many samples each has, and how it differs from the first."""
+    first, *others = [store.scene(each) for each in scene_ids]
+    said = [f"{first.scene_id} ({samples_of(first)})"]
+    said += [f"{each.scene_id} ({samples_of(each)}; {differences(first.spec, each.spec)} differ)" for each in others]
+    return ", ".join(said)
+
+
+def samples_of(scene: SceneStore) -> str:
+    """How many samples of a scene are complete, in words."""
+    try:
+        found = scene.progress()
+    except StoreError:
+        return "its plans cannot be read"
+    return f"{found.committed_samples} of {found.planned_samples} samples complete"
+
+
+def differences(there: SceneSpec, here: SceneSpec) -> str:
+    """Where two specs differ in what ids cover, in words."""
+    changes = differing(there.identity(), here.identity())
+    few = list(changes.items())[:FEW]
+    more = f" and {len(changes) - len(few)} more" if len(changes) > len(few) else ""
+    return (
+        ", ".join(
+            FILES if key == "content" else f"{key} ({_said(a)} in the store, {_said(b)} asked for)"
+            for key, (a, b) in few
+        )
+        + more
+    )
+
+
+def _alike(store: Store, spec: SceneSpec) -> tuple[SceneStore | None, int]:
+    """The other scene of a spec's name that differs least from it, and how many more there are."""
+    there, _ = store.each(lambda scene: scene)
+    alike = [each for each in there.values() if each.spec.name == spec.name and each.scene_id != spec.scene_id]
+    if not alike:
+        return None, 0
+    return min(alike, key=lambda each: len(differing(each.spec.identity(), spec.identity()))), len(alike) - 1
+
+
+def _said(value: object) -> str:
+    if value is None:
+        return "not"
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 40 else f"{text[:39]}…"

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.rooms import Room
-from photonfarm.trainer.compare.comparison import markdown_table
+from photonfarm.core.formatting import format_markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -125,7 +125,7 @@ def table(rooms: Sequence[Room]) -> str:
         for ours in placed(room, OURS):
             line = [room.name, ours.name, f"{ours.milliseconds:.0f}", f"{ours.mse:.5f}"]
             lines.append([*line, *(_against(ours, family(room, begins)) for begins in FAMILIES)])
-    return markdown_table(head, lines)
+    return format_markdown_table(head, lines)
 
 
 def _against(ours: Placed, members: Sequence[Placed]) -> str:

@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its
 from experiments.experiment import HERE, Experiment
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.pictures import Picture
-from photonfarm.trainer.compare.comparison import COMPARISON, GAP, LINE
+from photonfarm.trainer.compare.evaluation_page import COMPARISON, GAP, LINE
 from photonfarm.trainer.predict.animation import read_png, write_png
 from photonfarm.trainer.report.views import OVERVIEW, coloured
 from photonfarm.trainer.report.worst_cases import caption as worst_view

@@ -11,8 +11,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from experiments.rooms import Room, estimate
+from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.contents import Published, PublishedTable
@@ -137,7 +137,7 @@ def _table(rooms: Sequence[Room], published: PublishedTable, columns: Sequence[C
         head.append(column.head)
         if published and column.theirs:
             head.append(f"paper: {column.head.removesuffix(' (95 %)')}")
-    return markdown_table(head, [_line(rooms, name, published, columns) for name in _row_names(rooms)])
+    return format_markdown_table(head, [_line(rooms, name, published, columns) for name in _row_names(rooms)])
 
 
 def _line(rooms: Sequence[Room], name: str, published: PublishedTable, columns: Sequence[Column]) -> list[str]:
@@ -175,7 +175,7 @@ def order_table(rooms: Sequence[Room], published: PublishedTable) -> str:
             theirs = f"{share:+.0%} {sign(share)}"
         paper = [theirs] if published else []
         lines.append([f"`{first}` − `{second}`", *paper, *(gap(room, first, second) for room in rooms)])
-    return markdown_table(head, lines)
+    return format_markdown_table(head, lines)
 
 
 def gap(room: Room, first: str, second: str) -> str:

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Callable, Sequence
 
 from experiments.rooms import Room
-from photonfarm.trainer.compare.comparison import markdown_table
+from photonfarm.core.formatting import format_markdown_table
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 
 WIDTH = 120  # characters of a line
@@ -19,7 +19,7 @@ def room_table(rooms: Sequence[Room]) -> str:
         "experiment", "images trained on", "held out", "spp", "references", "noise of targets, linear MSE",
         "connections", "light ratio", "light samples",
     )  # fmt: skip
-    return markdown_table(head, [_rendered(room) for room in rooms])
+    return format_markdown_table(head, [_rendered(room) for room in rooms])
 
 
 def _rendered(room: Room) -> list[str]:
@@ -41,7 +41,7 @@ def cost_table(rooms: Sequence[Room]) -> str:
         "experiment", "images, core-s", "reference passes", "passes, core-s", "MB in all", "edit, ms",
         "load average of 1, 5, 15 min",
     )  # fmt: skip
-    return markdown_table(head, [_cost(room) for room in rooms])
+    return format_markdown_table(head, [_cost(room) for room in rooms])
 
 
 def _cost(room: Room) -> list[str]:

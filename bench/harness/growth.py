@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from photonfarm.trainer.metrics.intervals import t_975
+from photonfarm.trainer.metrics.image_metrics import t_975
 
 FLAT = 1.5
 """A cost that does not even grow by this factor over all sizes counts as constant."""

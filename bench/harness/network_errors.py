@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.keys import Key
 from photonfarm.core.statistics import Estimate, group_means
-from photonfarm.trainer.metrics.intervals import t_975
+from photonfarm.trainer.metrics.image_metrics import t_975
 
 F64 = NDArray[np.float64]
 

@@ -33,10 +33,10 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
+from photonfarm.trainer.data.batch_stream import RoundSampler
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.data.sampler import RoundSampler
 from photonfarm.trainer.dry_run.made_up import MadeUpScene
-from photonfarm.trainer.metrics.intervals import confidence_interval
+from photonfarm.trainer.metrics.image_metrics import confidence_interval
 from photonfarm.trainer.networks import image_of
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.settings import Precision, TrainSettings, preset

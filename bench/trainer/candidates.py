@@ -14,12 +14,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.guided import Guided
-from photonfarm.trainer.networks.inputs import Inputs, Needs
-from photonfarm.trainer.networks.light_transport import LightTransport
+from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame
 from photonfarm.trainer.networks.lit_points import HIDDEN, OCTAVES, LearnedVisibility, LitPoints
-from photonfarm.trainer.networks.point_layers import WIDTH
+from photonfarm.trainer.networks.paper_networks import WIDTH, LightTransport
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 SURFACE = 6 + 6 * OCTAVES

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bench.harness import results
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.optimisers import build_optimiser
+from photonfarm.trainer.training.learner import build_optimiser
 
 MEAN = 0.9
 COUNTS = (4, 16, 256)  # samples a target

@@ -29,6 +29,7 @@ from pydantic import ValidationError
 
 from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
 from photonfarm.core.files import write_whole
+from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.keys import Key, make_key
 from photonfarm.core.models import sentences
 from photonfarm.core.processes import Stop
@@ -38,7 +39,6 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.cli.train_verb import by_key
 from photonfarm.trainer.cli.train_verb import train as train_verb
-from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
 from photonfarm.trainer.predict.trained import TrainedRun
@@ -135,7 +135,7 @@ def table(cells: Sequence[Cell]) -> str:
         behind = _stated(cell.behind(ranked[0])) if cell.per_unit and cell is not ranked[0] else ""
         picked = stated(cell.rank, None) if cell.picked_by else ""
         rows.append([*map(str, cell.changes.values()), picked, _stated(cell.error), behind])
-    return markdown_table([*keys, "picked by", "held-out error", "more than the best"], rows)
+    return format_markdown_table([*keys, "picked by", "held-out error", "more than the best"], rows)
 
 
 def _cells(settings: TrainSettings, axes: Axes) -> list[tuple[dict[str, Any], TrainSettings]]:

@@ -34,10 +34,10 @@ from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES
 from photonfarm.trainer.networks.inputs import Inputs
-from photonfarm.trainer.networks.light_transport import LightTransportPhotons
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs import metrics_log
-from photonfarm.trainer.runs.device import usable_device
+from photonfarm.trainer.networks.paper_networks import LightTransportPhotons
+from photonfarm.trainer.runs import run_folder
+from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.runs.settings import TrainSettings, preset
 from photonfarm.trainer.training.learner import Learner
@@ -214,7 +214,7 @@ def wait_share(where: tuple[Path, str], settings: TrainSettings, steps: int) -> 
     with tempfile.TemporaryDirectory() as folder:
         changes = {"max_steps": steps, "validate_every": 10 * steps, "validation_samples": 1}
         train(SceneReader(*where), settings.model_copy(update=changes), Path(folder))
-        seconds = metrics_log.read(Path(folder) / METRICS)[-1]["seconds"]
+        seconds = run_folder.read(Path(folder) / METRICS)[-1]["seconds"]
     waited = seconds["wait_data"] + seconds["wait_read"]
     return waited / (waited + seconds["train"])
 

@@ -21,7 +21,7 @@ import torch
 
 from photonfarm.plan.request import Request
 from photonfarm.store import Store
-from photonfarm.trainer.training.unbiasedness import judged
+from photonfarm.trainer.training.losses import judged
 
 ROOT = Path(__file__).parents[2]
 

@@ -12,7 +12,7 @@ import pytest
 from experiments import figures
 from experiments.figures import AFTER, BEFORE, REFERENCE, Report
 from photonfarm.core.errors import IncompleteError
-from photonfarm.trainer.compare.comparison import COMPARISON, comparison
+from photonfarm.trainer.compare.evaluation_page import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.predict.animation import write_png
 

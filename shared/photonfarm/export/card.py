@@ -7,6 +7,7 @@ from typing import Any
 
 from photonfarm.core.errors import store_errors
 from photonfarm.core.files import write_whole
+from photonfarm.core.formatting import format_markdown_table
 from photonfarm.export.columns import Column
 from photonfarm.export.folder import DATA
 from photonfarm.export.formats.format import Exported
@@ -120,12 +121,9 @@ def _credits(found: Manifest) -> str:
 
 
 def _table(columns: tuple[Column, ...]) -> str:
-    rows = ["| name | type | shape | unit | is |", "|---|---|---|---|---|"]
-    for column in columns:
-        shape = " × ".join(map(str, column.shape)) or "–"
-        cells = (f"`{column.name}`", column.dtype, shape, column.unit or "–", column.meaning)
-        rows.append(f"| {' | '.join(cell.replace('|', '∣') for cell in cells)} |")
-    return "\n".join(rows)
+    shapes = [" × ".join(map(str, column.shape)) or "–" for column in columns]
+    rows = [(f"`{c.name}`", c.dtype, shape, c.unit or "–", c.meaning) for c, shape in zip(columns, shapes, strict=True)]
+    return format_markdown_table(("name", "type", "shape", "unit", "is"), rows)
 
 
 def _origin(found: Manifest) -> str:

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.cli.show import print_json
+from photonfarm.core.formatting import format_bytes
 from photonfarm.core.waiting import in_words
 from photonfarm.export.export import OnProgress, Result
 
@@ -53,5 +54,5 @@ def result(found: Result, as_json: bool) -> None:
         print_json(asdict(found))
         return
     shared = f", {found.configurations} configurations" if found.configurations else ""
-    size = f" in {found.new_files} files of {found.new_bytes / 1e6:,.1f} MB" if found.new else ""
+    size = f" in {found.new_files} files of {format_bytes(found.new_bytes)}" if found.new else ""
     click.echo(f"{found.folder}: {found.samples} samples{shared}; {found.new} of them new{size}")

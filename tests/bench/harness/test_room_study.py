@@ -25,7 +25,7 @@ from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, Store
-from photonfarm.trainer.metrics.intervals import t_975
+from photonfarm.trainer.metrics.image_metrics import t_975
 from photonfarm.trainer.runs.settings import preset
 
 SIZE, SLOTS = 8, 8

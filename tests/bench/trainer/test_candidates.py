@@ -12,8 +12,7 @@ from torch import Tensor
 from bench.trainer import candidates
 from bench.trainer.guided_networks import CANDIDATES, INSTEAD
 from photonfarm.trainer.networks import build, kind_of
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Inputs, Needs
+from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs import settings

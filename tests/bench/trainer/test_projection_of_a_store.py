@@ -19,8 +19,7 @@ from photonfarm.scene.view import Camera
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import PhotonInputs, PointInputs
+from photonfarm.trainer.networks.inputs import PhotonInputs, PointInputs, SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.settings import NetworkSettings
 

@@ -4,7 +4,7 @@ from collections import Counter
 
 import pytest
 
-from photonfarm.trainer.data.sampler import RoundSampler
+from photonfarm.trainer.data.batch_stream import RoundSampler
 
 
 def grown(sampler: RoundSampler) -> list[tuple[int, ...]]:

@@ -12,9 +12,8 @@ from photonfarm.cli.main import umbrella
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.trainer.dry_run import dry_run
-from photonfarm.trainer.dry_run.dry_run import DryRun, rehearse
+from photonfarm.trainer.dry_run.dry_run import DryRun, document, rehearse, text
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
-from photonfarm.trainer.dry_run.printed import document, text
 from photonfarm.trainer.networks import ARCHITECTURES, image_of
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.summary import summary

@@ -12,8 +12,7 @@ from scipy import stats
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.metrics import confidence_interval, flip, image_metrics, metric_space, mse, mssim
-from photonfarm.trainer.metrics.image_metrics import CHUNK
-from photonfarm.trainer.metrics.intervals import PerImage, t_975
+from photonfarm.trainer.metrics.image_metrics import CHUNK, PerImage, t_975
 
 
 def _pictures(count: int, size: tuple[int, int], seed: int) -> NDArray[np.float32]:

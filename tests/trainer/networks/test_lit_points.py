@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.core.records import LIT_POINTS
-from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.projection import Optics
 

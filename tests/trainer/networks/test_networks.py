@@ -4,8 +4,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from photonfarm.trainer.networks.image_synthesis import ImageSynthesisLayer
-from photonfarm.trainer.networks.point_layers import LightTransportLayer, ResidualBlock, masked_max
+from photonfarm.trainer.networks.network import ImageSynthesisLayer
+from photonfarm.trainer.networks.paper_networks import LightTransportLayer, ResidualBlock, masked_max
 
 
 def parameters(module: torch.nn.Module) -> int:

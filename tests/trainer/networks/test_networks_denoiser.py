@@ -9,8 +9,7 @@ from photonfarm.core.statistics import Estimate, clean_error, clean_error_having
 from photonfarm.trainer.data.batch import TrainingBatch, kept_pixels
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.networks.inputs import Needs, SceneFrame
 from photonfarm.trainer.predict.evaluation import batches, measure
 from photonfarm.trainer.runs.settings import NetworkSettings
 

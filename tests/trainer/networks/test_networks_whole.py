@@ -16,8 +16,7 @@ from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Inputs, map_tensors
+from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, map_tensors
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.settings import Architecture, NetworkSettings
 

@@ -10,7 +10,7 @@ from read_batches import batch_of
 
 from photonfarm.scene.view import Camera
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
 from photonfarm.trainer.networks.projection import Footprint, Optics
 from photonfarm.trainer.runs.settings import NetworkSettings

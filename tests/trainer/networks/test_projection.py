@@ -11,9 +11,8 @@ from read_batches import batch_of
 
 from photonfarm.scene.view import Camera, View
 from photonfarm.trainer.networks import build
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.networks.point_layers import LightTransportLayer
+from photonfarm.trainer.networks.inputs import Needs, SceneFrame
+from photonfarm.trainer.networks.paper_networks import LightTransportLayer
 from photonfarm.trainer.networks.projection import Footprint, Optics, footprint, project_mean
 from photonfarm.trainer.runs.settings import NetworkSettings, Occlusion
 

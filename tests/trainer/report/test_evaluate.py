@@ -20,10 +20,9 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.modification import sample_modification
 from photonfarm.store import SceneReader, SceneStore
 from photonfarm.store.read.merge import MergedView, merge_view
-from photonfarm.trainer.compare.comparison import COMPARISON, comparison
-from photonfarm.trainer.compare.evaluate import EVALUATION, compare
+from photonfarm.trainer.compare.evaluate import compare
+from photonfarm.trainer.compare.evaluation_page import COMPARISON, EVALUATION, comparison, evaluation_text, notes
 from photonfarm.trainer.compare.evaluation_samples import References
-from photonfarm.trainer.compare.evaluation_table import evaluation_text, notes
 from photonfarm.trainer.data.batch import kept_count, kept_pixels
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics import find_weights, metric_space, mse

@@ -36,8 +36,8 @@ from photonfarm.trainer.report.plots import Plot, plots
 from photonfarm.trainer.report.tables import Table
 from photonfarm.trainer.report.trained_runs import RunStory, short_names
 from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.progress import bottleneck
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, SETTINGS
-from photonfarm.trainer.runs.wait_times import bottleneck
 from photonfarm.trainer.training.loop import Hooks, train
 
 

@@ -17,9 +17,8 @@ from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.report.contents import ReportContents, gathered
-from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, half_floats, light_data
+from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, half_floats, light_data
 from photonfarm.trainer.report.tables import facts
-from photonfarm.trainer.report.verdict import Verdict
 from photonfarm.trainer.report.views import Layer, ShownView, light, shown_views
 
 

@@ -7,7 +7,7 @@ from held_out_errors import held_out_errors
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.device import described, round_convolutions, usable_device
+from photonfarm.trainer.runs.devices import described, round_convolutions, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.loop import train

@@ -22,8 +22,8 @@ from torch.nn.parallel import DistributedDataParallel
 from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs import distributed as processes
-from photonfarm.trainer.runs.distributed import Ranks, leading, ranks
+from photonfarm.trainer.runs import devices as processes
+from photonfarm.trainer.runs.devices import Ranks, leading, ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import Learner

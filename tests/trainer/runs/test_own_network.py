@@ -14,8 +14,7 @@ from photonfarm.store import SceneStore, Store
 from photonfarm.trainer import train
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
-from photonfarm.trainer.training.losses import LOSSES, loss_of
-from photonfarm.trainer.training.unbiasedness import judged
+from photonfarm.trainer.training.losses import LOSSES, judged, loss_of
 
 MODULE = '''
 import torch

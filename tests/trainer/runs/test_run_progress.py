@@ -10,9 +10,10 @@ from PIL import Image
 
 from photonfarm.core.pictures import display
 from photonfarm.farm.training import PROGRESS, VIEWS, RunFolder
-from photonfarm.trainer.runs import run_progress, shown_views
-from photonfarm.trainer.runs.run_progress import RunProgress, followed
-from photonfarm.trainer.runs.shown_views import MOST, write_views
+from photonfarm.trainer.runs import progress as progress_module
+from photonfarm.trainer.runs import run_folder
+from photonfarm.trainer.runs.progress import RunProgress, followed
+from photonfarm.trainer.runs.run_folder import MOST, write_views
 from photonfarm.trainer.training.loop import Hooks, train
 
 
@@ -47,8 +48,8 @@ def test_the_last_line_is_of_the_last_step(run: Path) -> None:
 def test_a_line_comes_every_five_seconds_and_others_read_the_file_meanwhile(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run_progress, "FILE_S", 0.02)
-    monkeypatch.setattr(run_progress, "LINE_S", 0.1)
+    monkeypatch.setattr(progress_module, "FILE_S", 0.02)
+    monkeypatch.setattr(progress_module, "LINE_S", 0.1)
     said: list[str] = []
     run.mkdir()
     progress = RunProgress(100, batch=1)
@@ -96,5 +97,5 @@ def test_a_trained_run_leaves_pictures_of_each_validation(make_source, tiny, run
     validations = [record for record in log if record["kind"] == "validation"]
     assert [step for step, *_ in written] == [record["step"] for record in validations]
     for _, rows, targets, predictions in written:
-        assert len(rows) == targets[0] == predictions[0] >= min(shown_views.SHOWN, validations[0]["held_out"])
+        assert len(rows) == targets[0] == predictions[0] >= min(run_folder.SHOWN, validations[0]["held_out"])
     assert len(list((run / VIEWS).iterdir())) == len(written)

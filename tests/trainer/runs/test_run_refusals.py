@@ -11,7 +11,7 @@ from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.trainer import service
 from photonfarm.trainer.cli import train_verb as cli
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, held
 from photonfarm.trainer.runs.settings import NetworkSettings
@@ -49,7 +49,7 @@ def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: 
     with (run / METRICS).open("a") as file:
         file.write(f"{line}\n")
     with pytest.raises(StoreError):
-        metrics_log.read(run / METRICS)
+        run_folder.read(run / METRICS)
     with pytest.raises(StoreError, match="remove that line"):
         train(make_source(24), tiny(max_steps=3), run)
     assert checkpoint.load(run / CHECKPOINT)["step"] == 2
@@ -140,7 +140,7 @@ def test_a_full_disk_is_a_store_error(tmp_path) -> None:
     for name in (METRICS, "checkpoint.partial"):
         (tmp_path / name).symlink_to("/dev/full")
     with pytest.raises(StoreError):
-        metrics_log.MetricsLog(tmp_path / METRICS).write("train", step=1)
+        run_folder.MetricsLog(tmp_path / METRICS).write("train", step=1)
     with pytest.raises(StoreError):
         checkpoint.save(tmp_path / CHECKPOINT, {})
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.trainer.runs import metrics_log
+from photonfarm.trainer.runs import run_folder
 from photonfarm.trainer.runs import tensorboard as boards
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.training import loop
@@ -44,7 +44,7 @@ def test_a_run_shows_its_records_and_pictures(make_source, tiny, run, monkeypatc
 
     monkeypatch.setattr(loop, "LOG_EVERY", 10)
     trained(make_source(24), tiny(), run)
-    events, records = accumulated(run), metrics_log.read(run / METRICS)
+    events, records = accumulated(run), run_folder.read(run / METRICS)
     told = [r for r in records if r["kind"] == "validation"]
     found = events.Scalars("error/held out")
     assert [(e.step, e.value) for e in found] == [(r["step"], pytest.approx(r["error"])) for r in told]
@@ -80,7 +80,7 @@ def test_what_was_shown_up_to_an_end_stays_when_the_run_goes_on(make_source, tin
 
 def test_a_run_that_goes_back_shows_what_is_left_of_its_rate(make_source, tiny, run) -> None:
     trained(make_source(48), tiny(learning_rate=0.05, max_steps=30), run)
-    halved = [r for r in metrics_log.read(run / METRICS) if r["kind"] == "recovered"]
+    halved = [r for r in run_folder.read(run / METRICS) if r["kind"] == "recovered"]
     found = accumulated(run).Scalars("optimiser/rate factor")
     assert [(e.step, e.value) for e in found] == [(r["step"], r["rate_factor"]) for r in halved] != []
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from photonfarm.trainer.cli import show
-from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs import checkpoint, run_folder
+from photonfarm.trainer.runs.progress import Stopwatch, bottleneck, samples_per_used, stated, wait_shares
 from photonfarm.trainer.runs.run_folder import METRICS
-from photonfarm.trainer.runs.wait_times import Stopwatch, bottleneck, samples_per_used, stated, wait_shares
 from photonfarm.trainer.training.loop import Hooks, train
 
 BEFORE = {"train": 10.0, "validate": 5.0, "wait_data": 100.0, "wait_read": 1.0}
@@ -70,7 +70,7 @@ def test_a_run_that_waits_for_rendering_says_so_with_each_validation(
     source = make_scarce(60, lot=12, patience=30)
     scarce = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, poll_seconds=0.02)
     train(source, scarce, run, Hooks(on_record=show.record, on_draws=source.count))
-    records = metrics_log.read(run / METRICS)
+    records = run_folder.read(run / METRICS)
     told = [r for r in records if r["kind"] == "validation"]
     waited = [r["seconds"]["wait_data"] for r in told if r["step"] % 5 == 0]
     assert min(np.diff([0, *waited])) > 0.4
@@ -95,7 +95,7 @@ def test_a_run_that_waits_for_reading_says_so(make_source, tiny, run) -> None:
     source: Any = make_source(24)
     source.read_samples = slowed(source.read_samples, 0.3)
     train(source, tiny(validate_every=100), run)
-    last = metrics_log.read(run / METRICS)[-1]
+    last = run_folder.read(run / METRICS)[-1]
     assert bottleneck(wait_shares(last["seconds"])) == "reading"
 
 
@@ -109,7 +109,7 @@ def test_what_is_no_training_is_counted_as_what_it_is_and_not_as_waiting(
     began = time.monotonic()
     train(source, tiny(), run, Hooks(on_record=slowed(lambda _: None, 0.2)))
     wall_s = time.monotonic() - began
-    seconds = metrics_log.read(run / METRICS)[-1]["seconds"]
+    seconds = run_folder.read(run / METRICS)[-1]["seconds"]
     assert seconds["start"] >= 0.5 + 0.3, "the weights at the beginning are saved as well"
     assert seconds["save"] >= 3 * 0.3
     assert seconds["other"] >= 4 * 0.2

@@ -32,11 +32,11 @@ from photonfarm.scene.view import View, sample_view
 from photonfarm.store import Sample
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.frame import SceneFrame
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.settings import Architecture, NetworkSettings, TrainSettings
+from photonfarm.trainer.training.learner import build_optimiser
 from photonfarm.trainer.training.losses import LOSSES, paired_loss
-from photonfarm.trainer.training.optimisers import build_optimiser
 
 SIZE, POINTS = 32, 1024
 K = 336  # noisy targets, of one sample in each half

@@ -16,13 +16,12 @@ from read_batches import batch_of
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks import build
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.networks.inputs import Needs, SceneFrame
 from photonfarm.trainer.predict.evaluation import network_predictor
-from photonfarm.trainer.runs import biased
+from photonfarm.trainer.runs import settings
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, settings_of
+from photonfarm.trainer.training.learner import build_optimiser, rate_at
 from photonfarm.trainer.training.loop import train
-from photonfarm.trainer.training.optimisers import build_optimiser, rate_at
 
 BENCH = Path(__file__).parents[3] / "bench"
 
@@ -44,20 +43,20 @@ def firefly(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 @pytest.mark.parametrize(
     ("key", "value", "reason"),
     [
-        ("loss", "l1", biased.L1),
-        ("loss", "L1", biased.L1),
-        ("loss", "log", biased.LOG),
-        ("loss", "smape", biased.TARGET_WEIGHT),
-        ("loss", "srgb", biased.DISPLAY),
-        ("loss", "ssim", biased.STRUCTURE),
-        ("gradient_clip", 1.0, biased.CLIPPED_GRADIENT),
-        ("max_grad_norm", 5, biased.CLIPPED_GRADIENT),
-        ("firefly_clamp", 10, biased.CLAMPED),
-        ("tone_mapping", "aces", biased.DISPLAY),
+        ("loss", "l1", settings.L1),
+        ("loss", "L1", settings.L1),
+        ("loss", "log", settings.LOG),
+        ("loss", "smape", settings.TARGET_WEIGHT),
+        ("loss", "srgb", settings.DISPLAY),
+        ("loss", "ssim", settings.STRUCTURE),
+        ("gradient_clip", 1.0, settings.CLIPPED_GRADIENT),
+        ("max_grad_norm", 5, settings.CLIPPED_GRADIENT),
+        ("firefly_clamp", 10, settings.CLAMPED),
+        ("tone_mapping", "aces", settings.DISPLAY),
     ],
 )
 def test_what_biases_under_noisy_targets_is_refused_with_the_reason(
-    key: str, value: object, reason: biased.BiasReason
+    key: str, value: object, reason: settings.BiasReason
 ) -> None:
     with pytest.raises(SpecError, match=f"{key} = {value!r}: .*{re.escape(reason.why)}"):
         settings_of("small", {key: value})
@@ -89,13 +88,13 @@ def test_the_figures_of_the_messages_are_those_that_the_benchmark_measures(firef
     found = {name: tuple(round(value, 2) for value in values) for name, values in firefly.least().items()}
     page = json.loads((BENCH.parent / "docs/results/firefly.json").read_text())["least"]
     said = {
-        "absolute error (L1)": biased.L1,
-        "squared error of log(1 + x)": biased.LOG,
-        "squared error after clip to 1 and gamma 2.2": biased.DISPLAY,
-        "squared error, targets clamped at 1": biased.CLAMPED,
-        "relative, weight from the noisy target": biased.TARGET_WEIGHT,
-        "relative, weight from the prediction, not detached": biased.UNDETACHED,
-        "squared error, gradient of each step clipped at 1 (Huber)": biased.CLIPPED_GRADIENT,
+        "absolute error (L1)": settings.L1,
+        "squared error of log(1 + x)": settings.LOG,
+        "squared error after clip to 1 and gamma 2.2": settings.DISPLAY,
+        "squared error, targets clamped at 1": settings.CLAMPED,
+        "relative, weight from the noisy target": settings.TARGET_WEIGHT,
+        "relative, weight from the prediction, not detached": settings.UNDETACHED,
+        "squared error, gradient of each step clipped at 1 (Huber)": settings.CLIPPED_GRADIENT,
     }
     for name, bias in said.items():
         assert bias.ends_at == found[name]

@@ -20,7 +20,7 @@ from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.write.lease import lease
 from photonfarm.store.write.withdrawal import forget
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.distributed import leading, ranks
+from photonfarm.trainer.runs.devices import leading, ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training import other_ranks

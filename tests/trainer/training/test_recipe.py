@@ -11,12 +11,12 @@ from held_out_errors import held_out_errors
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predict.evaluation import batches
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
 from photonfarm.trainer.runs.settings import PRESETS, TrainSettings
 from photonfarm.trainer.training import loop
+from photonfarm.trainer.training.learner import rate_at
 from photonfarm.trainer.training.loop import train
-from photonfarm.trainer.training.optimisers import rate_at
 
 Weights = dict[str, torch.Tensor]
 
@@ -60,7 +60,7 @@ def test_a_run_that_goes_on_with_more_steps_follows_the_schedule_of_these(make_s
     monkeypatch.setattr(loop, "LOG_EVERY", 1)
     for steps in (4, 8):
         train(make_source(24), tiny(schedule="cosine", warm_up=0.25, max_steps=steps, learning_rate=1e-3), run)
-    rates = [record["rate"] for record in metrics_log.read(run / METRICS) if record["kind"] == "train"]
+    rates = [record["rate"] for record in run_folder.read(run / METRICS) if record["kind"] == "train"]
     shares = [1, 1, 0.75, 0.25]  # of 4 steps, of which one is the rise
     shares += [(1 + np.cos(np.pi * part / 6)) / 2 for part in (2, 3, 4, 5)]  # of 8, of which two are
     assert rates == pytest.approx([1e-3 * share for share in shares])

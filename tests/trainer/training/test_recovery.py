@@ -17,20 +17,19 @@ from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, METRICS
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.recovery import NEXT
-from photonfarm.trainer.training.validation import UP_TO_WHITE, BestValidation, Validation, compared, validate
+from photonfarm.trainer.training.validation import NEXT, UP_TO_WHITE, BestValidation, Validation, compared, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
 
 
 def records(run: Path, kind: str) -> list[dict[str, Any]]:
-    return [record for record in metrics_log.read(run / METRICS) if record["kind"] == kind]
+    return [record for record in run_folder.read(run / METRICS) if record["kind"] == kind]
 
 
 def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
@@ -279,7 +278,7 @@ def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_s
     noisy = [1.5, 0.1, 0.5]
     as_if(monkeypatch, {0: [1.0] * 3, 5: [0.5] * 3, 10: noisy, 12: noisy})
     train(make_source(24), tiny(), run, Hooks(on_record=show.record))
-    told = [(r["kind"], r["step"]) for r in metrics_log.read(run / METRICS)]
+    told = [(r["kind"], r["step"]) for r in run_folder.read(run / METRICS)]
     assert told[2:] == [("validation", 10), ("validation", 12), ("recovered", 12), ("validation", 12), ("end", 12)]
     (found,) = records(run, "recovered")
     assert (found["cause"], found["back_to"], found["rate_factor"], found["recoveries"]) == ("end", 5, 1.0, 0)

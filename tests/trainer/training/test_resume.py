@@ -20,13 +20,12 @@ from safetensors import safe_open
 from photonfarm.core.errors import SpecError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, Store
-from photonfarm.trainer.data.growth import Growth
-from photonfarm.trainer.data.sampler import RoundSampler
-from photonfarm.trainer.runs import checkpoint, metrics_log
+from photonfarm.trainer.data.batch_stream import Growth, RoundSampler
+from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.recovery import NEXT
+from photonfarm.trainer.training.validation import NEXT
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 
@@ -94,7 +93,7 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
         assert ended_by(lambda how=how: train(make_source(24), settings, killed, Hooks(**how))) == -signal.SIGKILL
     train(make_source(24), settings, killed)
     assert_same(run, killed)
-    logs = [[(r["kind"], r["step"]) for r in metrics_log.read(folder / METRICS)] for folder in (run, killed)]
+    logs = [[(r["kind"], r["step"]) for r in run_folder.read(folder / METRICS)] for folder in (run, killed)]
     assert logs[0] == logs[1]
     assert ("recovered" in [kind for kind, _ in logs[0]]) == ("learning_rate" in recipe)
     assert not (killed / NEXT).exists()
@@ -171,7 +170,7 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_repeats_from_its_log_howev
     growing.join()
     train(SceneReader(root, scene_id), tiny(**how), killed)
 
-    first = metrics_log.read(killed / METRICS)[0]
+    first = run_folder.read(killed / METRICS)[0]
     state = checkpoint.load(killed / CHECKPOINT)
     assert first["samples"] < 40 == state["store"]["samples"]
     assert len(state["store"]["plans"]) == 2

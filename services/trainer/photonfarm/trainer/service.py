@@ -20,17 +20,16 @@ from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.read.other_scenes import other_scenes
 from photonfarm.store.write.scene_store import held as scenes_held
-from photonfarm.trainer.runs.run_folder import held, note_scene_folder
-from photonfarm.trainer.runs.run_progress import RunProgress, followed
+from photonfarm.trainer.runs.progress import RunProgress, followed
+from photonfarm.trainer.runs.run_folder import held, note_scene_folder, write_views
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
-from photonfarm.trainer.runs.shown_views import write_views
 from photonfarm.trainer.runs.user_code import named_in_errors
 
 if TYPE_CHECKING:
     from photonfarm.core.records import F32
     from photonfarm.scene.spec import SceneSpec
     from photonfarm.trainer.dry_run.dry_run import DryRun
-    from photonfarm.trainer.runs.distributed import TrainingGroup
+    from photonfarm.trainer.runs.devices import TrainingGroup
 
 T = TypeVar("T")
 
@@ -64,8 +63,7 @@ def run(
     signal stops it.
     """
     from photonfarm.store import SceneReader
-    from photonfarm.trainer.runs.device import described
-    from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, leading, ranks
+    from photonfarm.trainer.runs.devices import SINGLE_PROCESS, described, leading, ranks
     from photonfarm.trainer.training.loop import stop_on_signals
     from photonfarm.trainer.training.other_ranks import assist
 
@@ -217,7 +215,7 @@ def rehearse(
     """
     from photonfarm.core.models import sentences
     from photonfarm.trainer.dry_run.dry_run import rehearse
-    from photonfarm.trainer.runs.distributed import processes
+    from photonfarm.trainer.runs.devices import processes
 
     if (size := processes()) > 1:
         raise SpecError(

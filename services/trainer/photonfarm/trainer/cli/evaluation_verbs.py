@@ -98,8 +98,8 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     this leaves evaluation.json, with every figure, and comparison.png, a few of the images side by side.
     """
     how = _how(**asked)
-    from photonfarm.trainer.compare.evaluate import compare, write
-    from photonfarm.trainer.compare.evaluation_table import evaluation_text
+    from photonfarm.trainer.compare.evaluate import compare
+    from photonfarm.trainer.compare.evaluation_page import evaluation_text, write_evaluation
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
@@ -107,7 +107,7 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
 
     with measuring_progress() as on_progress:
         found = compare(store, loaded, on_progress=on_progress, **how)
-    pictures = write(found, loaded)
+    pictures = write_evaluation(found, loaded)
     click.echo(json.dumps(found.document(), indent=2) if as_json else evaluation_text(found))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photonfarm.core.statistics import stated
-from photonfarm.trainer.runs import wait_times
+from photonfarm.trainer.runs import progress
 
 if TYPE_CHECKING:
     from photonfarm.trainer.dry_run.dry_run import DryRun
@@ -39,16 +39,16 @@ def record(of: dict[str, Any]) -> None:
         click.echo(
             f"step {of['step']}: held-out error {stated(of['error'], of['standard_error'])} "
             f"({stated(of['shown_error'], None)} up to white) {there}"
-            + wait_times.stated(of["waits"], of["samples_per_used"]),
+            + progress.stated(of["waits"], of["samples_per_used"]),
             err=True,
         )
 
 
 def dry_run(found: DryRun, as_json: bool) -> None:
     """Print the estimate of a training."""
-    from photonfarm.trainer.dry_run.printed import document, text
+    from photonfarm.trainer.dry_run.dry_run import describe, format_estimate
 
-    click.echo(json.dumps(document(found), indent=2) if as_json else text(found))
+    click.echo(json.dumps(describe(found), indent=2) if as_json else format_estimate(found))
 
 
 def _recovered(log_record: dict[str, Any]) -> str:

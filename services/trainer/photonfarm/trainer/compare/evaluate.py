@@ -6,7 +6,6 @@ exactly. The columns of the paper's tables concern what a display shows, and nee
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -16,12 +15,11 @@ import numpy as np
 import torch
 
 from photonfarm.core.archives import Seconds
-from photonfarm.core.errors import IncompleteError, SpecError, store_errors
+from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.store import SceneReader
-from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
 from photonfarm.trainer.data.batch import TrainingBatch, kept_count
 from photonfarm.trainer.data.feed import Feed
@@ -35,7 +33,6 @@ from photonfarm.trainer.metrics import (
     reference_features,
 )
 from photonfarm.trainer.networks.inputs import Inputs
-from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.evaluation import (
     NONE_COMPLETE,
     DevicePredictor,
@@ -46,10 +43,8 @@ from photonfarm.trainer.predict.evaluation import (
     measure,
 )
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
-from photonfarm.trainer.runs.device import described, usable_device
+from photonfarm.trainer.runs.devices import described, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
-
-EVALUATION = "evaluation.json"
 
 Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
 """A function that names rows to show beside the first ones.
@@ -213,16 +208,6 @@ def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
                 f"{run.folder}: was trained with exposure {run.exposure:g}, and {first.folder} with "
                 f"{first.exposure:g}; runs of one exposure can be compared"
             )
-
-
-def write(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list[Path]:
-    """Write evaluation.json and comparison.png into each run's folder; returns the pictures. Raises StoreError."""
-    text, picture = json.dumps(evaluation.document(), indent=2, ensure_ascii=False) + "\n", comparison(evaluation)
-    for run in runs:
-        with store_errors("write the evaluation", run.folder):
-            (run.folder / EVALUATION).write_text(text)
-        write_png(picture, run.folder / COMPARISON)
-    return [run.folder / COMPARISON for run in runs]
 
 
 # --------------------------------------------------------------------------------------------------------- predictors

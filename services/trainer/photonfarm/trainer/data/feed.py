@@ -23,7 +23,7 @@ from photonfarm.plan.hold_out import Keyed, are_held_out, enough, units_of
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, empty_memory, kept_pixels
 from photonfarm.trainer.networks import kind_of
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.runs.device import usable_device
+from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
 
 LATE_S = 60.0

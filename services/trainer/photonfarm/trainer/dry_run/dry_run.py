@@ -1,18 +1,24 @@
-"""What a training would take: parameters, operations, memory, and time by a few real steps on made-up samples."""
+"""What a training would take: parameters, operations, memory, and time by a few real steps on made-up samples.
+
+The estimate is printed in words, or as JSON.
+"""
 
 from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
+from photonfarm.core.formatting import format_bytes
+from photonfarm.core.waiting import in_words
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch, size_bytes
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
-from photonfarm.trainer.runs.device import described, usable_device
+from photonfarm.trainer.runs.devices import described, usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.learner import Learner, compiling
 
@@ -153,3 +159,36 @@ def _seconds(learner: Learner, batch: TrainingBatch, device: torch.device) -> fl
     if device.type == "cuda":
         torch.cuda.synchronize(device)
     return time.perf_counter() - began
+
+
+def describe(estimate: DryRun) -> dict[str, Any]:
+    """The estimate for programs: its fields, and what follows from them."""
+    derived = {"step_flops": estimate.step_flops, "memory_bytes": estimate.memory_bytes, "seconds": estimate.seconds}
+    return {**asdict(estimate), **derived}
+
+
+def format_estimate(estimate: DryRun) -> str:
+    """The estimate for people."""
+    work, timed, batch = estimate.work, estimate.timed, estimate.batch
+    parts = (
+        ("activations", batch * work.activation_bytes),
+        ("batch", batch * work.sample_bytes),
+        ("weights, gradients, optimiser", estimate.state_bytes),
+    )
+    rate = estimate.step_flops / timed.step_s / 1e9
+    of = "" if timed.samples == batch else f", times {batch}/{timed.samples}"
+    step = f"{timed.step_s:.1f} s" if timed.step_s >= 10 else f"{timed.step_s * 1e3:.0f} ms"
+    lines = [
+        f"{estimate.architecture} for {estimate.scene}: {estimate.film[0]} × {estimate.film[1]} pixels, "
+        f"width {estimate.width}, {estimate.precision}",
+        f"parameters   {estimate.parameters:,}",
+        f"steps        {estimate.steps:,} of {batch} samples, {estimate.steps * batch:,} draws",
+        f"work         {estimate.step_flops / 1e9:,.1f} GFLOP a step, forward and backward",
+        f"memory       {format_bytes(estimate.memory_bytes)} at least: "
+        + ", ".join(f"{name} {format_bytes(size)}" for name, size in parts),
+        *([] if timed.peak_bytes is None else [f"             {format_bytes(timed.peak_bytes)} at the timed steps"]),
+        f"here         {step} a step, {rate:,.0f} GFLOP/s, {in_words(estimate.seconds)} in all, on {timed.device}",
+        f"             (median of {timed.steps} steps of {timed.samples}{of}, on made-up samples; without reading, "
+        "waiting, validation)",
+    ]
+    return "\n".join(lines)

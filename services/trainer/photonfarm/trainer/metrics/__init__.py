@@ -4,6 +4,8 @@ from photonfarm.trainer.metrics.fid import Fid, fid, kid
 from photonfarm.trainer.metrics.image_metrics import (
     HEADLINE_BLOCK,
     ImageMetrics,
+    PerImage,
+    confidence_interval,
     feature_l1,
     flip,
     image_metrics,
@@ -20,7 +22,6 @@ from photonfarm.trainer.metrics.inception import (
     find_weights,
     load_inception,
 )
-from photonfarm.trainer.metrics.intervals import PerImage, confidence_interval
 
 __all__ = [
     "HEADLINE_BLOCK",

@@ -11,13 +11,17 @@ import torch
 from torch import Tensor, nn
 
 from photonfarm.core.errors import SpecError
-from photonfarm.trainer.networks.baselines import Cnn, Denoiser, FeatureProjection
-from photonfarm.trainer.networks.frame import SceneFrame
 from photonfarm.trainer.networks.guided import Guided
-from photonfarm.trainer.networks.inputs import Inputs, Needs
-from photonfarm.trainer.networks.light_transport import LightTransport, LightTransportPhotons
+from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.networks.paper_networks import (
+    Cnn,
+    Denoiser,
+    FeatureProjection,
+    LightTransport,
+    LightTransportPhotons,
+)
 from photonfarm.trainer.runs import user_code
 from photonfarm.trainer.runs.settings import NetworkSettings
 

@@ -14,8 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, given
+from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, SceneFrame, given
 from photonfarm.trainer.networks.lit_points import CHANNELS, DIFFUSE, LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight

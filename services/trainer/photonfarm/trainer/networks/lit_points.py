@@ -27,8 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from photonfarm.core.records import LIT_POINTS
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Inputs, given
+from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, given
 from photonfarm.trainer.networks.network import with_octaves
 
 COARSE = 4

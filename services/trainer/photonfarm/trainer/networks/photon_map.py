@@ -15,8 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from photonfarm.core.errors import SpecError
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Inputs, given
+from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, given
 from photonfarm.trainer.networks.projection import Footprint, Optics, footprint
 
 

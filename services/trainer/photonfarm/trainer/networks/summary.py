@@ -14,8 +14,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks import build, kind_of
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Inputs, NoisyColour
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.projection import Optics
 from photonfarm.trainer.runs.settings import NetworkSettings

@@ -15,14 +15,13 @@ from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader
 from photonfarm.trainer.networks import build, kind_of
-from photonfarm.trainer.networks.frame import SceneFrame
-from photonfarm.trainer.networks.inputs import Inputs, Needs, given
+from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, given
 from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.predict.denoisers import fill_in
 from photonfarm.trainer.predict.evaluation import DevicePredictor, network_predictor
-from photonfarm.trainer.predict.fill_in import fill_in
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.checkpoint import read_settings
-from photonfarm.trainer.runs.device import usable_device
+from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
 from photonfarm.trainer.runs.user_code import named_in_errors
@@ -116,6 +115,6 @@ class ReadyPredictor:
             return lambda inputs: given(inputs.noisy).colour
         if self.denoiser == "fill-in":
             return lambda inputs: fill_in(given(inputs.noisy), inputs.albedo)
-        from photonfarm.trainer.predict.oidn import Oidn
+        from photonfarm.trainer.predict.denoisers import Oidn
 
         return Oidn(self.settings.threads)

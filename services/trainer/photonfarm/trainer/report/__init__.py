@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.core.errors import store_errors
-from photonfarm.trainer.compare.comparison import COMPARISON, comparison
 from photonfarm.trainer.compare.evaluate import MeasureProgress
+from photonfarm.trainer.compare.evaluation_page import COMPARISON, comparison
 from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.contents import gathered
-from photonfarm.trainer.report.page import markdown, page
+from photonfarm.trainer.report.page import Verdict, markdown, page
 from photonfarm.trainer.report.plots import plots
-from photonfarm.trainer.report.verdict import Verdict
 from photonfarm.trainer.report.views import OVERVIEW, overview, shown_views
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 

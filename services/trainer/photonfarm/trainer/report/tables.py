@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from photonfarm.core.archives import Seconds
+from photonfarm.core.formatting import format_bytes, format_count, format_milliseconds
 from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.compare.evaluation_table import counted, notes, place_of_networks
+from photonfarm.trainer.compare.evaluation_page import notes, place_of_networks
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE, TITLES
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
@@ -53,14 +54,14 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
         ("samples", f"{card.samples.rows} of {card.samples.planned} planned, {2 * t.half_spp} samples per pixel each, "
                     f"in two independent halves{_further_passes(contents)}"),
         ("noise of the targets", f"{contents.evaluation.noise_floor:.4g}, of those held out, as linear MSE"),
-        ("transport", f"bdpt: paths of up to {t.max_depth} edges, {counted(t.connections, 'connection')}, light ratio "
-                      f"{t.light_ratio:g}" + ", guided light" * t.guided_light
+        ("transport", f"bdpt: paths of up to {t.max_depth} edges, {format_count(t.connections, 'connection')}, light "
+                      f"ratio {t.light_ratio:g}" + ", guided light" * t.guided_light
                       + (f", {t.light_samples} light samples" if t.light_samples > 1 else "")),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
         ("seeds", _seeds(contents)),
         ("cost", _cost(contents)),
-        ("size", f"{status.size_bytes / 1e6:.1f} MB"),
-        ("rendered by", f"{counted(card.workers, 'worker')} with {versions}"),
+        ("size", format_bytes(status.size_bytes)),
+        ("rendered by", f"{format_count(card.workers, 'worker')} with {versions}"),
         ("times taken on", contents.machine.stated),
         ("GPU", _gpu(contents)),
     ]  # fmt: skip
@@ -169,7 +170,7 @@ def _of_paper(contents: ReportContents) -> str:
 def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) -> tuple[str, ...]:
     found, paper, unit = entry.estimates, entry.published, contents.measure
     cells = [
-        (f"{1e3 * entry.time.total:.1f}" if entry.time else NOT_AVAILABLE, None),
+        (format_milliseconds(entry.time.total) if entry.time else NOT_AVAILABLE, None),
         (_ratio(entry, unit, alone=len(contents.entries) == 1), _published_ratio(entry, unit)),
         (with_interval(found.get("mse"), 5), f"{paper.mse:.4f}" if paper else ""),
         (with_interval(found.get("mssim"), 3), f"{paper.mssim:.3f}" if paper else ""),
@@ -238,7 +239,7 @@ def _frame_parts(contents: ReportContents) -> list[Table]:
         (
             entry.name,
             *(_ms(part) if part else "–" for part in entry.time.parts.values()),
-            f"{1e3 * entry.time.total:.1f}",
+            format_milliseconds(entry.time.total),
         )
         for entry in contents.entries
         if entry.time
@@ -261,7 +262,8 @@ def _frame_parts(contents: ReportContents) -> list[Table]:
 
 
 def _ms(time: Seconds) -> str:
-    return f"{1e3 * time.median:.1f} ({1e3 * time.low:.1f} … {1e3 * time.high:.1f})"
+    low, high = format_milliseconds(time.low), format_milliseconds(time.high)
+    return f"{format_milliseconds(time.median)} ({low} … {high})"
 
 
 # ---------------------------------------------------------------------------------------------------------- runs, cases

@@ -22,10 +22,10 @@ from photonfarm.trainer.predict.evaluation import (
     network_predictor,
 )
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.runs import checkpoint, metrics_log
-from photonfarm.trainer.runs.device import AUTO, usable_device
+from photonfarm.trainer.runs import checkpoint, run_folder
+from photonfarm.trainer.runs.devices import AUTO, usable_device
+from photonfarm.trainer.runs.progress import bottleneck, samples_per_used, wait_shares
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
-from photonfarm.trainer.runs.wait_times import bottleneck, samples_per_used, wait_shares
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class RunStory:
     @classmethod
     def of(cls, name: str, run: TrainedRun) -> RunStory:
         """Read the story of a run; raises StoreError for a log that cannot be read."""
-        records = metrics_log.read(run.folder / METRICS)
+        records = run_folder.read(run.folder / METRICS)
         state = checkpoint.load(run.folder / CHECKPOINT)
         arrived, held_out = (state["following"][rows].numpy() for rows in ("arrived", "held_out"))
         training = np.concatenate([[0], np.cumsum(~np.isin(arrived, held_out))])  # of the first n that arrived

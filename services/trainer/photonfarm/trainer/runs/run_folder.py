@@ -1,15 +1,26 @@
-"""The folder of a training run: the names of its files, and the lock that one trainer at a time holds."""
+"""The folder of a training run: its lock, its log metrics.jsonl, and its pictures of held-out views.
+
+The log has one record a line, appended during training. The pictures let others watch a few views improve.
+"""
 
 from __future__ import annotations
 
 import fcntl
+import json
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from photonfarm.core.errors import StoreError, store_errors
-from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS
+from photonfarm.core.files import whole_file
+from photonfarm.core.pictures import display
+from photonfarm.core.records import F32
+from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS, VIEWS
 from photonfarm.scene.spec_loading import SCENES_VARIABLE
 
 __all__ = ["CHECKPOINT", "INITIAL", "METRICS", "SETTINGS", "held", "note_scene_folder", "with_scenes"]
@@ -52,3 +63,93 @@ def with_scenes(folder: Path) -> dict[str, str]:
         return dict(os.environ)
     folders = filter(None, (os.environ.get(SCENES_VARIABLE), noted))
     return {**os.environ, SCENES_VARIABLE: os.pathsep.join(folders)}
+
+
+class MetricsLog:
+    """The log of one run. `on_record` is called with each record as it is written; StoreError if the disk refuses."""
+
+    def __init__(self, path: Path, on_record: Callable[[dict[str, Any]], object] | None = None) -> None:
+        self._path, self._on_record = path, on_record
+
+    def cut(self, step: int) -> list[dict[str, Any]]:
+        """Drop the records after the checkpoint of `step`, which a resumed run writes again.
+
+        Returns the records that stay. They are renamed into place, so that a concurrent reader always finds a whole
+        file. A training record of `step` itself was written before the checkpoint, and so was everything up to an end
+        there; a validation or a change of settings without an end after it was written after the checkpoint.
+        """
+        with store_errors("cut the log", self._path):
+            lines = _lines(self._path)
+            records = [_record(line, self._path) for line in lines if line.endswith(b"\n")]
+            ends = [i + 1 for i, record in enumerate(records) if (record["step"], record["kind"]) == (step, "end")]
+            kept = max(ends, default=0)
+            while kept < len(records) and not _is_after(records[kept], step):
+                kept += 1
+            if kept < len(lines):
+                partial = self._path.with_suffix(".partial")
+                partial.write_bytes(b"".join(lines[:kept]))
+                partial.replace(self._path)
+            return records[:kept]
+
+    def write(self, kind: str, **values: Any) -> None:
+        """Append a record."""
+        record = {"kind": kind, **values}
+        with store_errors("write the log", self._path), self._path.open("ab") as file:
+            file.write(json.dumps(record).encode() + b"\n")
+        if self._on_record:
+            self._on_record(record)
+
+
+def _is_after(record: dict[str, Any], step: int) -> bool:
+    return record["step"] > step or (record["step"] == step and record["kind"] != "train")
+
+
+def _lines(path: Path) -> list[bytes]:
+    return path.read_bytes().splitlines(keepends=True) if path.exists() else []
+
+
+def _record(line: bytes, path: Path) -> dict[str, Any]:
+    try:
+        record: dict[str, Any] = json.loads(line)
+        _ = record["step"], record["kind"]
+        return record
+    except (ValueError, KeyError, TypeError) as error:
+        raise StoreError(
+            f"{path}: holds the line {line[:40]!r}, which is not a record of a training run; remove that line"
+        ) from error
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """The whole records of a log, in order; a last line cut short by a crash is left out. Raises StoreError."""
+    with store_errors("read the log", path):
+        return [_record(line, path) for line in _lines(path) if line.endswith(b"\n")]
+
+
+SHOWN = 4  # the most views
+MOST = 24  # the most pictures kept; beyond, every second one goes, so that early ones become rare
+_NAME = re.compile(r"step-(\d{8})\.png")
+
+
+def write_views(run: Path, scene_id: str, step: int, rows: tuple[int, ...], predictions: F32) -> None:
+    """Write the first predictions, exposed linear radiance (B, H, W, 3), side by side as a display shows them.
+
+    The PNG's texts `scene` and `rows` name what they belong to in the store. Raises StoreError if the disk refuses.
+    """
+    from PIL import Image, PngImagePlugin
+
+    rows, folder = rows[:SHOWN], run / VIEWS
+    about = PngImagePlugin.PngInfo()
+    about.add_text("scene", scene_id)
+    about.add_text("rows", " ".join(map(str, rows)))
+    strip = np.concatenate([display(image, 1.0) for image in predictions[: len(rows)]], axis=1)
+    with store_errors("write pictures of held-out views", folder):
+        with whole_file(folder / f"step-{step:08d}.png") as part:
+            Image.fromarray(strip).save(part, "PNG", pnginfo=about)
+        _thin_out(folder)
+
+
+def _thin_out(folder: Path) -> None:
+    files = sorted(file for file in folder.iterdir() if _NAME.fullmatch(file.name))
+    if len(files) > MOST:
+        for file in files[1:-1:2]:
+            file.unlink(missing_ok=True)

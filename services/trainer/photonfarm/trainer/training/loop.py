@@ -19,21 +19,27 @@ from photonfarm.core.models import Changes
 from photonfarm.core.processes import Stop
 from photonfarm.core.statistics import group_means
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
+from photonfarm.trainer.data.batch_stream import BatchStream, Growth
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.data.growth import BatchStream, Growth
 from photonfarm.trainer.predict.evaluation import batches, network_predictor
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.device import usable_device
-from photonfarm.trainer.runs.distributed import SINGLE_PROCESS, TrainingGroup
-from photonfarm.trainer.runs.metrics_log import MetricsLog
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, held
+from photonfarm.trainer.runs.devices import SINGLE_PROCESS, TrainingGroup, usable_device
+from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, samples_per_used, wait_shares
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, held
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.user_code import named_in_errors
-from photonfarm.trainer.runs.wait_times import Stopwatch, TimeKind, samples_per_used, wait_shares
 from photonfarm.trainer.training.learner import DivergedError, Learner, compiling
 from photonfarm.trainer.training.other_ranks import Presence
-from photonfarm.trainer.training.recovery import GoodState, settle
-from photonfarm.trainer.training.validation import BestValidation, Comparison, Show, Validation, compared, validate
+from photonfarm.trainer.training.validation import (
+    BestValidation,
+    Comparison,
+    GoodState,
+    Show,
+    Validation,
+    compared,
+    settle,
+    validate,
+)
 
 T = TypeVar("T")
 

@@ -20,11 +20,11 @@ from photonfarm.store.write.lease import LeasedError
 from photonfarm.trainer.data.batch import ResidentSamples
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.distributed import Ranks
+from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.learner import Learner, compiling
-from photonfarm.trainer.training.recovery import GoodState
+from photonfarm.trainer.training.validation import GoodState
 
 
 def assist(source: Callable[[str, float], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:

@@ -1,20 +1,50 @@
-"""The output of `photonfarm evaluate`: a head, a table, and notes on how far its figures can be trusted."""
+"""What `photonfarm evaluate` leaves behind: its figures, a table with notes on trust, and pictures side by side.
+
+Shape letters: H W image.
+"""
 
 from __future__ import annotations
 
+import json
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from photonfarm.core.errors import store_errors
+from photonfarm.core.formatting import format_count, format_markdown_table, format_milliseconds
+from photonfarm.core.pictures import Picture
 from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.compare.comparison import markdown_table
 from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
-from photonfarm.trainer.compare.evaluation_samples import References
+from photonfarm.trainer.compare.evaluation_samples import References, Target
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.predict.animation import enlarged, write_png
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
+from photonfarm.trainer.predict.trained import TrainedRun
+
+if TYPE_CHECKING:
+    from photonfarm.trainer.compare.evaluate import Evaluation
+
+EVALUATION = "evaluation.json"
 
 CONVERGED_SPP = 4096
 """The samples per pixel from which a reference counts as converged [method §4, ours]."""
 
 FEW_UNITS = 6
 """The number of configurations or views below which intervals by Student's t are of little use."""
+
+
+def write_evaluation(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list[Path]:
+    """Write evaluation.json and comparison.png into each run's folder; returns the pictures. Raises StoreError."""
+    text, picture = json.dumps(evaluation.document(), indent=2, ensure_ascii=False) + "\n", comparison(evaluation)
+    for run in runs:
+        with store_errors("write the evaluation", run.folder):
+            (run.folder / EVALUATION).write_text(text)
+        write_png(picture, run.folder / COMPARISON)
+    return [run.folder / COMPARISON for run in runs]
 
 
 def evaluation_text(evaluation: Evaluation) -> str:
@@ -28,7 +58,7 @@ def notes(evaluation: Evaluation) -> list[str]:
     """Notes on the errors, a sentence each."""
     found = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over "
-        f"{counted(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
+        f"{format_count(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:
@@ -44,7 +74,7 @@ def _of_few(units: int) -> str:
 def place_of_networks(evaluation: Evaluation) -> str:
     """The device of the networks in words, on a CPU with the number of threads."""
     return (
-        f"{evaluation.device}, {counted(evaluation.threads, 'thread')}"
+        f"{evaluation.device}, {format_count(evaluation.threads, 'thread')}"
         if evaluation.device == "cpu"
         else evaluation.device
     )
@@ -68,8 +98,8 @@ def _of_references(evaluation: Evaluation, references: References, metrics: Imag
     )
     units = metrics.mse.estimate.count
     found = [
-        f"references: of {counted(references.views, 'view')}, of {references.spp} samples per pixel or more; intervals "
-        f"over their {counted(units, evaluation.unit)}{_of_few(units)}; {converged}"
+        f"references: of {format_count(references.views, 'view')}, of {references.spp} samples per pixel or more; "
+        f"intervals over their {format_count(units, evaluation.unit)}{_of_few(units)}; {converged}"
     ]
     if any(row.kept is not None for row in evaluation.rows):
         found.append(
@@ -108,7 +138,7 @@ def _table(evaluation: Evaluation) -> str:
     first = evaluation.rows[0]
     columns = next((list(row.metrics.columns()) for row in evaluation.rows if row.metrics is not None), [])
     head = ["predictor", "network, ms", "linear MSE", "95 %", "more than the first", *columns]
-    return markdown_table(head, [_cells(row, first, columns) for row in evaluation.rows])
+    return format_markdown_table(head, [_cells(row, first, columns) for row in evaluation.rows])
 
 
 def _cells(row: PredictorRow, first: PredictorRow, columns: list[str]) -> list[str]:
@@ -116,7 +146,7 @@ def _cells(row: PredictorRow, first: PredictorRow, columns: list[str]) -> list[s
     metrics = {} if row.metrics is None else row.metrics.columns()
     return [
         row.name,
-        f"{1e3 * row.seconds.median:.1f}",
+        format_milliseconds(row.seconds.median),
         f"{row.held_out.error.mean:.5f}",
         _interval(row.held_out.error),
         "" if behind is None else f"{behind.mean:.5f} ({_interval(behind)})",
@@ -131,10 +161,56 @@ def _interval(estimate: Estimate) -> str:
 
 def views_of(evaluation: Evaluation, noun: str = "view") -> str:
     """The numbers of measured views and configurations; in a static scene, of views alone."""
-    views = counted(evaluation.samples, noun)
-    return views if evaluation.unit == "view" else f"{views} of {counted(evaluation.units, evaluation.unit)}"
+    views = format_count(evaluation.samples, noun)
+    return views if evaluation.unit == "view" else f"{views} of {format_count(evaluation.units, evaluation.unit)}"
 
 
-def counted(number: int, noun: str) -> str:
-    """A number with its noun."""
-    return f"{number} {noun}{'' if number == 1 else 's'}"
+COMPARISON = "comparison.png"
+
+TEXT = 14  # pixels, of the letters
+LINE = 18  # pixels, from one line of text to the next
+GAP = 8  # pixels, between pictures
+
+
+def comparison(evaluation: Evaluation) -> Picture:
+    """A column for the target and one for each predictor, a row for each of a few held-out samples.
+
+    All are shown as clip(exposure · I, 0, 1)^(1/2.2) with the scene's own exposure; the head of each column names it.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    cells = _place_pictures(evaluation)
+    height, width = cells[0][0].shape[:2]
+    font = ImageFont.load_default(TEXT)
+    letters = int(width // font.getlength("n"))
+    heads = [
+        textwrap.wrap(head, letters) for head in [_of_targets(evaluation.shown), *(row.name for row in evaluation.rows)]
+    ]
+    top = max(map(len, heads)) * LINE + GAP
+    step = height + LINE + GAP  # each row has its own line of text
+    sheet = Image.new("RGB", (len(heads) * (width + GAP) - GAP, top + len(cells) * step - GAP), "white")
+    draw = ImageDraw.Draw(sheet)
+    for column, head in enumerate(heads):
+        draw.multiline_text((column * (width + GAP), 0), "\n".join(head), fill="black", font=font, spacing=LINE - TEXT)
+    for place, (target, row) in enumerate(zip(evaluation.shown, cells, strict=True)):
+        draw.text((0, top + place * step), f"row {target.row} of the store", fill="black", font=font)
+        for column, picture in enumerate(row):
+            sheet.paste(Image.fromarray(picture), (column * (width + GAP), top + place * step + LINE))
+    return np.asarray(sheet)
+
+
+def _place_pictures(evaluation: Evaluation) -> list[list[Picture]]:
+    """The pictures of each shown sample; black where a predictor could not be measured, after a repair."""
+    found = []
+    for target in evaluation.shown:
+        images = [row.shown.get(target.row, np.zeros_like(target.image)) for row in evaluation.rows]
+        found.append([enlarged(image) for image in (target.image, *images)])
+    return found
+
+
+def _of_targets(shown: tuple[Target, ...]) -> str:
+    """The head of the first column."""
+    fewest = min(target.spp for target in shown)
+    if all(target.is_reference for target in shown):
+        return f"reference, {fewest} samples per pixel or more"
+    return f"target: mean of A and B, {fewest} samples per pixel, noisy"

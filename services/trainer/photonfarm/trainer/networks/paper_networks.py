@@ -1,0 +1,222 @@
+"""The networks of the paper: light transport without and with photons, and the baselines [supplement 1, 4].
+
+Points → light transport → projection → image synthesis. The Light Transport Layer is two PointNet blocks over the
+scene's point cloud [supplement 1.1, Fig. 1]. The figure concatenates each point's features with the maximum over all
+points. Here the two halves stay apart, one row per point and one per cloud, until the end: W [l, g] = W_l l + W_g g is
+the same function at about half the work.
+
+Of the baselines, `cnn` has no inputs but the image-space buffers, `denoise(1/k)` has part of a rendered image, and
+`feature_projection` has its scene's points.
+
+Shape letters: B batch, P points, K photon slots, F features of a point, L features of each point, G features of the
+cloud, H W image.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, SceneFrame, given
+from photonfarm.trainer.networks.network import Network, descriptors
+from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
+from photonfarm.trainer.runs.settings import NetworkSettings
+
+
+class FeatureProjection(Network):
+    """Each point's learnable descriptor, projected unchanged [supplement Table 1, "Feature projection"].
+
+    A descriptor moves with its point, and is the same in every configuration.
+    """
+
+    def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
+        super().__init__(settings, frame, further=settings.descriptor)
+        self.descriptor = descriptors(len(frame.appearance), settings)
+
+    def further(self, inputs: Inputs) -> list[Tensor]:
+        """The descriptors, averaged over the points in each pixel, (B, H, W, descriptor)."""
+        points = given(inputs.points)
+        features = self.descriptor.expand(len(points.position), -1, -1)
+        return [self.project(features, points.position, points.present, points.seen, inputs)]
+
+
+class Cnn(Network):
+    """Image synthesis from the image-space channels alone [supplement Table 1, "CNN only"]."""
+
+
+SHARE = 2
+"""The divisor of a light U-Net's width: half as wide, it has about a quarter of the work.
+
+Published times fit 1.50 s / k + 0.005 s, where the full U-Net takes 0.019 s [method 2, 4].
+"""
+
+
+class Denoiser(Network):
+    """A light U-Net over sparse noisy colour, the mask of the kept pixels, and the image-space channels.
+
+    It is trained on pairs of independent noisy halves (Lehtinen et al., Noise2Noise, 2018): its input is never in its
+    target. The colour is linear; the share of kept pixels affects only its weights, not its structure.
+    """
+
+    def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
+        super().__init__(settings, frame, further=3 + 1, share=SHARE)
+
+    def further(self, inputs: Inputs) -> list[Tensor]:
+        """The noisy colour, zero where not kept, and the mask, (B, H, W, 3) and (B, H, W, 1)."""
+        noisy = given(inputs.noisy)
+        return [noisy.colour, noisy.kept[..., None].to(noisy.colour)]
+
+
+WIDTH = 64
+"""The width of the layer's output and of each block's input [supplement Fig. 1]."""
+
+LOCAL = WIDTH // 2
+"""The width of the per-point half of a block's output; the other half is the maximum over points."""
+
+
+class ResidualBlock(nn.Module):
+    """A fully connected residual block 64 → 32, activations before each layer [supplement Fig. 1].
+
+    Ours where the figure gives no details: the last layer starts at zero and the shortcut has no bias, so that a block
+    starts as a linear map.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.hidden = nn.Linear(WIDTH, LOCAL)
+        self.out = nn.Linear(LOCAL, LOCAL)
+        self.shortcut = nn.Linear(WIDTH, LOCAL, bias=False)
+        for layer in (self.hidden, self.shortcut):
+            nn.init.kaiming_uniform_(layer.weight, nonlinearity="linear")
+        nn.init.zeros_(self.out.weight)
+        nn.init.zeros_(self.out.bias)
+
+    def forward(self, local: Tensor, shared: Tensor) -> Tensor:
+        """(B, P, L) and (B, G) with L + G = 64 → (B, P, 32)."""
+        hidden = _linear(self.hidden, torch.relu(local), torch.relu(shared))
+        return _linear(self.shortcut, local, shared) + self.out(torch.relu(hidden))
+
+
+def _linear(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
+    """Apply `layer` to each point's [local, shared], without building it."""
+    own, common = torch.split(layer.weight, [local.shape[-1], shared.shape[-1]], dim=1)
+    return functional.linear(local, own) + functional.linear(shared, common, layer.bias)[:, None]
+
+
+def masked_max(x: Tensor, present: Tensor) -> Tensor:
+    """The maximum over present points, (B, P, F) and (B, P) → (B, F); zero if no point is present."""
+    maximum = x.masked_fill(~present[..., None], -torch.inf).amax(dim=1)
+    return torch.where(present.any(dim=1, keepdim=True), maximum, 0)
+
+
+class LightTransportLayer(nn.Module):
+    """Features of each point that depend on the whole scene; the output is that of the second block.
+
+    Ours where the figure gives no details: weights start with variance 1 / inputs [LeCun et al. 1998], so that features
+    of size 1 stay so. By torch's default, a third of that, they would enter the U-Net far below its other channels.
+    """
+
+    def __init__(self, varying: int, fixed: int) -> None:
+        super().__init__()
+        self.preprocess = nn.Linear(varying + fixed, WIDTH)
+        nn.init.kaiming_uniform_(self.preprocess.weight, nonlinearity="linear")
+        self.blocks = nn.ModuleList([ResidualBlock(), ResidualBlock()])
+
+    def forward(self, varying: Tensor, fixed: Tensor, present: Tensor, reference: Tensor | None = None) -> Tensor:
+        """p_i and present (B, P) → f_i (B, P, 64).
+
+        p_i comes in two parts: values that differ between samples (B, P, F), and constants (P, F′). With a reference, a
+        cloud (P, F) of which all points are present, its maxima are subtracted, which is ours: the effect of a moved
+        lamp on them is small beside what all configurations have in common, and would be lost in the optimiser's
+        changes to that.
+        """
+        samples = len(varying)
+        if reference is not None:
+            varying = torch.cat([varying, reference[None]])
+            present = torch.cat([present, present.new_ones(1, present.shape[1])])
+        own, common = torch.split(self.preprocess.weight, [varying.shape[-1], fixed.shape[-1]], dim=1)
+        local = functional.linear(varying, own) + functional.linear(fixed, common, self.preprocess.bias)
+        shared = local.new_zeros(len(local), 0)
+        for block in self.blocks:
+            local = block(local, shared)
+            shared = masked_max(local, present)
+            if reference is not None:
+                shared = torch.where(present.any(dim=1, keepdim=True), shared - shared[-1:], 0)
+        local, shared = local[:samples], shared[:samples]
+        return torch.cat([local, shared[:, None].expand_as(local)], dim=-1)
+
+
+PHOTON_NUMBERS = 10
+"""The features of each photon beside its coordinates: direction 3, normal 3, power 3, bounce 1."""
+
+
+class LightTransport(Network):
+    """The supplement's network without photons: "Ours (w/o photons)"."""
+
+    appearance: Tensor
+    base: Tensor
+
+    def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = WIDTH) -> None:
+        super().__init__(settings, frame, further=further)
+        points, appearance = frame.appearance.shape
+        self.register_buffer("appearance", torch.from_numpy(frame.appearance), persistent=False)
+        self.register_buffer("base", torch.from_numpy(frame.base), persistent=False)
+        self.relative = settings.maxima == "relative"
+        self.descriptor = descriptors(points, settings)
+        self.light_transport = LightTransportLayer(self.coordinate_count, appearance + settings.descriptor)
+
+    def further(self, inputs: Inputs) -> list[Tensor]:
+        """f_i, averaged over the points in each pixel, (B, H, W, 64)."""
+        points = given(inputs.points)
+        return [self.project(self.point_features(points), points.position, points.present, points.seen, inputs)]
+
+    def point_features(self, points: PointInputs) -> Tensor:
+        """f_i (B, P, 64) from p_i: current world position, then normal, albedo, emission and learnable descriptor."""
+        fixed = torch.cat([self.appearance, self.descriptor], dim=1)
+        reference = self.coordinates(self.base) if self.relative else None
+        return self.light_transport(self.coordinates(points.position), fixed, points.present, reference)
+
+
+class LightTransportPhotons(LightTransport):
+    """The supplement's network with photons of the current configuration, "Ours (w/ photons)"; the design is ours.
+
+    With `photons = gathered` its inputs include the light gathered from them in windows of the image; and that of the
+    widest window, times albedo, is the image that its output is added to. With `transport` a second PointNet of the
+    same kind over the photons is projected and averaged like the points. No input depends on the number of photons
+    except by its noise: not their power, which is normalised, nor a maximum or mean over them.
+    """
+
+    def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
+        photon_light = PhotonLight(frame, settings.architecture)
+        transported = settings.photons == "transport"
+        super().__init__(settings, frame, further=WIDTH + (WIDTH if transported else 3 * len(WINDOWS)))
+        self.photon_light = photon_light
+        self.photon_depth, self.photon_scale = frame.photon_depth, frame.photon_scale
+        layer = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0) if transported else None
+        self.photon_transport = layer
+
+    def further(self, inputs: Inputs) -> list[Tensor]:
+        """The points' features, and log(1 + gathered light), (B, H, W, 3) each, or the photons' features, 64 wide."""
+        found, photons = super().further(inputs), given(inputs.photons)
+        if self.photon_transport is None:
+            return [*found, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
+        where = photons.position, photons.present, photons.seen
+        return [*found, self.project(self.photon_features(photons), *where, inputs)]
+
+    def gathered(self, inputs: Inputs) -> list[Tensor]:
+        """The light of all photons by `PhotonLight`, (B, H, W, 3) for each window."""
+        return self.photon_light(inputs)
+
+    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor | float:
+        """Albedo times the light of the widest window: the photon map's image of diffuse surfaces."""
+        return inputs.albedo * torch.expm1(further[-1]) if self.photon_transport is None else 0.0
+
+    def photon_features(self, photons: PhotonInputs) -> Tensor:
+        """The features of photons by their own layer, (B, K, 64), also of empty slots; ValueError without it."""
+        if self.photon_transport is None:
+            raise ValueError("photons = 'gathered': there is no layer for photons")
+        position, power = self.coordinates(photons.position), photons.power * self.photon_scale
+        bounce = photons.bounce[..., None] / self.photon_depth
+        numbers = torch.cat([position, photons.direction, photons.normal, power, bounce], dim=-1)
+        return self.photon_transport(numbers, numbers.new_zeros(numbers.shape[1], 0), photons.present)

@@ -1,0 +1,141 @@
+"""Denoisers that need no training: dropped pixels filled in from kept ones, and Intel's Open Image Denoise.
+
+Filling in is a normalised convolution [Knutsson and Westin, 1993] of demodulated colour. With kept pixels m ∈ {0, 1},
+colour c, a Gaussian g, and a divisor d that is the albedo where a surface has one and 1 elsewhere, a dropped pixel p
+becomes
+
+d(p) · Σ_q g(p − q) m(q) c(q) / Σ_q g(p − q) m(q) d(q)
+
+in each channel, over those q that have an albedo if p has one, and over the others if not. So light on a texture,
+c = d · E, is reproduced exactly wherever E is constant, and so is a constant image of a constant albedo; a lamp, whose
+albedo is 0, does not bleed into the wall beside it. It is a ratio of sums instead of a mean of ratios: dark surfaces,
+whose ratios are noisiest, count the least. Kept pixels do not change.
+
+Open Image Denoise takes colour, albedo and normals of one filled-in image. Its weights are part of the package `pyoidn`
+(the extra `oidn`), whose binding has the flag for HDR.
+
+Shape letters: B batch, H W image.
+"""
+
+from __future__ import annotations
+
+import math
+from importlib import import_module
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from photonfarm.core.errors import SpecError
+from photonfarm.core.records import F32
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, given
+
+LEAST_ALBEDO = 0.01
+"""The albedo below which a channel counts as having none: lamps, mirrors, glass, and the sky."""
+
+SPREAD = 0.6
+"""σ of the Gaussian over the mean distance √k between kept pixels; on `room` 0.5 … 0.75 do better than 0.35 or 1."""
+
+REACH = 3
+"""The radius at which the Gaussian is cut off, in σ."""
+
+
+def fill_in(noisy: NoisyColour, albedo: Tensor) -> Tensor:
+    """Whole images, (B, H, W, 3), linear radiance × exposure, from the kept pixels and the albedo, (B, H, W, 3).
+
+    A pixel without a kept one of its kind in reach takes a wider Gaussian, and if the image has none of its kind, all
+    of them; an image without kept pixels stays black.
+    """
+    kept = noisy.kept[..., None].to(noisy.colour)
+    has_albedo = albedo >= LEAST_ALBEDO
+    divisor = torch.where(has_albedo, albedo, 1)
+    filled, open_ = noisy.colour, ~noisy.kept[..., None].expand_as(noisy.colour)
+    sigma = SPREAD / math.sqrt(max(float(kept.mean()), 1 / kept[0].numel()))
+    side = max(kept.shape[1:3])
+    while bool(open_.any()) and sigma < 2 * side:
+        for kind in (has_albedo, ~has_albedo):
+            filled, open_ = _filled(filled, open_ & kind, open_, noisy.colour, kept * kind, divisor, sigma)
+        sigma *= 2
+    everything, one = kept.expand_as(divisor), torch.ones_like(divisor)
+    return _filled(filled, open_, open_, noisy.colour, everything, one, sigma)[0]
+
+
+def _filled(
+    image: Tensor, wanted: Tensor, open_: Tensor, colour: Tensor, weight: Tensor, divisor: Tensor, sigma: float
+) -> tuple[Tensor, Tensor]:
+    """The image with the wanted pixels filled in as far as kept ones reach, and those still open; (B, H, W, 3) all."""
+    if not bool(wanted.any()):
+        return image, open_
+    light, surface = (_blurred(weight * values, sigma) for values in (colour, divisor))
+    done = wanted & (surface > 0)
+    return torch.where(done, divisor * light / torch.where(done, surface, 1), image), open_ & ~done
+
+
+def _blurred(image: Tensor, sigma: float) -> Tensor:
+    """The sum over a Gaussian window around each pixel, (B, H, W, 3); zero beyond the border."""
+    reach = math.ceil(REACH * sigma)
+    window = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(image) / sigma) ** 2)
+    planes = image.movedim(-1, 1).flatten(0, 1)[:, None]  # (3 B, 1, H, W)
+    planes = functional.conv2d(planes, window[None, None, :, None], padding=(reach, 0))
+    planes = functional.conv2d(planes, window[None, None, None, :], padding=(0, reach))
+    return planes.reshape(len(image), 3, *image.shape[1:3]).movedim(1, -1)
+
+
+PACKAGE = "pyoidn"
+
+
+class Oidn:
+    """Whole images from the kept pixels of half A, for a `DevicePredictor` that has `Needs(points=False, kept=k)`.
+
+    It runs on the CPU, so that images do not depend on the machine's GPU. It is not thread-safe.
+    """
+
+    def __init__(self, threads: int = 1) -> None:
+        """Load the library. Raises SpecError if the package is not installed or does not work here."""
+        self._oidn = _package()
+        self._device = self._oidn.Device(self._oidn.OIDN_DEVICE_TYPE_CPU)
+        self._device.set_int("numThreads", threads)
+        self._device.set_bool("setAffinity", False)  # renderers share the machine
+        self._device.commit()
+        self._check()
+
+    def __call__(self, inputs: Inputs) -> Tensor:
+        """A batch's images, (B, H, W, 3), linear radiance × exposure."""
+        whole = fill_in(given(inputs.noisy), inputs.albedo)
+        images = zip(whole.numpy(), inputs.albedo.numpy(), inputs.normal.numpy(), strict=True)
+        return torch.from_numpy(np.stack([self.denoised(*image) for image in images]))
+
+    def denoised(self, colour: F32, albedo: F32, normal: F32) -> F32:
+        """One denoised image, (H, W, 3) each. Albedo and normals are taken as free of noise, which ours are."""
+        result = np.empty_like(colour, order="C")
+        named = {"color": colour, "albedo": np.clip(albedo, 0, 1), "normal": normal, "output": result}
+        images = {name: np.ascontiguousarray(image) for name, image in named.items()}  # must live until it has run
+        denoiser: Any = self._oidn.Filter(self._device, self._oidn.OIDN_FILTER_TYPE_RT)
+        try:  # its own context manager would swallow exceptions
+            for name, image in images.items():
+                denoiser.set_image(name, image, self._oidn.OIDN_FORMAT_FLOAT3)
+            denoiser.set_bool("hdr", True)
+            denoiser.set_bool("cleanAux", True)
+            denoiser.commit()
+            denoiser.execute()
+            self._check()
+        finally:
+            denoiser.release()
+        return result
+
+    def _check(self) -> None:
+        if (error := self._device.get_error()) is not None:
+            raise SpecError(f"the denoiser oidn: {PACKAGE} does not work here: {error}")
+
+
+def _package() -> ModuleType:
+    try:
+        return import_module(PACKAGE)
+    except (ImportError, OSError) as error:  # the latter if its library cannot be loaded
+        raise SpecError(
+            f"the denoiser oidn: needs the package {PACKAGE}, which cannot be imported ({error}); "
+            "pip install photonfarm[oidn]"
+        ) from error

@@ -1,0 +1,200 @@
+"""What a trainer spends its time on, and how far it is: in a small file of the run's folder, and a line now and then.
+
+From the times follows which of rendering, reading and training is the bottleneck.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Literal
+
+from photonfarm.core.files import write_whole
+from photonfarm.core.processes import repeating
+from photonfarm.core.waiting import in_words
+from photonfarm.farm.training import PROGRESS, TRAINS, WAITS, counted
+
+TimeKind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
+"""The kinds of time.
+
+In this order: building the network and the feed; steps; validations; waiting for samples to be rendered; waiting for
+samples to be read; writing checkpoints; and the rest, such as writing the log and drawing.
+"""
+
+KINDS: tuple[TimeKind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
+
+Bottleneck = Literal["rendering", "reading", "training"]
+
+NONE: Mapping[str, float] = {}
+
+
+class Stopwatch:
+    """Counts the seconds of a run by kind. At any moment exactly one kind is counted, so their sum is the wall time."""
+
+    def __init__(
+        self,
+        clock: Callable[[], float],
+        kind: TimeKind,
+        ahead: float = 0.0,
+        on_turn: Callable[[TimeKind], object] | None = None,
+    ) -> None:
+        """Begin to count `kind`, which has `ahead` seconds already; `on_turn` is told each kind that begins."""
+        self._on_turn = on_turn
+        self._clock, self._kind, self._since = clock, kind, clock() - ahead
+        self._spent: dict[str, float] = dict.fromkeys(KINDS, 0.0)
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """The seconds so far, by kind."""
+        self.turn(self._kind)
+        return dict(self._spent)
+
+    @property
+    def total(self) -> float:
+        """The sum of all kinds."""
+        return sum(self.seconds.values())
+
+    def add(self, seconds: Mapping[str, float]) -> None:
+        """Add the seconds of an earlier session of the run."""
+        for kind, value in seconds.items():
+            self._spent[kind] += value
+
+    def turn(self, kind: TimeKind) -> TimeKind:
+        """Switch to another kind; returns the one before."""
+        before, now = self._kind, self._clock()
+        self._spent[before] += now - self._since
+        self._kind, self._since = kind, now
+        if self._on_turn is not None:
+            self._on_turn(kind)
+        return before
+
+    @contextmanager
+    def on(self, kind: TimeKind) -> Iterator[None]:
+        """Switch to a kind while the block runs."""
+        before = self.turn(kind)
+        try:
+            yield
+        finally:
+            self.turn(before)
+
+
+def wait_shares(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
+    """The shares of the time since `before` in which training waited for samples to be rendered, and to be read."""
+    spent = {name: value - before.get(name, 0.0) for name, value in seconds.items()}
+    total = max(sum(spent.values()), 1e-9)
+    return {"samples": round(spent["wait_data"] / total, 4), "reading": round(spent["wait_read"] / total, 4)}
+
+
+def bottleneck(shares: Mapping[str, float]) -> Bottleneck:
+    """The part that takes most of the time, by `wait_shares`; the rest of the time counts as training."""
+    spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
+    spent["training"] = 1 - sum(spent.values())
+    return max(spent, key=lambda name: spent[name])
+
+
+def samples_per_used(samples: int, draws: int) -> float:
+    """The number of arrived samples for each used one; workers skip the scene while it is above their `--ahead`.
+
+    A sample counts as used once it is drawn, and a held-out one as soon as it arrives, as in the number that workers
+    read from Redis.
+    """
+    return samples / max(min(draws, samples), 1)
+
+
+def stated(shares: Mapping[str, float], ahead: float) -> str:
+    """The shares of `wait_shares`, the arrived samples for each used one, and the bottleneck, as part of a line."""
+    return (
+        f"waited {shares['samples']:.1%} of the time for samples and {shares['reading']:.1%} for reading, "
+        f"{ahead:.2f} samples there for each used (--ahead): {bottleneck(shares)} is the bottleneck"
+    )
+
+
+FILE_S = 2.0  # between two versions of the file
+LINE_S = 5.0  # between two lines
+SHORT_S = 1.0  # a phase that is over sooner is a part of training
+WINDOW = 30  # the versions over which the pace is taken: a minute
+
+WORDS: dict[TimeKind, str] = {
+    "start": "builds the network",
+    "train": TRAINS,
+    "validate": "validates",
+    "wait_data": WAITS,
+    "wait_read": "reads samples",
+    "save": "writes a checkpoint",
+    "other": TRAINS,
+}
+
+
+class RunProgress:
+    """Follows a session of training; `phase` and `drawn` are its hooks."""
+
+    def __init__(self, steps: int, batch: int, *, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take the last step, and the samples of each step."""
+        self._steps, self._batch, self._clock = steps, batch, clock
+        self._step = self._samples = 0
+        self._phase: tuple[TimeKind, float] = ("wait_data", clock())
+        self._history: deque[tuple[float, int]] = deque(maxlen=WINDOW)
+
+    def phase(self, kind: TimeKind) -> None:
+        """Note what the time is spent on from now on."""
+        if kind != self._phase[0]:
+            self._phase = (kind, self._clock())
+
+    def drawn(self, draws: int, samples: int) -> None:
+        """Note the samples drawn so far, and those that have arrived."""
+        self._step, self._samples = draws // self._batch, samples
+
+    def look(self) -> dict[str, object]:
+        """The present state, as the file holds it."""
+        now, (kind, since) = self._clock(), self._phase
+        self._history.append((now, self._step))
+        (began, first), left = self._history[0], None
+        if self._step > first:
+            left = max(self._steps - self._step, 0) * (now - began) / (self._step - first)
+        phase = WORDS[kind] if now - since >= SHORT_S or not self._step else TRAINS
+        return {
+            "step": self._step, "steps": self._steps, "samples": self._samples, "phase": phase,
+            "phase_s": round(now - since, 1), "left_s": left, "at_s": time.time(),
+        }  # fmt: skip
+
+    def line(self) -> str:
+        """The present state in words."""
+        found = self.look()
+        left = f", {in_words(found['left_s'])} left" if isinstance(found["left_s"], float) else ""
+        since = f" for {found['phase_s']:.0f} s" if found["phase"] != TRAINS else ""
+        return f"{self._steps_done}: {found['phase']}{since}, {self._samples} samples have arrived{left}"
+
+    def last_line(self) -> str:
+        """The state at the end of the session, in words; "" if nothing has arrived."""
+        return f"{self._steps_done}, {self._samples} samples have arrived" if self._samples else ""
+
+    @property
+    def _steps_done(self) -> str:
+        return f"step {counted(self._step, self._steps)}"
+
+
+@contextmanager
+def followed(progress: RunProgress, run: Path, say: Callable[[str], object] | None) -> Iterator[None]:
+    """Keep the file up to date until the block ends; say a line every five seconds, and a last one."""
+    said = time.monotonic()
+
+    def follow() -> None:
+        nonlocal said
+        with suppress(OSError):
+            write_whole(run / PROGRESS, json.dumps(progress.look()))
+        if say is not None and time.monotonic() - said >= LINE_S - FILE_S / 2:
+            said = time.monotonic()
+            say(progress.line())
+
+    try:
+        with repeating(FILE_S, follow):
+            yield
+        if say is not None and (last := progress.last_line()):
+            say(last)
+    finally:
+        with suppress(OSError):
+            (run / PROGRESS).unlink(missing_ok=True)

@@ -13,9 +13,9 @@ from exports import BRIGHT, FORMATS, exported, planned, read, several
 
 from photonfarm.cli.main import main
 from photonfarm.data import Sample, open_scene
-from photonfarm.export.columns import ranges, rows_in, spans
+from photonfarm.export.columns import format_ranges, parse_ranges, parse_rows
 from photonfarm.export.export import export_scene
-from photonfarm.export.settings import ExportRequest
+from photonfarm.export.manifest import ExportRequest
 from photonfarm.store import SceneStore
 
 GUIDES = tuple(samples.guides(samples.small_spec(), 0).__dataclass_fields__)
@@ -83,14 +83,14 @@ def test_a_scene_in_a_bucket_is_exported_as_one_in_a_folder_is(url: str, tmp_pat
 
 @pytest.mark.parametrize(("rows", "text"), [([], ""), ([7], "7"), ([3, 0, 1, 2, 9, 11, 12], "0-3,9,11-12")])
 def test_rows_are_written_as_ranges_and_read_back(rows: list[int], text: str) -> None:
-    assert ranges(rows) == text
-    assert rows_in(text) == sorted(rows)
+    assert format_ranges(rows) == text
+    assert parse_rows(text) == sorted(rows)
 
 
 @pytest.mark.parametrize("text", ["x", "3-1", "-1", "1-", "1:3", "1--3"])
 def test_what_is_no_rows_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="no row"):
-        spans(text)
+        parse_ranges(text)
 
 
 def test_a_shard_is_an_ordinary_tar_file(scene: SceneStore, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import store_samples as samples
 from exports import FORMATS, commit, exported, planned, read, several
 
 from photonfarm.core.errors import CorruptError, IncompleteError, SpecError, StoreError
-from photonfarm.export.columns import rows_in
+from photonfarm.export.columns import parse_rows
 from photonfarm.store import SceneStore
 
 # --------------------------------------------------------------------------------------------- going on, and growing
@@ -20,7 +20,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from photonfarm.export.export import export_scene
-from photonfarm.export.settings import ExportRequest
+from photonfarm.export.manifest import ExportRequest
 
 def progress(done, total, size):
     if done == 5:
@@ -77,7 +77,7 @@ def test_a_later_export_takes_only_what_is_new(tmp_path: Path, to: str) -> None:
         assert sorted(read(out, to)) == list(range(10))
     manifest = json.loads((out / "export.json").read_text())
     assert (manifest["complete"], manifest["rows"], manifest["jobs"]) == (True, "0-9", "0-4")
-    assert sorted(row for part in manifest["parts"] for row in rows_in(part["rows"])) in ([], list(range(10)))
+    assert sorted(row for part in manifest["parts"] for row in parse_rows(part["rows"])) in ([], list(range(10)))
 
 
 def test_a_sample_whose_bytes_are_damaged_ends_it_and_is_exported_once_it_is_mended(

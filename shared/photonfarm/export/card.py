@@ -1,20 +1,35 @@
-"""The card of an export, README.md: what it is, whose it is and how to read it; with what Hugging Face reads of it."""
+"""What describes an export: its card README.md, for people and Hugging Face, and Croissant metadata, for programs.
+
+The card says what it is, whose it is and how to read it.
+"""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from photonfarm.core.errors import store_errors
 from photonfarm.core.files import write_whole
 from photonfarm.core.formatting import format_markdown_table
-from photonfarm.export.columns import Column
+from photonfarm.export.columns import Column, Contents
 from photonfarm.export.folder import DATA
-from photonfarm.export.formats.format import Exported
-from photonfarm.export.manifest import Manifest
-from photonfarm.export.settings import FormatName
+from photonfarm.export.manifest import FormatName, Manifest
+from photonfarm.export.snapshot import Snapshot
 
 CARD = "README.md"
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """An export whose files of samples are written."""
+
+    folder: Path
+    snapshot: Snapshot
+    contents: Contents
+    manifest: Manifest
+
 
 READING: dict[FormatName, str] = {
     "webdataset": """\
@@ -56,13 +71,15 @@ _SIZES = ((10**3, "n<1K"), (10**4, "1K<n<10K"), (10**5, "10K<n<100K"), (10**6, "
 def write_card(exported: Exported) -> None:
     """Write the card; raises StoreError if the disk refuses."""
     with store_errors("write the card", exported.folder):
-        write_whole(exported.folder / CARD, card(exported))
+        write_whole(exported.folder / CARD, format_card(exported))
 
 
-def card(exported: Exported) -> str:
+def format_card(exported: Exported) -> str:
     """The text of the card."""
     found, name = exported.manifest, exported.manifest.scene.name
-    head = "\n".join(f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in _front(exported).items())
+    head = "\n".join(
+        f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in _describe_head(exported).items()
+    )
     reading = READING[found.settings.to].format(folder=exported.folder.name)
     return "\n".join([
         f"---\n{head}\n---\n",
@@ -71,14 +88,14 @@ def card(exported: Exported) -> str:
         "unbiased bidirectional path tracer with seeds of their own: they are independent, and the mean of many such "
         "images is the true one. So the mean of (f − A)(f − B) estimates the squared error of an image f against the "
         "noise-free image. Values are linear and not clipped.\n",
-        f"## Licence and credits\n\n{_credits(found)}\n",
+        f"## Licence and credits\n\n{_format_credits(found)}\n",
         f"## Reading it\n\n```python\n{reading}```\n",
-        f"## What a sample holds\n\n{_table(exported.contents.columns)}\n",
-        f"## Where it came from\n\n{_origin(found)}\n",
+        f"## What a sample holds\n\n{_format_table(exported.contents.columns)}\n",
+        f"## Where it came from\n\n{_format_origin(found)}\n",
     ])  # fmt: skip
 
 
-def _front(exported: Exported) -> dict[str, Any]:
+def _describe_head(exported: Exported) -> dict[str, Any]:
     """What stands above the card, as YAML."""
     found = exported.manifest
     licence = (found.credits or {}).get("licence")
@@ -94,11 +111,11 @@ def _front(exported: Exported) -> dict[str, Any]:
         files = [{"split": _SPLITS[split], "path": f"{DATA}/{split}-*"} for split in splits]
         head["configs"] = [{"config_name": "default", "data_files": files}]
     if found.settings.to == "parquet":  # without it `datasets` takes arrays for lists, and reads them number by number
-        head["dataset_info"] = {"features": [_feature(column) for column in exported.contents.columns]}
+        head["dataset_info"] = {"features": [_describe_feature(column) for column in exported.contents.columns]}
     return head
 
 
-def _feature(column: Column) -> dict[str, Any]:
+def _describe_feature(column: Column) -> dict[str, Any]:
     """A column as `datasets` describes it."""
     value = "string" if column.dtype == "str" else column.dtype
     match len(column.shape):
@@ -111,7 +128,7 @@ def _feature(column: Column) -> dict[str, Any]:
             return {"name": column.name, "dtype": array}
 
 
-def _credits(found: Manifest) -> str:
+def _format_credits(found: Manifest) -> str:
     if found.credits is None:
         return (
             "The scene's spec names neither author nor licence ([credits]); ask who made the scene before sharing it."
@@ -120,13 +137,13 @@ def _credits(found: Manifest) -> str:
     return "\n".join([*lines, "\nThe licence is the scene's; photonfarm lays no claim to what it renders."])
 
 
-def _table(columns: tuple[Column, ...]) -> str:
+def _format_table(columns: tuple[Column, ...]) -> str:
     shapes = [" × ".join(map(str, column.shape)) or "–" for column in columns]
     rows = [(f"`{c.name}`", c.dtype, shape, c.unit or "–", c.meaning) for c, shape in zip(columns, shapes, strict=True)]
     return format_markdown_table(("name", "type", "shape", "unit", "is"), rows)
 
 
-def _origin(found: Manifest) -> str:
+def _format_origin(found: Manifest) -> str:
     about, camera = found.constants, found.constants["camera"]
     groups = ", ".join(about["groups"]) or "none: the scene is static"
     return "\n".join([
@@ -138,3 +155,60 @@ def _origin(found: Manifest) -> str:
         f"- held out: a share {found.settings.hold_out:g} of the configurations, chosen by a hash of their content",
         "- versions and plans: export.json",
     ])  # fmt: skip
+
+
+CROISSANT = "croissant.json"
+
+_TYPES = {"str": "sc:Text", "bool": "sc:Boolean", "int64": "sc:Integer"}
+
+_CONTEXT: dict[str, Any] = {
+    "@language": "en", "@vocab": "https://schema.org/", "citeAs": "cr:citeAs", "column": "cr:column",
+    "conformsTo": "dct:conformsTo", "cr": "http://mlcommons.org/croissant/", "data": {"@id": "cr:data",
+    "@type": "@json"}, "dataType": {"@id": "cr:dataType", "@type": "@vocab"}, "dct": "http://purl.org/dc/terms/",
+    "extract": "cr:extract", "field": "cr:field", "fileObject": "cr:fileObject", "fileProperty": "cr:fileProperty",
+    "fileSet": "cr:fileSet", "format": "cr:format", "includes": "cr:includes", "isArray": "cr:isArray",
+    "arrayShape": "cr:arrayShape", "isLiveDataset": "cr:isLiveDataset", "jsonPath": "cr:jsonPath", "key": "cr:key",
+    "md5": "cr:md5", "parentField": "cr:parentField", "path": "cr:path", "recordSet": "cr:recordSet",
+    "references": "cr:references", "regex": "cr:regex", "repeated": "cr:repeated", "replace": "cr:replace",
+    "sc": "https://schema.org/", "separator": "cr:separator", "source": "cr:source", "subField": "cr:subField",
+    "transform": "cr:transform", "rai": "http://mlcommons.org/croissant/RAI/", "equivalentProperty":
+    "cr:equivalentProperty", "samplingRate": "cr:samplingRate", "examples": {"@id": "cr:examples", "@type": "@json"},
+}  # fmt: skip
+"""The context that the specification of Croissant 1.1 prints."""
+
+
+def write_croissant(exported: Exported) -> None:
+    """Write the Croissant metadata of tables: their files and columns, as JSON-LD for search engines and loaders."""
+    columns, manifest = exported.contents.columns, exported.manifest
+    said = manifest.credits or {}
+    document = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
+        "name": f"photonfarm-{manifest.scene.name}",
+        "description": f"{manifest.samples} samples of the scene {manifest.scene.name}: pairs of independent unbiased "
+        "noisy renders of views of it, with buffers.",
+        "version": f"1.0.0+{manifest.samples}.samples",
+        "license": said.get("licence", "unknown"),
+        "creator": {"@type": "sc:Organization", "name": said.get("author", "unknown")},
+        "url": said.get("source") or f"urn:photonfarm:scene:{manifest.scene.id}",
+        "isLiveDataset": True,
+        "distribution": [
+            {"@type": "cr:FileSet", "@id": "tables", "encodingFormat": "application/x-parquet",
+             "includes": f"{DATA}/*.parquet"},
+        ],
+        "recordSet": [{"@type": "cr:RecordSet", "@id": "samples", "key": {"@id": "samples/row"},
+                       "field": [_describe_field(column) for column in columns]}],
+    }  # fmt: skip
+    with store_errors("write the Croissant metadata", exported.folder):
+        write_whole(exported.folder / CROISSANT, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
+
+
+def _describe_field(column: Column) -> dict[str, Any]:
+    shape = {"isArray": True, "arrayShape": ",".join(map(str, column.shape))} if column.shape else {}
+    unit = f" Unit: {column.unit}." if column.unit not in ("", "1") else ""
+    return {
+        "@type": "cr:Field", "@id": f"samples/{column.name}", "name": column.name,
+        "description": f"{column.meaning}.{unit}", "dataType": _TYPES.get(column.dtype, f"cr:{column.dtype.title()}"),
+        **shape, "source": {"fileSet": {"@id": "tables"}, "extract": {"column": column.name}},
+    }  # fmt: skip

@@ -38,7 +38,7 @@ class Column:
     meaning: str
     fact: bool = False  # it says what the sample is: kilobytes at most, written as JSON where a format has JSON
 
-    def described(self) -> dict[str, Any]:
+    def describe(self) -> dict[str, Any]:
         """It as JSON holds it."""
         about = {"name": self.name, "dtype": self.dtype, "shape": list(self.shape)}
         return {**about, "unit": self.unit, "meaning": self.meaning}
@@ -74,7 +74,7 @@ class Contents:
         return next(column.shape[:2] for column in self.columns if column.name == HALVES[0])
 
 
-def buffers_named(text: str) -> tuple[str, ...]:
+def parse_buffers(text: str) -> tuple[str, ...]:
     """The buffers that `--buffers` asks for: "all", "none", or names with commas between them.
 
     Raises SpecError for a name that is not there.
@@ -89,20 +89,25 @@ def buffers_named(text: str) -> tuple[str, ...]:
     return tuple(name for name in there if name in asked)
 
 
-def columns(spec: SceneSpec, buffers: Sequence[str], *, visibility: bool) -> tuple[Column, ...]:
+def list_columns(spec: SceneSpec, buffers: Sequence[str], *, visibility: bool) -> tuple[Column, ...]:
     """The columns of a scene's samples: facts, the half-estimates, buffers, and visibility if it is asked for."""
     size = (spec.film.height, spec.film.width)
-    unit, _ = _declared("radiance")
-    halves = [Column(name, "float32", (*size, 3), unit, _half(name)) for name in HALVES]
-    return (*_facts(spec), *halves, *(_stored(spec, name) for name in buffers), *(_seen(spec) if visibility else ()))
+    unit, _ = _find_declaration("radiance")
+    halves = [Column(name, "float32", (*size, 3), unit, _describe_half(name)) for name in HALVES]
+    return (
+        *_list_facts(spec),
+        *halves,
+        *(_describe_stored(spec, name) for name in buffers),
+        *(_list_visibility(spec) if visibility else ()),
+    )
 
 
-def _half(name: str) -> str:
+def _describe_half(name: str) -> str:
     other = HALVES[name == "A"]
     return f"linear RGB, mean over the pixel, not clipped; a noisy estimate of the image, independent of {other}"
 
 
-def _facts(spec: SceneSpec) -> list[Column]:
+def _list_facts(spec: SceneSpec) -> list[Column]:
     groups = len(spec.groups)
     moved = Column("modification", "float32", (groups, 4), "scene units; the last: 1", "of each movable group, in the "
                    "order of the spec: translation from rest along x, y, z, then 1: present or 0: removed")  # fmt: skip
@@ -126,13 +131,13 @@ def _facts(spec: SceneSpec) -> list[Column]:
     return [replace(each, fact=True) for each in found]
 
 
-def _stored(spec: SceneSpec, name: str) -> Column:
+def _describe_stored(spec: SceneSpec, name: str) -> Column:
     """A buffer or guide in the type that the store has: its values are the stored ones."""
     array = schema.output_arrays(spec)[name]
-    return Column(name, array.dtype.name, array.shape, *_declared(name))
+    return Column(name, array.dtype.name, array.shape, *_find_declaration(name))
 
 
-def _seen(spec: SceneSpec) -> list[Column]:
+def _list_visibility(spec: SceneSpec) -> list[Column]:
     found = []
     for name, count in schema.bit_counts(spec).items():
         what = "point of the cloud" if name == "point_seen" else "photon of the configuration"
@@ -140,7 +145,7 @@ def _seen(spec: SceneSpec) -> list[Column]:
     return [column for column in found if column.shape[0]]
 
 
-def _declared(name: str) -> tuple[str, str]:
+def _find_declaration(name: str) -> tuple[str, str]:
     """Unit and convention of an array, as the store's format declares them."""
     (found,) = (each for each in declarations.OUTPUTS if each.name == name)
     return found.unit, found.convention
@@ -149,7 +154,7 @@ def _declared(name: str) -> tuple[str, str]:
 _RANGE = re.compile(r"(\d{1,18})(?:-(\d{1,18}))?")
 
 
-def ranges(rows: Iterable[int]) -> str:
+def format_ranges(rows: Iterable[int]) -> str:
     """Rows as ranges: 0, 1, 2, 7 is 0-2,7."""
     found: list[list[int]] = []
     for row in sorted(rows):
@@ -160,7 +165,7 @@ def ranges(rows: Iterable[int]) -> str:
     return ",".join(f"{first}-{last}" if last > first else f"{first}" for first, last in found)
 
 
-def spans(text: str) -> list[range]:
+def parse_ranges(text: str) -> list[range]:
     """The ranges that a text names, in its order; raises ValueError for other text."""
     found = []
     for part in filter(None, text.split(",")):
@@ -171,6 +176,6 @@ def spans(text: str) -> list[range]:
     return found
 
 
-def rows_in(text: str) -> list[int]:
+def parse_rows(text: str) -> list[int]:
     """The rows that `ranges` wrote."""
-    return [row for span in spans(text) for row in span]
+    return [row for span in parse_ranges(text) for row in span]

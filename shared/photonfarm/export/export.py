@@ -12,13 +12,13 @@ import numpy as np
 
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.waiting import waiting
-from photonfarm.export import card, configurations, folder, manifest
-from photonfarm.export.columns import GUIDES, Column, Contents, buffers_named, columns, ranges, spans
+from photonfarm.export import card, folder, manifest
+from photonfarm.export.card import Exported
+from photonfarm.export.columns import GUIDES, Column, Contents, format_ranges, list_columns, parse_buffers, parse_ranges
 from photonfarm.export.folder import Files, Planned
-from photonfarm.export.formats.format import Exported, Format, format_named
-from photonfarm.export.manifest import Manifest, SceneName
-from photonfarm.export.settings import ExportRequest, ExportSettings
-from photonfarm.export.snapshot import Snapshot, Values, constants
+from photonfarm.export.formats import Format, load_format
+from photonfarm.export.manifest import ExportRequest, ExportSettings, Manifest, SceneName
+from photonfarm.export.snapshot import Snapshot, Values, describe_constants
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.format.declarations import VERSION
@@ -57,42 +57,46 @@ def export_scene(
     Raises StoreError for a folder with something else in it, a scene that is not there, or a package that is missing;
     SpecError for what the scene does not have; IncompleteError if no sample is complete.
     """
-    form = format_named(request.to)
+    form = load_format(request.to)
     opened = Store(store)
     stored = scene_or_spec(opened, scene)
-    buffers = buffers_named(request.buffers)
-    configurations.check_extras(stored.spec, request.extras)
-    contents = _contents(form, stored.spec, buffers, request)
-    settings = _settings(buffers, contents, request)
+    buffers = parse_buffers(request.buffers)
+    folder.check_extras(stored.spec, request.extras)
+    contents = _plan_contents(form, stored.spec, buffers, request)
+    settings = _choose_settings(buffers, contents, request)
     name = SceneName(id=stored.scene_id, name=stored.spec.name)
     wanted = Manifest(scene=name, store=opened.store_id, settings=settings, constants=contents.about)
-    with folder.held(out, wanted) as found:
+    with folder.lock_folder(out, wanted) as found:
         job = _Export(form, out, contents, found, log, on_progress)
-        return job.run(_snapshot(store, stored, settings, log), request)
+        return job.run(_take_snapshot(store, stored, settings, log), request)
 
 
-def _contents(form: Format, spec: SceneSpec, buffers: Sequence[str], request: ExportRequest) -> Contents:
+def _plan_contents(form: type[Format], spec: SceneSpec, buffers: Sequence[str], request: ExportRequest) -> Contents:
     single = form.ONE_PER_FILE or (form.ONE_PER_FILE is None and request.samples_per_file in (None, 1))
     if form.ONE_PER_FILE and request.samples_per_file not in (None, 1):
         raise SpecError(f"--samples-per-file {request.samples_per_file}: --to {request.to} has one sample per file")
-    found = columns(spec, buffers, visibility="visibility" in request.extras)
-    return Contents(found, constants(spec), single)
+    found = list_columns(spec, buffers, visibility="visibility" in request.extras)
+    return Contents(found, describe_constants(spec), single)
 
 
-def _settings(buffers: tuple[str, ...], contents: Contents, request: ExportRequest) -> ExportSettings:
-    per_file = 1 if contents.single else request.samples_per_file or max(1, FILE_BYTES // _bytes_of(contents.columns))
+def _choose_settings(buffers: tuple[str, ...], contents: Contents, request: ExportRequest) -> ExportSettings:
+    per_file = (
+        1 if contents.single else request.samples_per_file or max(1, FILE_BYTES // _count_bytes(contents.columns))
+    )
     extras = tuple(sorted(request.extras))
     return ExportSettings(
         to=request.to, buffers=buffers, extras=extras, samples_per_file=per_file, hold_out=request.hold_out
     )
 
 
-def _bytes_of(found: Sequence[Column]) -> int:
+def _count_bytes(found: Sequence[Column]) -> int:
     """The bytes of a sample's values, without text."""
     return sum(int(np.prod(each.shape)) * np.dtype(each.dtype).itemsize for each in found if each.dtype != "str")
 
 
-def _snapshot(store: str | Path, stored: SceneStore, settings: ExportSettings, log: Callable[[str], None]) -> Snapshot:
+def _take_snapshot(
+    store: str | Path, stored: SceneStore, settings: ExportSettings, log: Callable[[str], None]
+) -> Snapshot:
     guides = not set(GUIDES).isdisjoint(settings.buffers)
     with waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
         snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
@@ -105,7 +109,7 @@ class _Export:
 
     def __init__(
         self,
-        form: Format,
+        form: type[Format],
         out: Path,
         contents: Contents,
         found: Manifest,
@@ -115,13 +119,13 @@ class _Export:
         self._form, self._out, self._contents, self._manifest = form, out, contents, found
         self._log, self._on_progress = log, on_progress
         self._files = Files(out, form.SUFFIX, found.settings.samples_per_file, single=contents.single)
-        self._configurations = set(configurations.written(out))
+        self._configurations = set(folder.list_configurations(out))
         self._done = self._total = self._bytes = 0
 
     def run(self, snapshot: Snapshot, request: ExportRequest) -> Result:
         """Write what is new, and then what describes the whole."""
-        chosen = _chosen(snapshot, request)
-        there, written = self._files.there(self._manifest.parts)
+        chosen = _choose_rows(snapshot, request)
+        there, written = self._files.scan(self._manifest.parts)
         new = sorted(set(chosen) - set(there))
         splits = {split: [row for row in new if snapshot.split_of(row) == split] for split in ("train", "held-out")}
         planned, parts = self._files.plan(splits, written)
@@ -142,17 +146,17 @@ class _Export:
 
     def _samples(self, snapshot: Snapshot, part: Planned) -> Iterator[Values]:
         """The samples of a file; what belongs to their configurations is written before them."""
-        extras = [each for each in self._manifest.settings.extras if each in configurations.OF_CONFIGURATION]
+        extras = [each for each in self._manifest.settings.extras if each in folder.OF_CONFIGURATION]
         for row in part.rows:
             sample = snapshot.sample(row)
             values = snapshot.values(sample, self._contents.columns)
             key = values["configuration_key"]
             if extras and key not in self._configurations:
-                configurations.write_configuration(configurations.file_of(self._out, key), sample, extras)
+                folder.write_configuration(folder.configuration_file(self._out, key), sample, extras)
                 self._configurations.add(key)
             yield values
             self._done += 1
-            self._bytes += _bytes_of(self._contents.columns)
+            self._bytes += _count_bytes(self._contents.columns)
             self._on_progress(self._done, self._total, self._bytes)
 
     def _finish(self, snapshot: Snapshot, rows: Collection[int]) -> None:
@@ -170,19 +174,19 @@ class _Export:
         return {
             "complete": True,
             "samples": len(rows),
-            "rows": ranges(rows),
+            "rows": format_ranges(rows),
             "configurations": len(self._configurations),
-            "columns": tuple(column.described() for column in self._contents.columns),
+            "columns": tuple(column.describe() for column in self._contents.columns),
             "credits": snapshot.spec.credits and snapshot.spec.credits.model_dump(),
-            "jobs": ranges(snapshot.jobs_of(rows)),
+            "jobs": format_ranges(snapshot.jobs_of(rows)),
             "plans": tuple(snapshot.plans()),
             "versions": {"photonfarm": version("photonfarm"), "store": VERSION, "rendered_by": rendered},
         }
 
 
-def _chosen(snapshot: Snapshot, request: ExportRequest) -> list[int]:
+def _choose_rows(snapshot: Snapshot, request: ExportRequest) -> list[int]:
     """The rows that are asked for; raises IncompleteError if none of them is complete."""
-    asked = spans(request.rows)
+    asked = parse_ranges(request.rows)
     rows = [row for row in snapshot.rows if not asked or any(row in span for span in asked)]
     if request.split != "all":
         rows = [row for row in rows if snapshot.split_of(row) == request.split]

@@ -1,8 +1,9 @@
-"""The manifest of an export, `export.json`: what is in the folder, where it came from, and which files are to come."""
+"""What is asked of an export, and its manifest `export.json`: what a folder holds, from where, and what is to come."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -10,8 +11,35 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from photonfarm.core.errors import StoreError, store_errors
 from photonfarm.core.files import write_whole
-from photonfarm.core.models import sentences
-from photonfarm.export.settings import ExportSettings
+from photonfarm.core.models import Frozen, sentences
+from photonfarm.plan.hold_out import HOLD_OUT
+
+FormatName = Literal["webdataset", "exr", "npz", "parquet"]
+Extra = Literal["points", "photons", "visibility"]
+
+
+class ExportSettings(Frozen):
+    """What every sample of an export holds, and in which files: the same for all of a folder's."""
+
+    to: FormatName
+    buffers: tuple[str, ...]  # names of buffers and guides
+    extras: tuple[Extra, ...] = ()  # what is exported only where it is asked for
+    samples_per_file: Annotated[int, Field(ge=1)]
+    hold_out: Annotated[float, Field(gt=0, lt=1)]  # the share of configurations labelled as held out
+
+
+@dataclass(frozen=True, slots=True)
+class ExportRequest:
+    """What a user asks to be exported."""
+
+    to: FormatName
+    split: Literal["all", "train", "held-out"] = "all"
+    rows: str = ""  # such as 0-31,40; "": all
+    buffers: str = "all"
+    extras: tuple[Extra, ...] = ()
+    samples_per_file: int | None = None  # None: as many as the format has, or as make 128 MB
+    hold_out: float = HOLD_OUT
+
 
 MANIFEST = "export.json"
 RowText = Annotated[str, Field(pattern=r"^[0-9,-]*$")]
@@ -90,9 +118,9 @@ def check(folder: Path, found: Manifest, wanted: Manifest) -> None:
     for name, said in found.settings:
         if said != (asked := getattr(wanted.settings, name)):
             option = "--with" if name == "extras" else f"--{name.replace('_', '-')}"
-            differ = f"{option} {_shown(said)}, and {_shown(asked)} was asked for"
+            differ = f"{option} {_format_value(said)}, and {_format_value(asked)} was asked for"
             raise StoreError(f"{folder}: holds an export with {differ}; ask for the same, or {remedy}")
 
 
-def _shown(value: Any) -> str:
+def _format_value(value: Any) -> str:
     return (",".join(value) or "none") if isinstance(value, tuple) else str(value)

@@ -78,7 +78,7 @@ class Snapshot:
     def values(self, sample: Sample, columns: Sequence[Column]) -> Values:
         """The values of a sample, each in its column's type."""
         found = self._facts(sample.row) | dict(zip(HALVES, sample.radiance, strict=True))
-        return {column.name: _of(sample, column, found) for column in columns}
+        return {column.name: _take_value(sample, column, found) for column in columns}
 
     def inputs(self, row: int) -> tuple[Modification, View]:
         """The configuration and the view of a row, complete or not."""
@@ -145,7 +145,7 @@ class _Job:
         return dict(self._figures["versions"])
 
 
-def _of(sample: Sample, column: Column, found: Values) -> Any:
+def _take_value(sample: Sample, column: Column, found: Values) -> Any:
     """The value of a column, in its type."""
     if column.name in found:
         value = found[column.name]
@@ -166,7 +166,7 @@ def camera_to_world(view: View, spec: SceneSpec) -> NDArray[np.float64]:
     return matrix
 
 
-def constants(spec: SceneSpec) -> dict[str, Any]:
+def describe_constants(spec: SceneSpec) -> dict[str, Any]:
     """What is the same for all samples of a scene: its id and name, its movable groups, its camera, its light."""
     width, half_angle = spec.film.width, 0.5 * np.radians(spec.view.fov_deg)
     return {
@@ -184,7 +184,7 @@ def constants(spec: SceneSpec) -> dict[str, Any]:
     }
 
 
-def plain(values: Values, columns: Sequence[Column]) -> dict[str, Any]:
+def select_facts(values: Values, columns: Sequence[Column]) -> dict[str, Any]:
     """The facts among the values of a sample, as JSON holds them."""
     facts = {column.name: values[column.name] for column in columns if column.fact}
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in facts.items()}

@@ -1,15 +1,25 @@
-"""The verb `export`."""
+"""The verb `export`, and what it prints: a bar on a terminal, else lines."""
 
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from photonfarm.cli.options import json_option, store_option
+from photonfarm.cli.show import print_json
+from photonfarm.core.formatting import format_bytes
+from photonfarm.core.waiting import in_words
 from photonfarm.plan.hold_out import HOLD_OUT
+
+if TYPE_CHECKING:
+    from photonfarm.export.export import OnProgress, Result
 
 EXTRAS = ("points", "photons", "visibility")
 
@@ -22,10 +32,10 @@ def _extras(ctx: click.Context, param: click.Parameter, text: str) -> tuple[str,
 
 
 def _rows(ctx: click.Context, param: click.Parameter, text: str) -> str:  # noqa: ARG001
-    from photonfarm.export.columns import spans
+    from photonfarm.export.columns import parse_ranges
 
     try:
-        spans(text)
+        parse_ranges(text)
     except ValueError as error:
         raise click.BadParameter(str(error)) from error
     return text
@@ -60,14 +70,58 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
 
     Exit codes: 0 exported, 7 no sample is complete, 4 store or folder, 3 what the scene does not have, 130 Ctrl-C.
     """
-    from photonfarm.export import show
     from photonfarm.export.export import export_scene
-    from photonfarm.export.settings import ExportRequest
+    from photonfarm.export.manifest import ExportRequest
 
     try:
-        with show.progress() as (log, on_progress):
+        with show_progress() as (log, on_progress):
             result = export_scene(store, scene, out, ExportRequest(**asked), log, on_progress)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)
-    show.result(result, as_json)
+    print_result(result, as_json)
+
+
+LINE_S = 4.0
+"""The seconds between lines of progress where there is no terminal."""
+
+
+@contextmanager
+def show_progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
+    """Functions that say a line, and how far the export is: a bar on a terminal, else lines; both on stderr."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True, soft_wrap=True)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("samples"),
+               TextColumn("{task.fields[rate]}"), TimeRemainingColumn())  # fmt: skip
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+        bar = bars.add_task("export", total=None, rate="", visible=False)
+        began = last = time.monotonic()
+
+        def show(done: int, total: int, size_bytes: int) -> None:
+            nonlocal last
+            now = time.monotonic()
+            rate = done / max(now - began, 1e-9)
+            speed = f"{rate:.0f}/s, {rate * size_bytes / done / 1e6:.0f} MB/s"
+            bars.update(bar, completed=done, total=total, rate=speed, visible=True)
+            if not console.is_terminal and (now - last > LINE_S or done == total):
+                last, left = now, in_words((total - done) / rate)
+                console.print(f"{done}/{total} samples, {speed}, {left} left", highlight=False)
+
+        def say(line: str) -> None:
+            nonlocal began
+            began = time.monotonic()  # the samples begin after the last line about what was before them
+            console.print(line, markup=False, highlight=False)
+
+        yield say, show
+
+
+def print_result(result: Result, as_json: bool) -> None:
+    """Print what was written."""
+    if as_json:
+        print_json(asdict(result))
+        return
+    shared = f", {result.configurations} configurations" if result.configurations else ""
+    size = f" in {result.new_files} files of {format_bytes(result.new_bytes)}" if result.new else ""
+    click.echo(f"{result.folder}: {result.samples} samples{shared}; {result.new} of them new{size}")

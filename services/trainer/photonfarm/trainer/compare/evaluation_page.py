@@ -9,7 +9,6 @@ import json
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,9 +23,6 @@ from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.predict.animation import enlarged, write_png
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.predict.trained import TrainedRun
-
-if TYPE_CHECKING:
-    from photonfarm.trainer.compare.evaluate import Evaluation
 
 EVALUATION = "evaluation.json"
 

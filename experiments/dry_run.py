@@ -39,9 +39,14 @@ class Need:
         of_passes = costs.seconds(spp, configurations=0, views=0, samples=passes)
         runs = [*experiment.trained(), *experiment.again()]
         return cls(
-            experiment.name, samples, of_samples / 3600, passes, of_passes / 3600, len(runs),
+            experiment.name,
+            samples,
+            of_samples / 3600,
+            passes,
+            of_passes / 3600,
+            len(runs),
             sum(operations(spec, run) for run in runs),
-        )  # fmt: skip
+        )
 
     def line(self, tflops: float) -> str:
         """All of it in words, with the hours of a device that sustains so many 10¹² operations a second."""

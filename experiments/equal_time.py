@@ -29,9 +29,11 @@ FAMILIES = {"denoise_": "denoisers trained on the room", "oidn ": "OIDN"}
 """How the names of a family's rows begin, and what it is called."""
 
 BESIDE = {
-    "denoise_": (5, 2, "left"), "denoise_32": (0, 6, "center"), "denoise_64": (-6, -3, "right"),
+    "denoise_": (5, 2, "left"),
+    "denoise_32": (0, 6, "center"),
+    "denoise_64": (-6, -3, "right"),
     "oidn ": (-6, -5, "right"),
-}  # fmt: skip
+}
 """Where a denoiser's k stands beside its point, in points, and how it is aligned: of each family, and of those of it
 that lie close together."""
 

@@ -33,11 +33,23 @@ from photonfarm.trainer.predict.animation import read_png, write_png
 from photonfarm.trainer.report.views import OVERVIEW, coloured
 from photonfarm.trainer.report.worst_cases import caption as worst_view
 
-ROOMS = ["static-bathroom", "static-kitchen", "night-living-room-2", "movable-veach-ajar", "fixed-living-room",
-         "fixed-veach-ajar"]  # fmt: skip
+ROOMS = [
+    "static-bathroom",
+    "static-kitchen",
+    "night-living-room-2",
+    "movable-veach-ajar",
+    "fixed-living-room",
+    "fixed-veach-ajar",
+]
 METRICS = ("mse", "mssim", "fid", *(f"feature-l1-{layer}" for layer in range(4)))
-COMPARED = ("oidn 1/1", "light_transport_photons", "guided", "guided_transport", "guided_transport_photons",
-            "denoise_1")  # fmt: skip
+COMPARED = (
+    "oidn 1/1",
+    "light_transport_photons",
+    "guided",
+    "guided_transport",
+    "guided_transport_photons",
+    "denoise_1",
+)
 """What is shown beside the reference: the best denoiser and published network, ours, and a denoiser of the room."""
 
 BEFORE, AFTER = "light_transport_photons", "guided_transport"

@@ -16,9 +16,16 @@ WIDTH = 120  # characters of a line
 def room_table(rooms: Sequence[Room]) -> str:
     """The images of each room, and how they were rendered."""
     head = (
-        "experiment", "images trained on", "held out", "spp", "references", "noise of targets, linear MSE",
-        "connections", "light ratio", "light samples",
-    )  # fmt: skip
+        "experiment",
+        "images trained on",
+        "held out",
+        "spp",
+        "references",
+        "noise of targets, linear MSE",
+        "connections",
+        "light ratio",
+        "light samples",
+    )
     return format_markdown_table(head, [_rendered(room) for room in rooms])
 
 
@@ -27,30 +34,43 @@ def _rendered(room: Room) -> list[str]:
     trained_on = sorted({run["trained_on"] for run in room.document["runs"].values()})
     images, references, guides = room.spent("samples"), evaluation["references"], card.get("guides")
     return [
-        room.name, " or ".join(map(str, trained_on)),
-        " or ".join(f"{images['rows'] - count}" for count in reversed(trained_on)), f"{card['spp_per_sample']}",
+        room.name,
+        " or ".join(map(str, trained_on)),
+        " or ".join(f"{images['rows'] - count}" for count in reversed(trained_on)),
+        f"{card['spp_per_sample']}",
         f"{references['views']} views, {references['spp']} spp" if references else NOT_AVAILABLE,
-        f"{evaluation['noise_floor']:.3g}", f"{card['transport']['connections']}",
-        f"{card['transport']['light_ratio']:g}", f"{guides['light_samples']}" if guides else NOT_AVAILABLE,
-    ]  # fmt: skip
+        f"{evaluation['noise_floor']:.3g}",
+        f"{card['transport']['connections']}",
+        f"{card['transport']['light_ratio']:g}",
+        f"{guides['light_samples']}" if guides else NOT_AVAILABLE,
+    ]
 
 
 def cost_table(rooms: Sequence[Room]) -> str:
     """What each room took, and whether the machine was quiet."""
     head = (
-        "experiment", "images, core-s", "reference passes", "passes, core-s", "MB in all", "edit, ms",
+        "experiment",
+        "images, core-s",
+        "reference passes",
+        "passes, core-s",
+        "MB in all",
+        "edit, ms",
         "load average of 1, 5, 15 min",
-    )  # fmt: skip
+    )
     return format_markdown_table(head, [_cost(room) for room in rooms])
 
 
 def _cost(room: Room) -> list[str]:
     images, passes, edit = room.spent("samples"), room.spent("top-up"), room.document["edit_seconds"]
     return [
-        room.name, f"{images['core_seconds']:.0f}", f"{passes['rows']}", f"{passes['core_seconds']:.0f}",
-        f"{room.document['dataset']['bytes'] / 1e6:.0f}", NOT_AVAILABLE if edit is None else f"{1e3 * edit:.0f}",
+        room.name,
+        f"{images['core_seconds']:.0f}",
+        f"{passes['rows']}",
+        f"{passes['core_seconds']:.0f}",
+        f"{room.document['dataset']['bytes'] / 1e6:.0f}",
+        NOT_AVAILABLE if edit is None else f"{1e3 * edit:.0f}",
         ", ".join(f"{average:.1f}" for average in room.document["machine"]["load_average"]),
-    ]  # fmt: skip
+    ]
 
 
 def descriptions(rooms: Sequence[Room]) -> str:

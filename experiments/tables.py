@@ -71,11 +71,14 @@ def _part(rooms: Sequence[Room], title: str, published: PublishedTable) -> list[
     """The tables of some rooms: pairs, errors, further metrics, and what they were measured on."""
     means = wrapped(f"Means over: {', '.join(room.name for room in rooms)}.{lacking(rooms)}")
     return [
-        f"## {title}", f"### Pairs of networks, by MSE\n\n{order_table(rooms, published)}",
+        f"## {title}",
+        f"### Pairs of networks, by MSE\n\n{order_table(rooms, published)}",
         f"### Time and errors\n\n{means}\n\n{error_table(rooms, published)}",
         f"### Further times and metrics\n\n{further_table(rooms, published)}",
-        f"### The rooms\n\n{room_table(rooms)}", cost_table(rooms), descriptions(rooms),
-    ]  # fmt: skip
+        f"### The rooms\n\n{room_table(rooms)}",
+        cost_table(rooms),
+        descriptions(rooms),
+    ]
 
 
 def page_of(size: SizeName) -> str:
@@ -91,8 +94,9 @@ def command(size: SizeName) -> str:
 def introduction(found: Sequence[Room], size: SizeName) -> str:
     """What was run, as the sizes and the reports tell."""
     kinds: dict[str, Callable[[Room], str]] = {
-        "networks": lambda room: room.steps(denoisers=False), "denoisers": lambda room: room.steps(denoisers=True)
-    }  # fmt: skip
+        "networks": lambda room: room.steps(denoisers=False),
+        "denoisers": lambda room: room.steps(denoisers=True),
+    }
     trained = [
         f"{kind} for {said(having, steps)}"
         for kind, steps in kinds.items()

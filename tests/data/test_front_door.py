@@ -81,14 +81,40 @@ def test_public_parameters(function: Callable[..., object], parameters: str) -> 
 
 def test_public_members() -> None:
     assert {name for name in dir(Scene) if not name.startswith("_")} == {
-        "geometry", "has_guides", "id", "name", "read_samples", "refresh", "row", "rows", "snapshot", "spec", "split",
+        "geometry",
+        "has_guides",
+        "id",
+        "name",
+        "read_samples",
+        "refresh",
+        "row",
+        "rows",
+        "snapshot",
+        "spec",
+        "split",
         "torch",
-    }  # fmt: skip
+    }
     members = {*dir(photonfarm.data.Sample), *(field.name for field in fields(photonfarm.data.Sample))}
     assert {name for name in members if not name.startswith("_")} == {
-        "buffers", "decoded", "guides", "images", "key", "modification", "pass_number", "photons", "point_cloud",
-        "radiance", "read_cloud", "read_photons", "row", "scale", "seeds", "seen_photons", "view", "visibility",
-    }  # fmt: skip
+        "buffers",
+        "decoded",
+        "guides",
+        "images",
+        "key",
+        "modification",
+        "pass_number",
+        "photons",
+        "point_cloud",
+        "radiance",
+        "read_cloud",
+        "read_photons",
+        "row",
+        "scale",
+        "seeds",
+        "seen_photons",
+        "view",
+        "visibility",
+    }
 
 
 def test_a_sample_is_what_was_committed(place: str | Path) -> None:

@@ -40,7 +40,7 @@ def row(name: str, place: int, mse: float) -> dict[str, Any]:
             "kid": {"mean": 0.05},
             "inception": {"source": "somewhere"},
         },
-    }  # fmt: skip
+    }
 
 
 def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 64) -> dict[str, Any]:
@@ -50,25 +50,40 @@ def report(rows: tuple[str, ...] = NETWORKS, *, steps: int = 3000, film: int = 6
         "edit_seconds": 0.1486,
         "trained_at": {"cnn": ["1111111"], "light_transport": ["1111111", "2222222"]},
         "dataset": {
-            "width": film, "height": film, "spp_per_sample": 8, "credits": None, "bytes": 694e6,
-            "transport": {"connections": 4, "light_ratio": 0.25}, "guides": {"light_samples": 16},
+            "width": film,
+            "height": film,
+            "spp_per_sample": 8,
+            "credits": None,
+            "bytes": 694e6,
+            "transport": {"connections": 4, "light_ratio": 0.25},
+            "guides": {"light_samples": 16},
             "spent": {
-                "samples": {"rows": 896, "core_seconds": 527.2}, "top-up": {"rows": 4032, "core_seconds": 725.4},
+                "samples": {"rows": 896, "core_seconds": 527.2},
+                "top-up": {"rows": 4032, "core_seconds": 725.4},
             },
         },
         "runs": [
             {
-                "name": name, "architecture": name, "trained_on": 769, "parameters": 1000, "steps": steps,
-                "seconds": {}, "settings": {"max_steps": steps, "batch": 2, "seed": 0},
+                "name": name,
+                "architecture": name,
+                "trained_on": 769,
+                "parameters": 1000,
+                "steps": steps,
+                "seconds": {},
+                "settings": {"max_steps": steps, "batch": 2, "seed": 0},
             }
             for name in rows
         ],
         "evaluation": {
-            "samples": 112, "units": 112, "noise_floor": 0.07, "device": "cpu", "threads": 1,
+            "samples": 112,
+            "units": 112,
+            "noise_floor": 0.07,
+            "device": "cpu",
+            "threads": 1,
             "references": {"views": 4, "spp": 512},
             "rows": [row(name, place, 0.01 * (place + 1)) for place, name in enumerate(rows)],
         },
-    }  # fmt: skip
+    }
 
 
 def leave(folder: Path, size: SizeName, document: dict[str, Any]) -> None:
@@ -129,8 +144,13 @@ def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named(
     )
     page = paper_tables.error_table(rooms, tables.MOVABLE_LIGHTS)
     assert cells(page, "architecture") == [
-        "architecture", "ms a frame", "MSE (95 %)", "paper: MSE", "MSSIM (95 %)", "paper: MSSIM",
-    ]  # fmt: skip
+        "architecture",
+        "ms a frame",
+        "MSE (95 %)",
+        "paper: MSE",
+        "MSSIM (95 %)",
+        "paper: MSSIM",
+    ]
     assert cells(page, "denoise_4")[1] == "500.0"
     assert cells(page, "cnn")[1] == "400.0"
     page = paper_tables.further_table(rooms, tables.MOVABLE_LIGHTS)
@@ -203,16 +223,24 @@ def test_what_could_not_be_measured_is_not_available() -> None:
     for of_row in bare["evaluation"]["rows"]:
         of_row["metric_space"] |= {"feature_l1": None, "fid": None, "kid": None, "inception": None}
         of_row["metric_space"]["mse"] = {
-            "estimate": {"mean": 0.01, "standard_error": None, "count": 1}, "values": [0.01],
-        }  # fmt: skip
+            "estimate": {"mean": 0.01, "standard_error": None, "count": 1},
+            "values": [0.01],
+        }
     bare["evaluation"]["rows"][1]["frame_seconds"] = None
     bare |= {"machine": {**MACHINE, "cpu": None}, "edit_seconds": None}
     found = room("night-living-room", bare)
     page = tables.page([found], "small")
     assert cells(page, "cnn")[1:] == ["100.0", "0.01000", "0.0100", "0.700 (0.477 … 0.923)", "0.827"]
     assert cells(page.split("### Further")[1], "cnn")[1:] == [
-        "20.0 (19.0 … 23.0)", "n/a", "0.78", "n/a", "33.7", "n/a", "n/a", "0.199",
-    ]  # fmt: skip
+        "20.0 (19.0 … 23.0)",
+        "n/a",
+        "0.78",
+        "n/a",
+        "33.7",
+        "n/a",
+        "n/a",
+        "0.199",
+    ]
     assert cells(page, "feature_projection")[1] == "n/a"
     assert cells(page, "`feature_projection` − `light_transport`")[2] == "n/a"
     assert "Timed on a CPU of unknown model, 2 cores" in page

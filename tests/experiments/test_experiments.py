@@ -59,8 +59,10 @@ def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
 def test_tables_are_merged_as_deep_as_they_go_and_lists_are_replaced() -> None:
     below: dict[str, Any] = {"a": {"b": 1, "c": {"d": 2}}, "lights": [1, 2], "e": 3}
     assert merged(below, {"a": {"c": {"f": 4}}, "lights": []}) == {
-        "a": {"b": 1, "c": {"d": 2, "f": 4}}, "lights": [], "e": 3,
-    }  # fmt: skip
+        "a": {"b": 1, "c": {"d": 2, "f": 4}},
+        "lights": [],
+        "e": 3,
+    }
     assert below["a"]["c"] == {"d": 2}
 
 
@@ -161,8 +163,10 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     assert room_table([room]).splitlines()[-1].startswith("| tiny | ")
     assert room.document["rows"]["light_transport"]["network_seconds_range"][0] > 0
     assert {name: len(errors) for name in room.rows if (errors := room.errors(name)) is not None} == {
-        "light_transport": 2, "denoise_4": 1, "fill-in 1/4": 1,
-    }  # fmt: skip
+        "light_transport": 2,
+        "denoise_4": 1,
+        "fill-in 1/4": 1,
+    }
 
     before = reports(stages)
     assert stages.run() == out
@@ -281,8 +285,13 @@ def test_a_run_of_other_settings_is_refused_with_its_folder(
     tiny = with_size(tiny, architectures=("light_transport",), seeds=(0,))
     trained(tiny, tmp_path / "work", step=3).train()
     assert not (tmp_path / "work" / "logs").exists()  # nothing had to be done
-    other = with_size(tiny, **{key: merged(getattr(tiny.size, key), value) if isinstance(value, dict) else value
-                               for key, value in changes.items()})  # fmt: skip
+    other = with_size(
+        tiny,
+        **{
+            key: merged(getattr(tiny.size, key), value) if isinstance(value, dict) else value
+            for key, value in changes.items()
+        },
+    )
     with pytest.raises(StageError, match=said) as refused:
         Stages(other, tmp_path / "work", workers=1).train()
     assert str(tmp_path / "work" / "runs" / "light_transport") in str(refused.value)

@@ -55,8 +55,10 @@ def test_a_tile_is_that_of_its_row_also_where_a_worst_view_is_among_the_first(fo
     report = Report(folder)
     assert report.first == [22, 55, 64]
     assert report.worst == {
-        64: ["mirrors and clear glass", "all pixels"], 305: ["specular surfaces"], 22: ["near surfaces"],
-    }  # fmt: skip
+        64: ["mirrors and clear glass", "all pixels"],
+        305: ["specular surfaces"],
+        22: ["near surfaces"],
+    }
     for column, name in enumerate((REFERENCE, *PREDICTORS)):
         assert list(report.tiles[name]) == [*FIRST, 305]
         for row, tile in report.tiles[name].items():

@@ -50,8 +50,14 @@ def check_sample(there: dict[str, Any], sample: Sample, to: str) -> None:
         assert given.tobytes() == values.tobytes(), name
     if to != "parquet":
         types = {name: str(there[name].dtype) for name in ("A", "albedo", "normal", "roughness", "depth", "direct")}
-        assert types == {"A": "float32", "albedo": half, "normal": half, "roughness": half, "depth": "float32",
-                         "direct": "float32"}  # fmt: skip
+        assert types == {
+            "A": "float32",
+            "albedo": half,
+            "normal": half,
+            "roughness": half,
+            "depth": "float32",
+            "direct": "float32",
+        }
     assert (there["key"], there["pass"]) == (sample.key.hex(), sample.pass_number)
     assert (there["seed_A"], there["seed_B"]) == sample.seeds
     np.testing.assert_array_equal(np.asarray(there["modification"], np.float32), sample.modification.vector)

@@ -103,8 +103,13 @@ def test_a_folder_that_holds_something_else_is_refused_and_stays_as_it_is(scene:
     for other in others:
         samples.commit_all(other)
     before = contents(out)
-    for changed in ({"to": "exr"}, {"buffers": "none"}, {"samples_per_file": 2}, {"extras": ("points",)},
-                    {"hold_out": 0.5}):  # fmt: skip
+    for changed in (
+        {"to": "exr"},
+        {"buffers": "none"},
+        {"samples_per_file": 2},
+        {"extras": ("points",)},
+        {"hold_out": 0.5},
+    ):
         with pytest.raises(StoreError):
             exported(scene, out, **{"to": "npz", **changed})
     for other in others:

@@ -16,8 +16,12 @@ from photonfarm.store import Store
 
 PAGE = Path(__file__).parents[2] / "docs/export.md"
 
-FOLDERS: dict[FormatName, str] = {"webdataset": "room-tar", "exr": "room-exr", "npz": "room-npz",
-                                  "parquet": "room-parquet"}  # fmt: skip
+FOLDERS: dict[FormatName, str] = {
+    "webdataset": "room-tar",
+    "exr": "room-exr",
+    "npz": "room-npz",
+    "parquet": "room-parquet",
+}
 """The folders that the page exports to."""
 
 

@@ -182,9 +182,11 @@ def analytic_base(spec: SceneSpec) -> tuple[Geometry, BasePointCloud]:
     faces = squares[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
     shape_group = np.array([STATIC, 0, 1] if spec.groups else [STATIC] * 3, np.int16)
     geometry = Geometry(
-        vertices.astype(np.float32), faces.astype(np.uint32), np.repeat([0, 1, 2], [12, 12, 2]).astype(np.int32),
+        vertices.astype(np.float32),
+        faces.astype(np.uint32),
+        np.repeat([0, 1, 2], [12, 12, 2]).astype(np.int32),
         shape_group,
-    )  # fmt: skip
+    )
     face, weight = sample_surface(geometry, spec.points, Stream(make_key(spec.scene_id), "cloud"))
     position = (vertices[faces[face]] * weight[..., None]).sum(axis=1)
     shape = geometry.face_shape[face]

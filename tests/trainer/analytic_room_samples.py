@@ -161,10 +161,19 @@ def known(clean: F32, buffers: ViewBuffers, lit: int) -> Guides:
     """Half of the light, which is all direct; and what a diffuse surface without mirrors has to tell."""
     dark, none = np.zeros_like(clean), np.zeros_like(buffers.depth)
     return Guides(
-        emission=dark, direct=clean / 2, gloss=dark, specular=dark, roughness=none + 1, mean_depth=buffers.depth,
-        mean_normal=buffers.normal, throughput=dark, beyond_albedo=dark, beyond_normal=dark, beyond_depth=none,
+        emission=dark,
+        direct=clean / 2,
+        gloss=dark,
+        specular=dark,
+        roughness=none + 1,
+        mean_depth=buffers.depth,
+        mean_normal=buffers.normal,
+        throughput=dark,
+        beyond_albedo=dark,
+        beyond_normal=dark,
+        beyond_depth=none,
         point_light=np.ones((lit, 3), np.float32),
-    )  # fmt: skip
+    )
 
 
 def noisy(clean: F32, seed: int, noise: float) -> F32:

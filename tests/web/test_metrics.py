@@ -59,8 +59,10 @@ def test_a_scrape_says_what_store_queue_workers_and_run_hold(farm: FarmWatch, sc
     sizes = [about["size"] for marker in markers for about in marker["files"].values()]
     assert of(found, "committed_bytes_total", **names) == sum(sizes)
     assert {state: of(found, "workers", state=state) for state in ("rendering", "paused", "idle")} == {
-        "rendering": 1, "paused": 1, "idle": 1,
-    }  # fmt: skip
+        "rendering": 1,
+        "paused": 1,
+        "idle": 1,
+    }
     jobs = {state: of(found, "queue_jobs", state=state) for state in ("waiting", "started", "failed")}
     assert jobs == {"waiting": 0, "started": 1, "failed": 1}
     assert of(found, "failed_jobs", error="ValueError", state="failed") == 1
@@ -162,10 +164,11 @@ def test_the_page_lists_every_metric_with_its_type_and_labels(farm: FarmWatch) -
     families = text_string_to_metric_families(FarmMetrics(farm.look).answer()[1].decode())
     assert listed == {
         family.name + "_total" * (family.type == "counter"): (
-            family.type, {label for sample in family.samples for label in sample.labels},
+            family.type,
+            {label for sample in family.samples for label in sample.labels},
         )
         for family in families
-    }  # fmt: skip
+    }
 
 
 # ------------------------------------------------------------------------------------------------------------ the verb

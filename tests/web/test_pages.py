@@ -61,10 +61,17 @@ def trained(scene: SceneStore, folder: Path) -> Path:
     """The folder of a training run, with pictures of two validations."""
     (folder / "views").mkdir(parents=True)
     records = [
-        {"kind": "validation", "step": step, "error": 1 / (step + 1), "standard_error": 0.1 / (step + 1),
-         "held_out": held_out, "samples": 6, "seconds": {"train": float(step)}}
+        {
+            "kind": "validation",
+            "step": step,
+            "error": 1 / (step + 1),
+            "standard_error": 0.1 / (step + 1),
+            "held_out": held_out,
+            "samples": 6,
+            "seconds": {"train": float(step)},
+        }
         for step, held_out in ((0, 1), (50, 2), (100, 2))
-    ]  # fmt: skip
+    ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
     (folder / "settings.json").write_text('{"max_steps": 200}')
     about = PngImagePlugin.PngInfo()
@@ -230,12 +237,25 @@ def test_a_sample_that_lands_is_seen_and_one_that_a_repair_takes_is_gone(store: 
 @pytest.mark.parametrize(
     "path",
     [
-        "/../pyproject.toml", "/..%2f..%2fetc/passwd", "/static/../server.py", "/server.py", "//etc/passwd", "/%00",
-        "/sample/../../etc/passwd/0/a.png", f"/sample/{'ab' * 16}/0/a.png", "/run/7/50.png", "/run/0/51.png",
-        "/run/0/../../settings.json", "/api/wall/xyz", f"/api/sample/{'0' * 32}/1", "/api", "/" + "a" * 5000,
-        "/api/state/", "/index.html/..",
+        "/../pyproject.toml",
+        "/..%2f..%2fetc/passwd",
+        "/static/../server.py",
+        "/server.py",
+        "//etc/passwd",
+        "/%00",
+        "/sample/../../etc/passwd/0/a.png",
+        f"/sample/{'ab' * 16}/0/a.png",
+        "/run/7/50.png",
+        "/run/0/51.png",
+        "/run/0/../../settings.json",
+        "/api/wall/xyz",
+        f"/api/sample/{'0' * 32}/1",
+        "/api",
+        "/" + "a" * 5000,
+        "/api/state/",
+        "/index.html/..",
     ],
-)  # fmt: skip
+)
 def test_there_is_nothing_besides_the_pages(server: PageServer, path: str) -> None:
     status, headers, content = asked(server, path)
     assert status == 404

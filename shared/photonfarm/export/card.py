@@ -81,7 +81,7 @@ def format_card(exported: Exported) -> str:
         f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in _describe_head(exported).items()
     )
     reading = READING[found.settings.to].format(folder=exported.folder.name)
-    return "\n".join([
+    parts = [
         f"---\n{head}\n---\n",
         f"# {name}\n",
         f"{found.samples} samples of the scene {name}. Each has two noisy images A and B of one view, rendered by an "
@@ -92,25 +92,26 @@ def format_card(exported: Exported) -> str:
         f"## Reading it\n\n```python\n{reading}```\n",
         f"## What a sample holds\n\n{_format_table(exported.contents.columns)}\n",
         f"## Where it came from\n\n{_format_origin(found)}\n",
-    ])  # fmt: skip
+    ]
+    return "\n".join(parts)
 
 
 def _describe_head(exported: Exported) -> dict[str, Any]:
     """What stands above the card, as YAML."""
-    found = exported.manifest
-    licence = (found.credits or {}).get("licence")
+    manifest = exported.manifest
+    licence = (manifest.credits or {}).get("licence")
     known = licence is not None and licence.lower().startswith(("cc0-", "cc-by-", "apache-", "mit"))
     head: dict[str, Any] = {"license": licence.lower() if licence and known else "other"}
     if licence and not known:
         head["license_name"] = licence
-    size = next((name for end, name in _SIZES if found.samples < end), "n>10M")
-    head |= {"pretty_name": found.scene.name, "tags": ["photonfarm", "rendering", "path-tracing", "denoising"]}
+    size = next((name for end, name in _SIZES if manifest.samples < end), "n>10M")
+    head |= {"pretty_name": manifest.scene.name, "tags": ["photonfarm", "rendering", "path-tracing", "denoising"]}
     head["size_categories"] = [size]
-    if found.parts:
-        splits = [split for split in _SPLITS if any(part.file.startswith(f"{DATA}/{split}-") for part in found.parts)]
+    if manifest.parts:
+        splits = [split for split in _SPLITS if any(part.file.startswith(f"{DATA}/{split}-") for part in manifest.parts)]
         files = [{"split": _SPLITS[split], "path": f"{DATA}/{split}-*"} for split in splits]
         head["configs"] = [{"config_name": "default", "data_files": files}]
-    if found.settings.to == "parquet":  # without it `datasets` takes arrays for lists, and reads them number by number
+    if manifest.settings.to == "parquet":  # without it `datasets` takes arrays for lists, and reads them number by number
         head["dataset_info"] = {"features": [_describe_feature(column) for column in exported.contents.columns]}
     return head
 
@@ -146,7 +147,7 @@ def _format_table(columns: tuple[Column, ...]) -> str:
 def _format_origin(found: Manifest) -> str:
     about, camera = found.constants, found.constants["camera"]
     groups = ", ".join(about["groups"]) or "none: the scene is static"
-    return "\n".join([
+    parts = [
         f"- scene id {found.scene.id}, store {found.store}",
         f"- committed jobs {found.jobs} of {len(found.plans)} plans, rows {found.rows} of the store",
         f"- half-estimates of {about['half_spp']} samples per pixel each; exposure {about['exposure']:g} for display",
@@ -154,7 +155,8 @@ def _format_origin(found: Manifest) -> str:
         f"- movable groups, in the order of `modification`: {groups}",
         f"- held out: a share {found.settings.hold_out:g} of the configurations, chosen by a hash of their content",
         "- versions and plans: export.json",
-    ])  # fmt: skip
+    ]
+    return "\n".join(parts)
 
 
 CROISSANT = "croissant.json"
@@ -194,12 +196,22 @@ def write_croissant(exported: Exported) -> None:
         "url": said.get("source") or f"urn:photonfarm:scene:{manifest.scene.id}",
         "isLiveDataset": True,
         "distribution": [
-            {"@type": "cr:FileSet", "@id": "tables", "encodingFormat": "application/x-parquet",
-             "includes": f"{DATA}/*.parquet"},
+            {
+                "@type": "cr:FileSet",
+                "@id": "tables",
+                "encodingFormat": "application/x-parquet",
+                "includes": f"{DATA}/*.parquet",
+            },
         ],
-        "recordSet": [{"@type": "cr:RecordSet", "@id": "samples", "key": {"@id": "samples/row"},
-                       "field": [_describe_field(column) for column in columns]}],
-    }  # fmt: skip
+        "recordSet": [
+            {
+                "@type": "cr:RecordSet",
+                "@id": "samples",
+                "key": {"@id": "samples/row"},
+                "field": [_describe_field(column) for column in columns],
+            }
+        ],
+    }
     with store_errors("write the Croissant metadata", exported.folder):
         write_whole(exported.folder / CROISSANT, json.dumps(document, indent=1, ensure_ascii=False) + "\n")
 
@@ -208,7 +220,11 @@ def _describe_field(column: Column) -> dict[str, Any]:
     shape = {"isArray": True, "arrayShape": ",".join(map(str, column.shape))} if column.shape else {}
     unit = f" Unit: {column.unit}." if column.unit not in ("", "1") else ""
     return {
-        "@type": "cr:Field", "@id": f"samples/{column.name}", "name": column.name,
-        "description": f"{column.meaning}.{unit}", "dataType": _TYPES.get(column.dtype, f"cr:{column.dtype.title()}"),
-        **shape, "source": {"fileSet": {"@id": "tables"}, "extract": {"column": column.name}},
-    }  # fmt: skip
+        "@type": "cr:Field",
+        "@id": f"samples/{column.name}",
+        "name": column.name,
+        "description": f"{column.meaning}.{unit}",
+        "dataType": _TYPES.get(column.dtype, f"cr:{column.dtype.title()}"),
+        **shape,
+        "source": {"fileSet": {"@id": "tables"}, "extract": {"column": column.name}},
+    }

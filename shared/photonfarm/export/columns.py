@@ -109,8 +109,14 @@ def _describe_half(name: str) -> str:
 
 def _list_facts(spec: SceneSpec) -> list[Column]:
     groups = len(spec.groups)
-    moved = Column("modification", "float32", (groups, 4), "scene units; the last: 1", "of each movable group, in the "
-                   "order of the spec: translation from rest along x, y, z, then 1: present or 0: removed")  # fmt: skip
+    moved = Column(
+        "modification",
+        "float32",
+        (groups, 4),
+        "scene units; the last: 1",
+        "of each movable group, in the "
+        "order of the spec: translation from rest along x, y, z, then 1: present or 0: removed",
+    )
     found = [
         Column("row", "int64", (), "1", "the sample's row in the store"),
         Column("key", "str", (), "", "the sample's content key, hexadecimal"),
@@ -121,13 +127,18 @@ def _list_facts(spec: SceneSpec) -> list[Column]:
         *([moved] if groups else []),
         Column("origin", "float32", (3,), "scene units", "where the camera stands, world coordinates"),
         Column("target", "float32", (3,), "scene units", "the point that it looks at, world coordinates"),
-        Column("camera_to_world", "float64", (4, 4), "scene units", "columns: the camera's right, up and backward, "
-               "and where it stands (the convention of NeRF and OpenGL)"),
+        Column(
+            "camera_to_world",
+            "float64",
+            (4, 4),
+            "scene units",
+            "columns: the camera's right, up and backward, and where it stands (the convention of NeRF and OpenGL)",
+        ),
         Column("seed_A", "int64", (), "1", "seed of A; a render that was not finite was drawn again with another"),
         Column("seed_B", "int64", (), "1", "seed of B, likewise"),
         Column("job", "int64", (), "1", "the render job that it came from"),
         Column("core_s", "float64", (), "s", "processor time of that job, over its samples"),
-    ]  # fmt: skip
+    ]
     return [replace(each, fact=True) for each in found]
 
 

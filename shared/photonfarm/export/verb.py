@@ -46,17 +46,41 @@ def _rows(ctx: click.Context, param: click.Parameter, text: str) -> str:  # noqa
 @store_option
 @click.option("--to", required=True, type=click.Choice(["webdataset", "exr", "npz", "parquet"]), help="The format.")
 @click.option("--out", required=True, type=click.Path(file_okay=False, path_type=Path), help="A folder.")
-@click.option("--split", type=click.Choice(["all", "train", "held-out"]), default="all", show_default=True,
-              help="The samples to train on, those held out, or both; each is labelled.")  # fmt: skip
-@click.option("--hold-out", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=HOLD_OUT,
-              show_default=True, help="Share of the configurations that is held out, as `train` has it.")  # fmt: skip
+@click.option(
+    "--split",
+    type=click.Choice(["all", "train", "held-out"]),
+    default="all",
+    show_default=True,
+    help="The samples to train on, those held out, or both; each is labelled.",
+)
+@click.option(
+    "--hold-out",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=HOLD_OUT,
+    show_default=True,
+    help="Share of the configurations that is held out, as `train` has it.",
+)
 @click.option("--rows", default="", callback=_rows, metavar="RANGES", help="These rows of the store alone: 0-31,40.")
-@click.option("--buffers", default="all", show_default=True, metavar="all|none|NAMES",
-              help="Buffers and guides beside A and B: albedo,normal,depth,direct and so on.")  # fmt: skip
-@click.option("--with", "extras", default="", callback=_extras, metavar="NAMES",
-              help="Also points and photons, once per configuration, and visibility, with each sample.")  # fmt: skip
-@click.option("--samples-per-file", type=click.IntRange(1), help="For webdataset, parquet and npz.  "
-              "[default: as many as make 128 MB; of npz 1]")  # fmt: skip
+@click.option(
+    "--buffers",
+    default="all",
+    show_default=True,
+    metavar="all|none|NAMES",
+    help="Buffers and guides beside A and B: albedo,normal,depth,direct and so on.",
+)
+@click.option(
+    "--with",
+    "extras",
+    default="",
+    callback=_extras,
+    metavar="NAMES",
+    help="Also points and photons, once per configuration, and visibility, with each sample.",
+)
+@click.option(
+    "--samples-per-file",
+    type=click.IntRange(1),
+    help="For webdataset, parquet and npz.  [default: as many as make 128 MB; of npz 1]",
+)
 @json_option
 def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any) -> None:
     """Write what is complete of a scene, by its name, its id or its spec, in a format that other programs read.
@@ -93,8 +117,14 @@ def show_progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True, soft_wrap=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("samples"),
-               TextColumn("{task.fields[rate]}"), TimeRemainingColumn())  # fmt: skip
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("samples"),
+        TextColumn("{task.fields[rate]}"),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
         bar = bars.add_task("export", total=None, rate="", visible=False)
         began = last = time.monotonic()

@@ -23,14 +23,26 @@ def _watch_options(command: Command) -> Command:
     options = (
         store_option,
         redis_option,
-        click.option("--run", "runs", type=click.Path(path_type=Path, file_okay=False), multiple=True,
-                     help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or "
-                     "run]"),
-        click.option("--host", default="localhost", show_default=True,
-                     help="The address to listen on; whoever reaches any other one sees all that is served."),
-        click.option("--name", "names", multiple=True,
-                     help="A name, beside the host's, by which others may ask; may be repeated."),
-    )  # fmt: skip
+        click.option(
+            "--run",
+            "runs",
+            type=click.Path(path_type=Path, file_okay=False),
+            multiple=True,
+            help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or run]",
+        ),
+        click.option(
+            "--host",
+            default="localhost",
+            show_default=True,
+            help="The address to listen on; whoever reaches any other one sees all that is served.",
+        ),
+        click.option(
+            "--name",
+            "names",
+            multiple=True,
+            help="A name, beside the host's, by which others may ask; may be repeated.",
+        ),
+    )
     found: Any = command
     for option in reversed(options):
         found = option(found)
@@ -39,8 +51,13 @@ def _watch_options(command: Command) -> Command:
 
 @click.command()
 @_watch_options
-@click.option("--port", type=click.IntRange(0, 65535), default=WEB_PORT, show_default=True,
-              help="If it is taken, a free one is taken instead.")  # fmt: skip
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=WEB_PORT,
+    show_default=True,
+    help="If it is taken, a free one is taken instead.",
+)
 def web(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any) -> None:
     """Serve pages that show the farm while it works: samples, noise, queue, workers, training, predictions.
 

@@ -74,20 +74,31 @@ class FarmMetrics(Collector):
 def _of_scenes(scenes: Sequence[SceneView]) -> Iterator[Metric]:
     names = "scene", "scene_id"
     of = {(_text(scene.name), scene.scene_id): scene for scene in scenes}
-    by_pass = [((*labels, which), counts) for labels, scene in of.items()
-               for which, counts in (("first", scene.samples), ("further", scene.passes))]  # fmt: skip
+    by_pass = [
+        ((*labels, which), counts)
+        for labels, scene in of.items()
+        for which, counts in (("first", scene.samples), ("further", scene.passes))
+    ]
     yield _counter(
-        "samples_committed", "Committed samples: first passes of views, and further ones.",
-        {labels: counts[0] for labels, counts in by_pass}, *names, "pass",
-    )  # fmt: skip
+        "samples_committed",
+        "Committed samples: first passes of views, and further ones.",
+        {labels: counts[0] for labels, counts in by_pass},
+        *names,
+        "pass",
+    )
     yield _gauge(
-        "samples_planned", "Planned samples: first passes of views, and further ones.",
-        {labels: counts[1] for labels, counts in by_pass}, *names, "pass",
-    )  # fmt: skip
+        "samples_planned",
+        "Planned samples: first passes of views, and further ones.",
+        {labels: counts[1] for labels, counts in by_pass},
+        *names,
+        "pass",
+    )
     yield _gauge(
-        "samples_in_hand", "Samples that are rendered, in jobs that are not committed yet.",
-        {labels: scene.in_hand for labels, scene in of.items()}, *names,
-    )  # fmt: skip
+        "samples_in_hand",
+        "Samples that are rendered, in jobs that are not committed yet.",
+        {labels: scene.in_hand for labels, scene in of.items()},
+        *names,
+    )
     committed = {labels: scene.jobs[0] for labels, scene in of.items()}
     yield _counter("jobs_committed", "Committed render jobs.", committed, *names)
     planned = {labels: scene.jobs[1] for labels, scene in of.items()}
@@ -102,9 +113,12 @@ def _of_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:
     yield _gauge("queue_up", "Whether the queue's Redis answers, 1 or 0.", {(): int(isinstance(queue, StoreQueue))})
     failed = _failures(queue)
     yield _gauge(
-        "failed_jobs", "Failed jobs by the class of their error: set aside until a retry, or kept by the store alone.",
-        failed, "error", "state",
-    )  # fmt: skip
+        "failed_jobs",
+        "Failed jobs by the class of their error: set aside until a retry, or kept by the store alone.",
+        failed,
+        "error",
+        "state",
+    )
     if isinstance(queue, NoQueue):
         return
     status = queue.status

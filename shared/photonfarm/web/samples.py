@@ -144,12 +144,10 @@ class SceneSamples:
             "noise": self._noted_noise(sample),
             "groups": [
                 {"name": group.name, "present": bool(there), "moved": moved.tolist()}
-                for group, there, moved in zip(
-                    spec.groups, modification.present, modification.translation, strict=True
-                )
+                for group, there, moved in zip(spec.groups, modification.present, modification.translation, strict=True)
             ],
             "images": ["mean", "a", "b", "noise", *_images_of(sample)],
-        }  # fmt: skip
+        }
 
     def mapped(self, cost_of: Callable[[int], float | None]) -> dict[str, Any]:
         """Where samples were seen from, in the plane below `up`, with their noise and what they cost."""

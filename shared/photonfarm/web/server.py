@@ -54,12 +54,18 @@ def page_routes(pages: FarmPages) -> Routes:
         (f"/sample/{_SCENE}/{_ROW}/thumbnail.jpg", True, lambda s, row: (JPEG, pages.samples(s).thumbnail(int(row)))),
         (f"/sample/{_SCENE}/{_ROW}/points", True, lambda s, row: (BYTES, pages.samples(s).points(int(row)))),
         (f"/sample/{_SCENE}/{_ROW}/photons", True, lambda s, row: (BYTES, pages.samples(s).photons(int(row)))),
-        (f"/sample/{_SCENE}/{_ROW}/reference.png", False,
-         lambda s, row: (PNG, pages.samples(s).picture(int(row), "reference"))),
-        (f"/sample/{_SCENE}/{_ROW}/([a-z_]{{1,20}}).png", True,
-         lambda s, row, name: (PNG, pages.samples(s).picture(int(row), name))),
+        (
+            f"/sample/{_SCENE}/{_ROW}/reference.png",
+            False,
+            lambda s, row: (PNG, pages.samples(s).picture(int(row), "reference")),
+        ),
+        (
+            f"/sample/{_SCENE}/{_ROW}/([a-z_]{{1,20}}).png",
+            True,
+            lambda s, row, name: (PNG, pages.samples(s).picture(int(row), name)),
+        ),
         ("/run/([0-9]{1,3})/([0-9]{1,8}).png", True, lambda run, step: (PNG, pages.prediction(int(run), int(step)))),
-    ]  # fmt: skip
+    ]
     found = [(re.compile(pattern.replace(".", r"\.")), stays, make) for pattern, stays, make in table]
     return found + metric_routes(pages.view)
 

@@ -231,8 +231,13 @@ def test_equal_images_have_no_error() -> None:
     references = _rooms(3)
     columns = image_metrics(references, references, _random_inception()).columns()
     assert {name: float(value) for name, value in columns.items()} == {
-        "MSE": 0, "MSSIM": 1, "FID": 0, "KID": 0, "Feature L1": 0, "FLIP": 0,
-    }  # fmt: skip
+        "MSE": 0,
+        "MSSIM": 1,
+        "FID": 0,
+        "KID": 0,
+        "Feature L1": 0,
+        "FLIP": 0,
+    }
 
 
 def test_without_weights_the_columns_of_inception_say_so() -> None:

@@ -174,9 +174,12 @@ def test_what_cannot_be_shown_is_refused(
 ) -> None:
     run = trained("light_transport_photons")
     path = frames(Modification.from_vector(np.tile([0, 0, 0, 1], (2, 1))), orbit(scene.spec, 2))
-    denoiser = replace(run, settings=run.settings.model_copy(
-        update={"network": run.settings.network.model_copy(update={"architecture": "denoise_4"})}
-    ))  # fmt: skip
+    denoiser = replace(
+        run,
+        settings=run.settings.model_copy(
+            update={"network": run.settings.network.model_copy(update={"architecture": "denoise_4"})}
+        ),
+    )
     refused = [
         ("photons", run, path),
         ("scene other", run, replace(path, scene_id="other")),
@@ -192,8 +195,10 @@ def test_what_cannot_be_shown_is_refused(
     with pytest.raises(PhotonfarmError) as error:
         infer.rendered_frames(store, run, ["--orbit", "0"])
     assert error.value.exit_code == 2
-    for show in (lambda: infer.show_sample(tmp_path, run, 7, tmp_path / "out"),
-                 lambda: infer.show_frames(tmp_path, run, path, tmp_path / "out")):  # fmt: skip
+    for show in (
+        lambda: infer.show_sample(tmp_path, run, 7, tmp_path / "out"),
+        lambda: infer.show_frames(tmp_path, run, path, tmp_path / "out"),
+    ):
         with pytest.raises(StoreError):
             show()
     assert not (tmp_path / "out").exists()

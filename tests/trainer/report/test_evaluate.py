@@ -115,12 +115,16 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
     assert result.exit_code == 0
     lines = [line for line in result.stdout.splitlines() if line.startswith("|")]
     assert [line.split(" | ")[0].removeprefix("| ").split(" ")[0] for line in lines[2:]] == [
-        "denoise_4", "light_transport", "oidn", "fill-in",
-    ]  # fmt: skip
+        "denoise_4",
+        "light_transport",
+        "oidn",
+        "fill-in",
+    ]
     assert lines[0].count("|") == lines[-1].count("|")
     assert [line for line in result.stderr.splitlines() if line.endswith(": 3 samples")][2:] == [
-        "oidn 1/4: 3 samples", "fill-in 1/4: 3 samples",
-    ]  # fmt: skip
+        "oidn 1/4: 3 samples",
+        "fill-in 1/4: 3 samples",
+    ]
     documents = [json.loads((run.folder / EVALUATION).read_text()) for run in runs]
     assert documents[0] == documents[1]
     assert documents[0]["rows"][2]["predictor"] == "oidn 1/4"
@@ -275,8 +279,9 @@ def test_a_configuration_file_may_name_one_run_or_several(store: Path, trained, 
             umbrella, ["--config", str(file), "evaluate", "--store", str(store), "--json"], catch_exceptions=False
         )
         assert [row["predictor"].split(" (")[0] for row in json.loads(result.stdout)["rows"]] == [
-            *["light_transport"] * wanted, "none 1/4",
-        ]  # fmt: skip
+            *["light_transport"] * wanted,
+            "none 1/4",
+        ]
 
 
 def test_runs_with_different_shares_are_measured_on_what_none_has_seen(scene: SceneStore, store: Path, trained) -> None:

@@ -148,9 +148,11 @@ def test_noise_does_not_make_a_dark_network_look_better_than_the_right_one() -> 
 def batch_of(half_a: Any, half_b: Any) -> Any:
     """One sample (1, H, W, 3), as far as a validation looks at it."""
     return SimpleNamespace(
-        rows=(0,), units=(b"a",), inputs=SimpleNamespace(noisy=None),
+        rows=(0,),
+        units=(b"a",),
+        inputs=SimpleNamespace(noisy=None),
         target=torch.from_numpy(np.stack([half_a, half_b], axis=1)),
-    )  # fmt: skip
+    )
 
 
 def at(batch: Any, predicted: Any, loss: str) -> Validation:

@@ -29,38 +29,66 @@ device_option = click.option(
 
 
 runs_option = click.option(
-    "--run", "runs", cls=RepeatableOption, multiple=True, type=click.Path(path_type=Path, file_okay=False),
-    default=["run"], envvar="PHOTONFARM_RUN", show_default=True,
+    "--run",
+    "runs",
+    cls=RepeatableOption,
+    multiple=True,
+    type=click.Path(path_type=Path, file_okay=False),
+    default=["run"],
+    envvar="PHOTONFARM_RUN",
+    show_default=True,
     help="Folder of a training run; several give several rows.",
-)  # fmt: skip
+)
 references_option = click.option(
-    "--references", type=click.Path(path_type=Path, file_okay=False), metavar="FOLDER",
+    "--references",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="FOLDER",
     help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
-)  # fmt: skip
+)
 denoisers_option = click.option(
-    "--denoiser", "denoisers", type=click.Choice(get_args(ReadyDenoiser)), cls=RepeatableOption, multiple=True,
+    "--denoiser",
+    "denoisers",
+    type=click.Choice(get_args(ReadyDenoiser)),
+    cls=RepeatableOption,
+    multiple=True,
     help="Measure a ready one too, or several. none: dropped pixels stay black.",
-)  # fmt: skip
+)
 kept_option = click.option(
-    "--kept", type=click.IntRange(1), cls=RepeatableOption, multiple=True, metavar="K",
+    "--kept",
+    type=click.IntRange(1),
+    cls=RepeatableOption,
+    multiple=True,
+    metavar="K",
     help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
-)  # fmt: skip
+)
 samples_option = click.option(
-    "--samples", "most", type=click.IntRange(1), default=MOST_HELD_OUT, show_default=True,
+    "--samples",
+    "most",
+    type=click.IntRange(1),
+    default=MOST_HELD_OUT,
+    show_default=True,
     help="At most so many, each of a view of its own.",
-)  # fmt: skip
+)
 inception_option = click.option(
-    "--inception", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
+    "--inception",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
     help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
-)  # fmt: skip
+)
 
 
 def measuring(command: Callable[..., None]) -> Callable[..., None]:
     """The options for what is measured, against what and on which device; `_how` takes all but the runs."""
     options = (
-        store_option, runs_option, references_option, denoisers_option, kept_option, samples_option, inception_option,
+        store_option,
+        runs_option,
+        references_option,
+        denoisers_option,
+        kept_option,
+        samples_option,
+        inception_option,
         device_option,
-    )  # fmt: skip
+    )
     for option in reversed(options):
         command = option(command)
     return command
@@ -117,9 +145,7 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
 @click.option("--untimed", is_flag=True, help="Leave out the time of a frame, which asks for a quiet machine.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @json_option
-def report(
-    store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, as_json: bool, **asked: Any
-) -> None:  # fmt: skip
+def report(store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, as_json: bool, **asked: Any) -> None:
     """Write report.html, report.md and report.json: what was learned, at which cost, with pictures.
 
     Runs and denoisers are measured as by `evaluate`. Where the renderer is installed, the time of a frame is measured
@@ -140,13 +166,25 @@ def report(
 @run_option
 @click.option("--row", type=click.IntRange(0), help="The sample in a row of the store.")
 @click.option("--view", metavar="VECTOR|KEY", help="The sample of this view, as `store find` takes it.")
-@click.option("--modification", metavar="VECTOR|KEY", help="And of this configuration; of a path its configuration, "
-              "which otherwise is the scene at rest.")  # fmt: skip
-@click.option("--camera-path", "path", type=click.Path(path_type=Path, exists=True, dir_okay=False), metavar="FILE",
-              help="Views along a path in JSON, as `photonfarm buffers` takes it.")  # fmt: skip
+@click.option(
+    "--modification",
+    metavar="VECTOR|KEY",
+    help="And of this configuration; of a path its configuration, which otherwise is the scene at rest.",
+)
+@click.option(
+    "--camera-path",
+    "path",
+    type=click.Path(path_type=Path, exists=True, dir_okay=False),
+    metavar="FILE",
+    help="Views along a path in JSON, as `photonfarm buffers` takes it.",
+)
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="FRAMES", help="Views once around the scene.")
-@click.option("--buffers", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-              help="Views whose buffers `photonfarm buffers` wrote, on a machine with the renderer.")  # fmt: skip
+@click.option(
+    "--buffers",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Views whose buffers `photonfarm buffers` wrote, on a machine with the renderer.",
+)
 @click.option("--fps", type=click.FloatRange(1, 50), default=12.0, show_default=True, help="Frames a second of a path.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @device_option

@@ -15,9 +15,13 @@ from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, 
 from photonfarm.trainer.runs.user_code import is_own
 
 run_option = click.option(
-    "--run", type=click.Path(path_type=Path, file_okay=False), envvar="PHOTONFARM_RUN", default="run",
-    show_default=True, help="Folder of the training run: checkpoints, metrics.",
-)  # fmt: skip
+    "--run",
+    type=click.Path(path_type=Path, file_okay=False),
+    envvar="PHOTONFARM_RUN",
+    default="run",
+    show_default=True,
+    help="Folder of the training run: checkpoints, metrics.",
+)
 
 
 class ChoiceOrOwn(click.Choice[str]):
@@ -74,8 +78,12 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
     "--precision", type=click.Choice(get_args(Precision)), help="Of the U-Net's computations.  [default: float32]"
 )
 @click.option("--steps", "max_steps", type=click.IntRange(1), help="Steps to train for.  [default: the preset's]")
-@click.option("--seconds", "max_seconds", type=click.FloatRange(0, min_open=True),
-              help="Stop after so much time in all, with waiting and what the run has had before.")  # fmt: skip
+@click.option(
+    "--seconds",
+    "max_seconds",
+    type=click.FloatRange(0, min_open=True),
+    help="Stop after so much time in all, with waiting and what the run has had before.",
+)
 @click.option("--batch", type=click.IntRange(1), help="Samples per step.  [default: the preset's]")
 @click.option("--seed", type=click.IntRange(0), help="Of the weights and the draws; 0 is a seed.  [default: 0]")
 @click.option("--replay-ratio", type=click.FloatRange(0, min_open=True), help="Draws per sample that has arrived.")
@@ -93,10 +101,12 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
     "your own, refused if it biases.  [default: the preset's]",
 )
 @click.option("--optimiser", metavar=f"[{'|'.join(get_args(Optimiser))}]", help="[default: adam]")
-@click.option("--learning-rate", type=click.FloatRange(0, min_open=True),
-              help="At the beginning.  [default: the preset's]")  # fmt: skip
-@click.option("--decay", type=click.FloatRange(0, 1, min_open=True),
-              help="Of the rate, per epoch.  [default: the preset's]")  # fmt: skip
+@click.option(
+    "--learning-rate", type=click.FloatRange(0, min_open=True), help="At the beginning.  [default: the preset's]"
+)
+@click.option(
+    "--decay", type=click.FloatRange(0, 1, min_open=True), help="Of the rate, per epoch.  [default: the preset's]"
+)
 @click.option("--beta2", type=float, help="Of Adam; 0.9999 or more where fireflies are rare.  [default: 0.999]")
 @click.option(
     "--demodulation",
@@ -111,20 +121,40 @@ def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
     metavar="KEY=VALUE",
     help=f"Any setting, also those above, whose own options come first; may be repeated: {', '.join(KEYS)}.",
 )
-@click.option("--until-complete", is_flag=True,
-              help="End with exit code 7, not 0, if a signal stops it, so that schedulers start it again.")  # fmt: skip
+@click.option(
+    "--until-complete",
+    is_flag=True,
+    help="End with exit code 7, not 0, if a signal stops it, so that schedulers start it again.",
+)
 @click.option("--summary", is_flag=True, help="Only print the network's parameters and work, part by part.")
 @click.option("--check", is_flag=True, help="Only say whether the run is alive (exit 0) or not (7).")
-@click.option("--dry-run", is_flag=True, help="Only estimate work, memory and time here, by a few steps "
-              "on made-up samples; write nothing.")  # fmt: skip
-@click.option("--film", type=click.IntRange(8), metavar="PIXELS",
-              help="With --dry-run: the side of images, instead of the spec's.")  # fmt: skip
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Only estimate work, memory and time here, by a few steps on made-up samples; write nothing.",
+)
+@click.option(
+    "--film",
+    type=click.IntRange(8),
+    metavar="PIXELS",
+    help="With --dry-run: the side of images, instead of the spec's.",
+)
 @json_option
 def train(
-    spec: str | None, store: str | Path, run: Path, redis_url: str, preset: str, pairs: tuple[str, ...],
-    until_complete: bool, summary: bool, check: bool, dry_run: bool, film: int | None, as_json: bool,
+    spec: str | None,
+    store: str | Path,
+    run: Path,
+    redis_url: str,
+    preset: str,
+    pairs: tuple[str, ...],
+    until_complete: bool,
+    summary: bool,
+    check: bool,
+    dry_run: bool,
+    film: int | None,
+    as_json: bool,
     **options: Any,
-) -> None:  # fmt: skip
+) -> None:
     """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
 
     Redis, where there is one, gets the number of used samples, for `photonfarm work --ahead`. Several processes share

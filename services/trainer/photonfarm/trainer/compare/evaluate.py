@@ -316,9 +316,14 @@ class _Test:
         images, units = np.stack([watched.images[row] for row in rows]), [watched.units[row] for row in rows]
         known = None if self.inception is None else self._features(tuple(rows), mean, self.inception)
         return image_metrics(
-            images, mean, self.inception, units, (halves[0], halves[1]), having_seen_a=having_seen_a,
+            images,
+            mean,
+            self.inception,
+            units,
+            (halves[0], halves[1]),
+            having_seen_a=having_seen_a,
             wanted_features=known,
-        )  # fmt: skip
+        )
 
     def _features(self, rows: tuple[int, ...], references: F32, inception: Inception) -> Features:
         """The features of the references of some rows, which are the same for almost all predictors."""

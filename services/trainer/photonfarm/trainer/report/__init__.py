@@ -47,9 +47,16 @@ def write_report(
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()  # an unwritable folder should fail before the measurements
     contents = gathered(
-        store, loaded, denoisers, references=references, inception=inception, most=most,
-        device=device, on_progress=on_progress, timed=timed,
-    )  # fmt: skip
+        store,
+        loaded,
+        denoisers,
+        references=references,
+        inception=inception,
+        most=most,
+        device=device,
+        on_progress=on_progress,
+        timed=timed,
+    )
     if on_progress:
         on_progress("plots and pages are drawn", 0, 0)
     drawn, views, verdict = plots(contents), shown_views(contents), Verdict.of(contents)

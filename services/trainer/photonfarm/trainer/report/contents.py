@@ -155,9 +155,16 @@ def gathered(
     tell = on_progress or (lambda *_: None)
     close_look = _CloseLook(store, first, kept, points_used(runs), tell, timed=timed)
     evaluation = evaluate.compare(
-        store, runs, denoisers, references=references, inception=inception, most=most, device=device,
-        on_progress=on_progress, choose=close_look,
-    )  # fmt: skip
+        store,
+        runs,
+        denoisers,
+        references=references,
+        inception=inception,
+        most=most,
+        device=device,
+        on_progress=on_progress,
+        choose=close_look,
+    )
     tell("the mean colour and the untrained network are measured", 0, 0)
     costs = close_look.costs
     found = table_of(card.spec)

@@ -35,9 +35,19 @@ STYLE: dict[Any, Any] = {  # names of matplotlib
     "grid.alpha": 0.3,
 }
 COLOURS = (
-    "#1f5fa8", "#c2571a", "#3b8f4d", "#8a4fa3", "#8c6d31", "#777777", "#d62728", "#17a2b8", "#e377c2", "#a6a61a",
-    "#111111", "#8fbcff",
-)  # fmt: skip
+    "#1f5fa8",
+    "#c2571a",
+    "#3b8f4d",
+    "#8a4fa3",
+    "#8c6d31",
+    "#777777",
+    "#d62728",
+    "#17a2b8",
+    "#e377c2",
+    "#a6a61a",
+    "#111111",
+    "#8fbcff",
+)
 """The colours of the predictors, by their places in the tables, in all plots; they repeat beyond twelve."""
 
 
@@ -96,10 +106,11 @@ def _curves(contents: ReportContents) -> Iterator[Plot]:
         ("samples", "samples drawn, repeats counted", lambda _, point: point.draws),
         ("rendering", "core-seconds of rendering", lambda _, point: point.core_s(per_sample)),
         (
-            "all", f"core-seconds of rendering and of training{on_gpu}",
+            "all",
+            f"core-seconds of rendering and of training{on_gpu}",
             lambda story, point: point.core_s(per_sample) + story.step_core_s(point),
         ),
-    )  # fmt: skip
+    )
     for name, label, x in axes:
         if max(len({x(story, point) for point in story.curve}) for story in contents.stories) < FEW:
             continue  # everything was rendered before the first validation
@@ -189,9 +200,15 @@ def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> Non
             low, high = confidence_interval(p.value) or (mean, mean)
             lowest = min(lowest, low)
             axes.errorbar(
-                p.milliseconds, mean, [[mean - max(low, floor)], [high - mean]],
-                fmt=marker, color=p.colour, label=p.name, markersize=5, elinewidth=0.8,
-            )  # fmt: skip
+                p.milliseconds,
+                mean,
+                [[mean - max(low, floor)], [high - mean]],
+                fmt=marker,
+                color=p.colour,
+                label=p.name,
+                markersize=5,
+                elinewidth=0.8,
+            )
     axes.set_xscale("log")
     if logarithmic:
         axes.set_yscale("log")

@@ -51,12 +51,19 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
         *([("published at", owed.source)] if owed is not None and owed.source else []),
         ("kind", about["kind"]),
         ("images", f"{spec.film.width} × {spec.film.height}, exposure {spec.exposure:g}"),
-        ("samples", f"{card.samples.rows} of {card.samples.planned} planned, {2 * t.half_spp} samples per pixel each, "
-                    f"in two independent halves{_further_passes(contents)}"),
+        (
+            "samples",
+            f"{card.samples.rows} of {card.samples.planned} planned, {2 * t.half_spp} samples per pixel each, "
+            f"in two independent halves{_further_passes(contents)}",
+        ),
         ("noise of the targets", f"{contents.evaluation.noise_floor:.4g}, of those held out, as linear MSE"),
-        ("transport", f"bdpt: paths of up to {t.max_depth} edges, {format_count(t.connections, 'connection')}, light "
-                      f"ratio {t.light_ratio:g}" + ", guided light" * t.guided_light
-                      + (f", {t.light_samples} light samples" if t.light_samples > 1 else "")),
+        (
+            "transport",
+            f"bdpt: paths of up to {t.max_depth} edges, {format_count(t.connections, 'connection')}, light "
+            f"ratio {t.light_ratio:g}"
+            + ", guided light" * t.guided_light
+            + (f", {t.light_samples} light samples" if t.light_samples > 1 else ""),
+        ),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
         ("seeds", _seeds(contents)),
         ("cost", _cost(contents)),
@@ -64,7 +71,7 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
         ("rendered by", f"{format_count(card.workers, 'worker')} with {versions}"),
         ("times taken on", contents.machine.stated),
         ("GPU", _gpu(contents)),
-    ]  # fmt: skip
+    ]
 
 
 def _further_passes(contents: ReportContents) -> str:
@@ -276,15 +283,28 @@ def _runs(contents: ReportContents) -> Table:
         shares = about["waits"]
         rows.append(
             (
-                story.name, f"{about['parameters']:,}", f"{about['steps']}", f"{about['draws_per_sample']:.1f}",
-                f"{about['seconds']['train'] / 60:.1f}", f"{shares['samples']:.1%}", f"{shares['reading']:.1%}",
-                f"{about['samples_per_used']:.2f}", about["bottleneck"],
+                story.name,
+                f"{about['parameters']:,}",
+                f"{about['steps']}",
+                f"{about['draws_per_sample']:.1f}",
+                f"{about['seconds']['train'] / 60:.1f}",
+                f"{shares['samples']:.1%}",
+                f"{shares['reading']:.1%}",
+                f"{about['samples_per_used']:.2f}",
+                about["bottleneck"],
             )
-        )  # fmt: skip
+        )
     head = (
-        "run", "parameters", "steps", "draws per sample", "minutes of steps", "waited for samples", "for reading",
-        "samples there for each used (--ahead)", "bottleneck",
-    )  # fmt: skip
+        "run",
+        "parameters",
+        "steps",
+        "draws per sample",
+        "minutes of steps",
+        "waited for samples",
+        "for reading",
+        "samples there for each used (--ahead)",
+        "bottleneck",
+    )
     return Table("Training", head, tuple(rows))
 
 

@@ -63,12 +63,17 @@ class RunStory:
         training = np.concatenate([[0], np.cumsum(~np.isin(arrived, held_out))])  # of the first n that arrived
         points = (
             CurvePoint(
-                r["step"], r["draws"], r["samples"], min(r["draws"], int(training[min(r["samples"], len(arrived))])),
-                r["seconds"]["train"], r["error"], r["held_out"],
+                r["step"],
+                r["draws"],
+                r["samples"],
+                min(r["draws"], int(training[min(r["samples"], len(arrived))])),
+                r["seconds"]["train"],
+                r["error"],
+                r["held_out"],
             )
             for r in records
             if r["kind"] == "validation"
-        )  # fmt: skip
+        )
         kept = {key: state[key] for key in ("step", "following", "seconds", "versions")}
         return cls(name, run, kept, tuple(points))
 

@@ -19,8 +19,13 @@ Mask = NDArray[np.bool_]
 
 CLOSE = 0.05  # quantile of all depths below which a pixel is close to the camera
 MIRRORS, SPECULAR, NEAR, SHADOWS, THIN, ALL = KINDS = (
-    "mirrors and clear glass", "specular surfaces", "near surfaces", "fine shadows", "thin objects", "all pixels",
-)  # fmt: skip
+    "mirrors and clear glass",
+    "specular surfaces",
+    "near surfaces",
+    "fine shadows",
+    "thin objects",
+    "all pixels",
+)
 LEAST = 0.005  # the least share of the image's pixels in a case
 STEP = 0.25  # of log irradiance, from a pixel to the next: a shadow's edge, where nothing else changes
 THIN_PIXELS, THIN_DEPTH = 3, 0.9  # pixels whose neighbours so many to either side are farther; by this ratio

@@ -157,9 +157,14 @@ class RunProgress:
             left = max(self._steps - self._step, 0) * (now - began) / (self._step - first)
         phase = WORDS[kind] if now - since >= SHORT_S or not self._step else TRAINS
         return {
-            "step": self._step, "steps": self._steps, "samples": self._samples, "phase": phase,
-            "phase_s": round(now - since, 1), "left_s": left, "at_s": time.time(),
-        }  # fmt: skip
+            "step": self._step,
+            "steps": self._steps,
+            "samples": self._samples,
+            "phase": phase,
+            "phase_s": round(now - since, 1),
+            "left_s": left,
+            "at_s": time.time(),
+        }
 
     def line(self) -> str:
         """The present state in words."""

@@ -95,10 +95,20 @@ def refuse(settings: Any) -> Any:
 
 Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
 Architecture = Literal[
-    "cnn", "feature_projection", "light_transport", "light_transport_photons",  # of the paper
-    "guided", "guided_transport", "guided_photons", "guided_transport_photons",  # ours, given the guides of a view
-    "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64",
-]  # fmt: skip
+    "cnn",
+    "feature_projection",
+    "light_transport",
+    "light_transport_photons",  # of the paper
+    "guided",
+    "guided_transport",
+    "guided_photons",
+    "guided_transport_photons",  # ours, given the guides of a view
+    "denoise_1",
+    "denoise_4",
+    "denoise_16",
+    "denoise_32",
+    "denoise_64",
+]
 Precision = Literal["float32", "tf32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
 EmissionScale = Literal["linear", "log"]

@@ -196,16 +196,16 @@ class Session:
 
     def _send_begin(self, *, continues: bool) -> None:
         spec = self._feed.spec
-        beginning = {
-            "scene_id": spec.scene_id, "exposure": spec.exposure, "step": self._step, "continues": continues,
-        }  # fmt: skip
+        beginning = {"scene_id": spec.scene_id, "exposure": spec.exposure, "step": self._step, "continues": continues}
         self._hooks.group.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
         spec = self._feed.spec
         return {
-            "scene_id": spec.scene_id, "exposure": spec.exposure, "settings": self._settings.model_dump(mode="json"),
-        }  # fmt: skip
+            "scene_id": spec.scene_id,
+            "exposure": spec.exposure,
+            "settings": self._settings.model_dump(mode="json"),
+        }
 
     def _save(self) -> None:
         with self._watch.on("save"):

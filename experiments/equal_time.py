@@ -78,12 +78,12 @@ class AtTime:
 
 def placed(room: Room, names: Sequence[str]) -> list[Placed]:
     """Those of the rows that were timed and have errors, by ascending time. Raises SpecError as `Room.errors` does."""
-    edit, found = room.document["edit_seconds"], []
+    edit, entries = room.document["edit_seconds"], []
     for name in names:
         time, errors = room.rows.get(name, {}).get("frame_seconds"), room.errors(name)
         if edit is not None and time and errors is not None:
-            found.append(Placed(name, 1e3 * (edit + time["total"]), errors.mean(axis=0)))
-    return sorted(found, key=lambda each: each.milliseconds)
+            entries.append(Placed(name, 1e3 * (edit + time["total"]), errors.mean(axis=0)))
+    return sorted(entries, key=lambda each: each.milliseconds)
 
 
 def family(room: Room, begins: str) -> list[Placed]:
@@ -97,14 +97,14 @@ def at(members: Sequence[Placed], milliseconds: float) -> AtTime | None:
     if not in_time:
         return None
     best = min(in_time, key=lambda each: each.mse)
-    found = AtTime(best, best, 0.0, beyond=best.milliseconds < milliseconds)
+    reached = AtTime(best, best, 0.0, beyond=best.milliseconds < milliseconds)
     if len(in_time) < len(members):
         last, after = in_time[-1], members[len(in_time)]
         share = np.log(milliseconds / last.milliseconds) / np.log(after.milliseconds / last.milliseconds)
         between = AtTime(last, after, float(share))
         if between.of(np.array(last.mse), np.array(after.mse)) < best.mse:
-            found = between
-    return found
+            reached = between
+    return reached
 
 
 def ratio(ours: Placed, theirs: AtTime) -> tuple[float, float, float]:

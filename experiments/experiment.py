@@ -121,11 +121,11 @@ def names() -> list[str]:
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Tables merged key by key, as deep as they go; of anything else, what is above."""
-    found = dict(below)
+    whole = dict(below)
     for key, value in above.items():
-        old = found.get(key)
-        found[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
-    return found
+        old = whole.get(key)
+        whole[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+    return whole
 
 
 def _toml(file: Path) -> dict[str, Any]:

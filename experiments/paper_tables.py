@@ -51,8 +51,8 @@ class Column:
 
 def _each(rooms: Sequence[Room], name: str, of: Callable[[Mapping[str, Any]], T | None]) -> list[T] | None:
     """A value of each room's row; None where one lacks it."""
-    found = [value for room in rooms if (value := of(room.rows[name])) is not None]
-    return found if len(found) == len(rooms) else None
+    values = [value for room in rooms if (value := of(room.rows[name])) is not None]
+    return values if len(values) == len(rooms) else None
 
 
 def _mean(of: Callable[[Mapping[str, Any]], float | None], digits: int) -> Callable[[Sequence[Room], str], str]:
@@ -78,8 +78,8 @@ def _of_set(metric: str, key: str) -> Callable[[Mapping[str, Any]], float | None
 
 def _mse(rooms: Sequence[Room], name: str) -> str:
     """The MSE of all seeds."""
-    found = [mse for room in rooms if (mse := room.mse(name)) is not None]
-    return with_interval(mean(found) if len(found) == len(rooms) else None, 5)
+    errors = [mse for room in rooms if (mse := room.mse(name)) is not None]
+    return with_interval(mean(errors) if len(errors) == len(rooms) else None, 5)
 
 
 def _network(rooms: Sequence[Room], name: str) -> str:
@@ -180,15 +180,15 @@ def order_table(rooms: Sequence[Room], published: PublishedTable) -> str:
 
 def gap(room: Room, first: str, second: str) -> str:
     """How far the first's MSE is above the second's, as a share of it. Raises SpecError as `Room.gap`."""
-    found = room.gap(first, second)
-    if found is None:
+    pair = room.gap(first, second)
+    if pair is None:
         return NOT_AVAILABLE
-    interval, share = confidence_interval(found.difference), found.difference.mean / found.unit
+    interval, share = confidence_interval(pair.difference), pair.difference.mean / pair.unit
     if interval is None:
         return f"{share:+.0%}"
-    seeds = ", ".join(f"{of_seed:+.0%}" for of_seed in found.of_seeds)
-    text = f"{share:+.0%} ({interval[0] / found.unit:+.0%} … {interval[1] / found.unit:+.0%}; {seeds}) {sign(share)}"
-    agree = len({of_seed > 0 for of_seed in found.of_seeds}) == 1 and (interval[0] > 0 or interval[1] < 0)
+    seeds = ", ".join(f"{of_seed:+.0%}" for of_seed in pair.of_seeds)
+    text = f"{share:+.0%} ({interval[0] / pair.unit:+.0%} … {interval[1] / pair.unit:+.0%}; {seeds}) {sign(share)}"
+    agree = len({of_seed > 0 for of_seed in pair.of_seeds}) == 1 and (interval[0] > 0 or interval[1] < 0)
     return text if agree else f"{text}, not told apart"
 
 

@@ -91,17 +91,17 @@ def _described(room: Room) -> str:
 
 def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
     """What holds of most rooms, and then what holds of the others, with their names."""
-    found: dict[str, list[str]] = {}
+    rooms_by_text: dict[str, list[str]] = {}
     for room in rooms:
-        found.setdefault(of(room), []).append(room.name)
-    most = max(found, key=lambda what: len(found[what]))
-    others = [f"{', '.join(which)}: {what}" for what, which in found.items() if what != most]
+        rooms_by_text.setdefault(of(room), []).append(room.name)
+    most = max(rooms_by_text, key=lambda what: len(rooms_by_text[what]))
+    others = [f"{', '.join(which)}: {what}" for what, which in rooms_by_text.items() if what != most]
     return f"{most} ({'; '.join(others)})" if others else most
 
 
 def wrapped(text: str, first: str = "", others: str = "") -> str:
     """A paragraph in lines of at most WIDTH characters after `first` and `others`; code and links are not broken."""
-    whole = re.sub(r"`[^`]*`|\[[^\]]*\]", lambda found: found[0].replace(" ", "\0"), text)
+    whole = re.sub(r"`[^`]*`|\[[^\]]*\]", lambda match: match[0].replace(" ", "\0"), text)
     filled = textwrap.fill(
         whole, WIDTH, initial_indent=first, subsequent_indent=others, break_long_words=False, break_on_hyphens=False
     )

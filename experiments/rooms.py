@@ -33,11 +33,11 @@ class Room:
                 f"{file}: an earlier version's, which does not say what it was timed on; delete it, and "
                 f"`python experiments/run.py {experiment.name}` makes it anew"
             )
-        found = cls.of(experiment, report, commit)
+        room = cls.of(experiment, report, commit)
         if again := experiment.again():
             evaluated = file.parents[1] / "runs" / again[0].name / EVALUATION
-            found.document["further_seeds"] = _further_seeds(experiment, evaluated)
-        return found
+            room.document["further_seeds"] = _further_seeds(experiment, evaluated)
+        return room
 
     @classmethod
     def kept(cls, experiment: Experiment, document: dict[str, Any], file: Path) -> Self:
@@ -105,18 +105,18 @@ class Room:
 
     def machine(self) -> str:
         """What it was timed on."""
-        found = self.document["machine"]
-        return f"{found['cpu'] or 'a CPU of unknown model'}, {found['cores']} cores, {found['architecture']}"
+        machine = self.document["machine"]
+        return f"{machine['cpu'] or 'a CPU of unknown model'}, {machine['cores']} cores, {machine['architecture']}"
 
     def commits(self) -> list[str]:
         """The commits at which its networks were trained; none where that was not recorded."""
-        found: dict[str, list[str]] = self.document.get("trained_at", {})
-        return list(dict.fromkeys(commit for of_run in found.values() for commit in of_run))
+        by_run: dict[str, list[str]] = self.document.get("trained_at", {})
+        return list(dict.fromkeys(commit for of_run in by_run.values() for commit in of_run))
 
     def spent(self, kind: str) -> dict[str, Any]:
         """Rows and core-seconds of a kind of plan, "samples" or "top-up"."""
-        found: dict[str, Any] = self.document["dataset"]["spent"].get(kind, {"rows": 0, "core_seconds": 0.0})
-        return found
+        totals: dict[str, Any] = self.document["dataset"]["spent"].get(kind, {"rows": 0, "core_seconds": 0.0})
+        return totals
 
     def steps(self, *, denoisers: bool) -> str:
         """How long its networks were trained, or its denoisers, by their settings; empty where it has none."""
@@ -151,18 +151,18 @@ class Room:
 
     def mse(self, name: str) -> Estimate | None:
         """MSE of a row over its views, the mean of its seeds; None where it has none. Raises SpecError as `errors`."""
-        found = self.errors(name)
-        return None if found is None else Estimate.of(found.mean(axis=0))
+        errors = self.errors(name)
+        return None if errors is None else Estimate.of(errors.mean(axis=0))
 
     def gap(self, first: str, second: str) -> Gap | None:
         """How far the first's MSE is above the second's; None where either has none. Raises SpecError as `errors`."""
         pair = [self.errors(name) for name in (first, second)]
-        found = [errors for errors in pair if errors is not None]
-        if len(found) < len(pair):
+        both = [errors for errors in pair if errors is not None]
+        if len(both) < len(pair):
             return None
-        seeds = min(len(errors) for errors in found)
-        differences = found[0][:seeds] - found[1][:seeds]
-        unit = float(found[0].mean())
+        seeds = min(len(errors) for errors in both)
+        differences = both[0][:seeds] - both[1][:seeds]
+        unit = float(both[0].mean())
         return Gap(Estimate.of(differences.mean(axis=0)), unit, tuple((differences.mean(axis=1) / unit).tolist()))
 
 
@@ -177,8 +177,8 @@ class Gap:
 
 def estimate(row: Mapping[str, Any], metric: str) -> Estimate | None:
     """Mean and standard error of a metric that each image has; None where it could not be computed."""
-    found = row.get(metric)
-    return None if found is None else Estimate(**found)
+    values = row.get(metric)
+    return None if values is None else Estimate(**values)
 
 
 def _further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[float]]]:
@@ -187,11 +187,11 @@ def _further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[fl
         raise IncompleteError(f"{file}: not there; `python experiments/run.py {experiment.name}` makes it")
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]  # in the order of the runs
     errors = {run.name: row["metric_space"]["mse"]["values"] for run, row in zip(experiment.again(), rows, strict=True)}
-    found: dict[str, list[list[float]]] = {}
+    by_run: dict[str, list[list[float]]] = {}
     for run in experiment.trained():
         names = [seeded(run.name, seed) for seed in experiment.size.seeds[1:]]
-        found[run.name] = [[round(value, 6) for value in errors[name]] for name in names if name in errors]
-    return {name: values for name, values in found.items() if values}
+        by_run[run.name] = [[round(value, 6) for value in errors[name]] for name in names if name in errors]
+    return {name: values for name, values in by_run.items() if values}
 
 
 def _compact(row: Mapping[str, Any]) -> dict[str, Any]:

@@ -125,18 +125,18 @@ class Stages:
         if not self._checkpoint(run).is_file():
             return False
         state = checkpoint.load(self._checkpoint(run))
-        found = {"scene_id": state["scene_id"], **state["settings"], **state["settings"]["network"]}
+        settings = {"scene_id": state["scene_id"], **state["settings"], **state["settings"]["network"]}
         differing = [
-            f"{key} = {found.get(key)!r}, and {value!r} is asked for now"
+            f"{key} = {settings.get(key)!r}, and {value!r} is asked for now"
             for key, value in {"scene_id": self._scene_id, **self._asked(run)}.items()
-            if found.get(key) != value
+            if settings.get(key) != value
         ]
         if differing:
             raise StageError(
                 f"{self.experiment.name}: {self._folder(run)} was trained with {'; '.join(differing)}: move that "
                 "folder away, and it is trained anew"
             )
-        return bool(state["step"] >= found["max_steps"])
+        return bool(state["step"] >= settings["max_steps"])
 
     def _asked(self, run: Run) -> dict[str, Any]:
         """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""
@@ -160,14 +160,14 @@ class Stages:
 
     def _keep_commit(self, run: Run) -> None:
         """Add this checkout's commit to those at which a run was trained: several, if it was interrupted."""
-        if (now := results.commit()) not in (found := self._commits(run)):
-            write_whole(self._folder(run) / COMMITS, json.dumps([*found, now]) + "\n")
+        if (now := results.commit()) not in (commits := self._commits(run)):
+            write_whole(self._folder(run) / COMMITS, json.dumps([*commits, now]) + "\n")
 
     def _commits(self, run: Run) -> list[str]:
         """The commits at which a run was trained; none where an earlier version trained it."""
         file = self._folder(run) / COMMITS
-        found: list[str] = json.loads(file.read_text()) if file.is_file() else []
-        return found
+        commits: list[str] = json.loads(file.read_text()) if file.is_file() else []
+        return commits
 
     def _folder(self, run: Run) -> Path:
         return self.folder / "runs" / run.name

@@ -49,19 +49,19 @@ RECIPES: Mapping[SizeName, str] = {
 """What differs from the supplement in the training of its networks, beside the loss."""
 
 
-def page(found: Sequence[Room], size: SizeName) -> str:
+def page(rooms: Sequence[Room], size: SizeName) -> str:
     """All of it as Markdown. Raises SpecError as `Room.gap` does."""
-    parts = [f"# The paper's tables over our rooms, `{size}`", wrapped(introduction(found, size))]
+    parts = [f"# The paper's tables over our rooms, `{size}`", wrapped(introduction(rooms, size))]
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
-    parts.append(reading(size, said(found, lambda room: str(room.experiment.size.train["loss"]))))
+    parts.append(reading(size, said(rooms, lambda room: str(room.experiment.size.train["loss"]))))
     for part, (title, published) in PARTS.items():
-        if rooms := [room for room in found if room.experiment.part == part]:
-            parts += _part(rooms, title, published)
-    parts.append(OF_TIME.format(picture=f"{page_of(size)}.png", table=equal_time.table(found)))
+        if of_part := [room for room in rooms if room.experiment.part == part]:
+            parts += _part(of_part, title, published)
+    parts.append(OF_TIME.format(picture=f"{page_of(size)}.png", table=equal_time.table(rooms)))
     made = (
-        f"Timed on {said(found, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
+        f"Timed on {said(rooms, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
         f"`{command(size)}`."
     )
     return "\n\n".join([*parts, wrapped(made)])
@@ -91,7 +91,7 @@ def command(size: SizeName) -> str:
     return f"python experiments/tables.py --size {size}"
 
 
-def introduction(found: Sequence[Room], size: SizeName) -> str:
+def introduction(rooms: Sequence[Room], size: SizeName) -> str:
     """What was run, as the sizes and the reports tell."""
     kinds: dict[str, Callable[[Room], str]] = {
         "networks": lambda room: room.steps(denoisers=False),
@@ -100,26 +100,26 @@ def introduction(found: Sequence[Room], size: SizeName) -> str:
     trained = [
         f"{kind} for {said(having, steps)}"
         for kind, steps in kinds.items()
-        if (having := [room for room in found if steps(room)])
+        if (having := [room for room in rooms if steps(room)])
     ]
     return (
-        f"The size `{size}`: {said(found, lambda room: str(room.document['size']))}. {_resolution(found)} All networks "
+        f"The size `{size}`: {said(rooms, lambda room: str(room.document['size']))}. {_resolution(rooms)} All networks "
         f"and denoisers but OIDN are trained on one room's images alone: {', '.join(trained)}. denoise_k and oidn 1/k "
         "are denoisers, which are given 1/k of the pixels of one noisy half-estimate."
     )
 
 
-def _resolution(found: Sequence[Room]) -> str:
+def _resolution(rooms: Sequence[Room]) -> str:
     """Whether a GPU took part, and what is at the paper's resolution."""
-    films = said(found, lambda room: f"{room.film[0]} × {room.film[1]}")
-    at_paper = [room.name for room in found if room.film == room.paper_film]
-    if len(at_paper) == len(found):
+    films = said(rooms, lambda room: f"{room.film[0]} × {room.film[1]}")
+    at_paper = [room.name for room in rooms if room.film == room.paper_film]
+    if len(at_paper) == len(rooms):
         reached = "everything"
     else:
         reached = f"of the rooms only {', '.join(at_paper)}" if at_paper else "nothing here"
     size = f"{reached} is at the paper's resolution; images are {films}."
-    if any(room.device.startswith("cuda") for room in found):
-        return f"A GPU took part: networks ran on {said(found, lambda room: room.device)}; {size}"
+    if any(room.device.startswith("cuda") for room in rooms):
+        return f"A GPU took part: networks ran on {said(rooms, lambda room: room.device)}; {size}"
     return f"No GPU was at hand: {size}"
 
 
@@ -193,36 +193,36 @@ def rooms_of(work: Path, size: SizeName, earlier: Path) -> list[Room]:
         documents = json.loads(earlier.read_text(encoding="utf-8"))["rooms"] if earlier.is_file() else {}
     except (ValueError, KeyError, TypeError) as error:
         raise IncompleteError(f"{earlier}: holds no rooms ({error!r}); move it away, and it is made anew") from error
-    found = []
+    rooms = []
     for name in names():
         experiment, report = Experiment.load(name, size), work / name / "report/report.json"
         if report.is_file():
-            found.append(Room.read(experiment, report, results.commit()))
+            rooms.append(Room.read(experiment, report, results.commit()))
         elif name in documents:
-            found.append(Room.kept(experiment, documents[name], earlier))
+            rooms.append(Room.kept(experiment, documents[name], earlier))
             print(f"{name}: no report in {work}; its rows of {earlier} stay", file=sys.stderr)
-    if not found:
+    if not rooms:
         raise IncompleteError(f"{work}: holds no report; `make experiments-{size}` makes them")
-    return found
+    return rooms
 
 
 def main() -> int:
     """Write the page; returns the exit code."""
     told = options().parse_args()
     try:
-        found = rooms_of(told.work / told.size, told.size, told.out / f"{page_of(told.size)}.json")
-        text = page(found, told.size)
+        rooms = rooms_of(told.work / told.size, told.size, told.out / f"{page_of(told.size)}.json")
+        text = page(rooms, told.size)
     except PhotonfarmError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     told.out.mkdir(parents=True, exist_ok=True)
-    (told.out / f"{page_of(told.size)}.png").write_bytes(equal_time.picture(found))
+    (told.out / f"{page_of(told.size)}.png").write_bytes(equal_time.picture(rooms))
     told_of = {
         "command": command(told.size),
         "commit": results.commit(),
         "machine": "each room's own",  # and not the one that this runs on
         "size": told.size,
-        "rooms": {room.name: room.document for room in found},
+        "rooms": {room.name: room.document for room in rooms},
     }
     results.save(page_of(told.size), text, told_of, told.out)
     return 0

@@ -31,8 +31,8 @@ def open_scene(store: str | Path, scene: str, *, guides: bool = True) -> Scene:
     Raises StoreError if there is no such store, or no such scene in it (the message names the scenes that exist).
     """
     opened = Store(store)
-    found = opened.scene(scene_named(opened, scene))
-    return Scene(store, found.scene_id, guides=guides)
+    stored = opened.scene(scene_named(opened, scene))
+    return Scene(store, stored.scene_id, guides=guides)
 
 
 class Scene:

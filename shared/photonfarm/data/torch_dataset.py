@@ -74,11 +74,11 @@ class SampleTensors:
 
     def empty(self, size: int, *, pinned: bool = False) -> dict[str, Tensor]:
         """Memory for `size` samples, (B, …) by name, to be used again and again; RuntimeError if there is none."""
-        found = {}
+        memory = {}
         for name in self.fields:
             kind = torch.bool if name in FLAGS else torch.float32
-            found[name] = torch.empty(size, *self._shape(name), dtype=kind, pin_memory=pinned)
-        return found
+            memory[name] = torch.empty(size, *self._shape(name), dtype=kind, pin_memory=pinned)
+        return memory
 
     def fill(self, memory: Mapping[str, Tensor], place: int, sample: Sample) -> None:
         """Write one sample into a place of such memory; stored types become float32 on the way, in one pass."""

@@ -76,22 +76,22 @@ def write_card(exported: Exported) -> None:
 
 def format_card(exported: Exported) -> str:
     """The text of the card."""
-    found, name = exported.manifest, exported.manifest.scene.name
+    manifest, name = exported.manifest, exported.manifest.scene.name
     head = "\n".join(
         f"{key}: {json.dumps(value, ensure_ascii=False)}" for key, value in _describe_head(exported).items()
     )
-    reading = READING[found.settings.to].format(folder=exported.folder.name)
+    reading = READING[manifest.settings.to].format(folder=exported.folder.name)
     parts = [
         f"---\n{head}\n---\n",
         f"# {name}\n",
-        f"{found.samples} samples of the scene {name}. Each has two noisy images A and B of one view, rendered by an "
-        "unbiased bidirectional path tracer with seeds of their own: they are independent, and the mean of many such "
-        "images is the true one. So the mean of (f − A)(f − B) estimates the squared error of an image f against the "
+        f"{manifest.samples} samples of the scene {name}. Each has two noisy images A and B of one view, rendered by "
+        "an unbiased bidirectional path tracer with seeds of their own: they are independent, and the mean of many "
+        "such images is the true one. So the mean of (f − A)(f − B) estimates the squared error of an image f against the "
         "noise-free image. Values are linear and not clipped.\n",
-        f"## Licence and credits\n\n{_format_credits(found)}\n",
+        f"## Licence and credits\n\n{_format_credits(manifest)}\n",
         f"## Reading it\n\n```python\n{reading}```\n",
         f"## What a sample holds\n\n{_format_table(exported.contents.columns)}\n",
-        f"## Where it came from\n\n{_format_origin(found)}\n",
+        f"## Where it came from\n\n{_format_origin(manifest)}\n",
     ]
     return "\n".join(parts)
 
@@ -108,10 +108,14 @@ def _describe_head(exported: Exported) -> dict[str, Any]:
     head |= {"pretty_name": manifest.scene.name, "tags": ["photonfarm", "rendering", "path-tracing", "denoising"]}
     head["size_categories"] = [size]
     if manifest.parts:
-        splits = [split for split in _SPLITS if any(part.file.startswith(f"{DATA}/{split}-") for part in manifest.parts)]
+        splits = [
+            split for split in _SPLITS if any(part.file.startswith(f"{DATA}/{split}-") for part in manifest.parts)
+        ]
         files = [{"split": _SPLITS[split], "path": f"{DATA}/{split}-*"} for split in splits]
         head["configs"] = [{"config_name": "default", "data_files": files}]
-    if manifest.settings.to == "parquet":  # without it `datasets` takes arrays for lists, and reads them number by number
+    if (
+        manifest.settings.to == "parquet"
+    ):  # without it `datasets` takes arrays for lists, and reads them number by number
         head["dataset_info"] = {"features": [_describe_feature(column) for column in exported.contents.columns]}
     return head
 
@@ -129,12 +133,12 @@ def _describe_feature(column: Column) -> dict[str, Any]:
             return {"name": column.name, "dtype": array}
 
 
-def _format_credits(found: Manifest) -> str:
-    if found.credits is None:
+def _format_credits(manifest: Manifest) -> str:
+    if manifest.credits is None:
         return (
             "The scene's spec names neither author nor licence ([credits]); ask who made the scene before sharing it."
         )
-    lines = [f"- {key}: {value}" for key, value in found.credits.items() if value]
+    lines = [f"- {key}: {value}" for key, value in manifest.credits.items() if value]
     return "\n".join([*lines, "\nThe licence is the scene's; photonfarm lays no claim to what it renders."])
 
 
@@ -144,16 +148,16 @@ def _format_table(columns: tuple[Column, ...]) -> str:
     return format_markdown_table(("name", "type", "shape", "unit", "is"), rows)
 
 
-def _format_origin(found: Manifest) -> str:
-    about, camera = found.constants, found.constants["camera"]
+def _format_origin(manifest: Manifest) -> str:
+    about, camera = manifest.constants, manifest.constants["camera"]
     groups = ", ".join(about["groups"]) or "none: the scene is static"
     parts = [
-        f"- scene id {found.scene.id}, store {found.store}",
-        f"- committed jobs {found.jobs} of {len(found.plans)} plans, rows {found.rows} of the store",
+        f"- scene id {manifest.scene.id}, store {manifest.store}",
+        f"- committed jobs {manifest.jobs} of {len(manifest.plans)} plans, rows {manifest.rows} of the store",
         f"- half-estimates of {about['half_spp']} samples per pixel each; exposure {about['exposure']:g} for display",
         f"- {camera['width']} × {camera['height']} pixels, field of view {camera['fov_deg']:g}° along the width",
         f"- movable groups, in the order of `modification`: {groups}",
-        f"- held out: a share {found.settings.hold_out:g} of the configurations, chosen by a hash of their content",
+        f"- held out: a share {manifest.settings.hold_out:g} of the configurations, chosen by a hash of their content",
         "- versions and plans: export.json",
     ]
     return "\n".join(parts)

@@ -117,7 +117,7 @@ def _list_facts(spec: SceneSpec) -> list[Column]:
         "of each movable group, in the "
         "order of the spec: translation from rest along x, y, z, then 1: present or 0: removed",
     )
-    found = [
+    facts = [
         Column("row", "int64", (), "1", "the sample's row in the store"),
         Column("key", "str", (), "", "the sample's content key, hexadecimal"),
         Column("split", "str", (), "", "train, or held-out: of a configuration to be kept from training"),
@@ -139,7 +139,7 @@ def _list_facts(spec: SceneSpec) -> list[Column]:
         Column("job", "int64", (), "1", "the render job that it came from"),
         Column("core_s", "float64", (), "s", "processor time of that job, over its samples"),
     ]
-    return [replace(each, fact=True) for each in found]
+    return [replace(each, fact=True) for each in facts]
 
 
 def _describe_stored(spec: SceneSpec, name: str) -> Column:
@@ -149,17 +149,17 @@ def _describe_stored(spec: SceneSpec, name: str) -> Column:
 
 
 def _list_visibility(spec: SceneSpec) -> list[Column]:
-    found = []
+    columns = []
     for name, count in schema.bit_counts(spec).items():
         what = "point of the cloud" if name == "point_seen" else "photon of the configuration"
-        found.append(Column(name, "bool", (count,), "1", f"whether the view sees each {what}"))
-    return [column for column in found if column.shape[0]]
+        columns.append(Column(name, "bool", (count,), "1", f"whether the view sees each {what}"))
+    return [column for column in columns if column.shape[0]]
 
 
 def _find_declaration(name: str) -> tuple[str, str]:
     """Unit and convention of an array, as the store's format declares them."""
-    (found,) = (each for each in declarations.OUTPUTS if each.name == name)
-    return found.unit, found.convention
+    (declaration,) = (each for each in declarations.OUTPUTS if each.name == name)
+    return declaration.unit, declaration.convention
 
 
 _RANGE = re.compile(r"(\d{1,18})(?:-(\d{1,18}))?")
@@ -167,24 +167,24 @@ _RANGE = re.compile(r"(\d{1,18})(?:-(\d{1,18}))?")
 
 def format_ranges(rows: Iterable[int]) -> str:
     """Rows as ranges: 0, 1, 2, 7 is 0-2,7."""
-    found: list[list[int]] = []
+    bounds: list[list[int]] = []
     for row in sorted(rows):
-        if found and row == found[-1][1] + 1:
-            found[-1][1] = row
+        if bounds and row == bounds[-1][1] + 1:
+            bounds[-1][1] = row
         else:
-            found.append([row, row])
-    return ",".join(f"{first}-{last}" if last > first else f"{first}" for first, last in found)
+            bounds.append([row, row])
+    return ",".join(f"{first}-{last}" if last > first else f"{first}" for first, last in bounds)
 
 
 def parse_ranges(text: str) -> list[range]:
     """The ranges that a text names, in its order; raises ValueError for other text."""
-    found = []
+    parsed = []
     for part in filter(None, text.split(",")):
         match = _RANGE.fullmatch(part.strip())
         if match is None or int(match[2] or match[1]) < int(match[1]):
             raise ValueError(f"{part.strip()!r} is no row and no range of rows; write them like 0-31,40")
-        found.append(range(int(match[1]), int(match[2] or match[1]) + 1))
-    return found
+        parsed.append(range(int(match[1]), int(match[2] or match[1]) + 1))
+    return parsed
 
 
 def parse_rows(text: str) -> list[int]:

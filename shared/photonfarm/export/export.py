@@ -66,8 +66,8 @@ def export_scene(
     settings = _choose_settings(buffers, contents, request)
     name = SceneName(id=stored.scene_id, name=stored.spec.name)
     wanted = Manifest(scene=name, store=opened.store_id, settings=settings, constants=contents.about)
-    with folder.lock_folder(out, wanted) as found:
-        job = _Export(form, out, contents, found, log, on_progress)
+    with folder.lock_folder(out, wanted) as current:
+        job = _Export(form, out, contents, current, log, on_progress)
         return job.run(_take_snapshot(store, stored, settings, log), request)
 
 
@@ -75,8 +75,8 @@ def _plan_contents(form: type[Format], spec: SceneSpec, buffers: Sequence[str], 
     single = form.ONE_PER_FILE or (form.ONE_PER_FILE is None and request.samples_per_file in (None, 1))
     if form.ONE_PER_FILE and request.samples_per_file not in (None, 1):
         raise SpecError(f"--samples-per-file {request.samples_per_file}: --to {request.to} has one sample per file")
-    found = list_columns(spec, buffers, visibility="visibility" in request.extras)
-    return Contents(found, describe_constants(spec), single)
+    columns = list_columns(spec, buffers, visibility="visibility" in request.extras)
+    return Contents(columns, describe_constants(spec), single)
 
 
 def _choose_settings(buffers: tuple[str, ...], contents: Contents, request: ExportRequest) -> ExportSettings:
@@ -89,9 +89,9 @@ def _choose_settings(buffers: tuple[str, ...], contents: Contents, request: Expo
     )
 
 
-def _count_bytes(found: Sequence[Column]) -> int:
+def _count_bytes(columns: Sequence[Column]) -> int:
     """The bytes of a sample's values, without text."""
-    return sum(int(np.prod(each.shape)) * np.dtype(each.dtype).itemsize for each in found if each.dtype != "str")
+    return sum(int(np.prod(each.shape)) * np.dtype(each.dtype).itemsize for each in columns if each.dtype != "str")
 
 
 def _take_snapshot(
@@ -112,13 +112,13 @@ class _Export:
         form: type[Format],
         out: Path,
         contents: Contents,
-        found: Manifest,
+        current: Manifest,
         log: Callable[[str], None],
         on_progress: OnProgress,
     ) -> None:
-        self._form, self._out, self._contents, self._manifest = form, out, contents, found
+        self._form, self._out, self._contents, self._manifest = form, out, contents, current
         self._log, self._on_progress = log, on_progress
-        self._files = Files(out, form.SUFFIX, found.settings.samples_per_file, single=contents.single)
+        self._files = Files(out, form.SUFFIX, current.settings.samples_per_file, single=contents.single)
         self._configurations = set(folder.list_configurations(out))
         self._done = self._total = self._bytes = 0
 

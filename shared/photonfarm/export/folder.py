@@ -56,11 +56,15 @@ def lock_folder(folder: Path, wanted: Manifest) -> Iterator[Manifest]:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise StoreError(f"{folder}: another process exports into it; wait, or give another folder") from error
-        found = manifest.read(folder)
-        if found is not None:
-            manifest.check(folder, found, wanted)
+        earlier = manifest.read(folder)
+        if earlier is not None:
+            manifest.check(folder, earlier, wanted)
         _sweep(folder)
-        yield wanted if found is None else wanted.model_copy(update={"parts": found.parts, "versions": found.versions})
+        yield (
+            wanted
+            if earlier is None
+            else wanted.model_copy(update={"parts": earlier.parts, "versions": earlier.versions})
+        )
 
 
 def _find_foreign(folder: Path) -> str | None:

@@ -107,15 +107,17 @@ def read(folder: Path) -> Manifest | None:
         raise StoreError(f"{file}: cannot be read: {error.strerror}") from error
 
 
-def check(folder: Path, found: Manifest, wanted: Manifest) -> None:
+def check(folder: Path, earlier: Manifest, wanted: Manifest) -> None:
     """Raise StoreError if a folder's export is of another scene, another store, or with other settings."""
     remedy = "give another folder with --out"
-    if found.scene.id != wanted.scene.id:
-        scenes = f"scene {found.scene.id} ({found.scene.name}), and {wanted.scene.id} ({wanted.scene.name}) was asked"
+    if earlier.scene.id != wanted.scene.id:
+        scenes = (
+            f"scene {earlier.scene.id} ({earlier.scene.name}), and {wanted.scene.id} ({wanted.scene.name}) was asked"
+        )
         raise StoreError(f"{folder}: holds an export of {scenes} for; {remedy}")
-    if found.store != wanted.store:
-        raise StoreError(f"{folder}: holds an export of the store {found.store}, not of {wanted.store}; {remedy}")
-    for name, said in found.settings:
+    if earlier.store != wanted.store:
+        raise StoreError(f"{folder}: holds an export of the store {earlier.store}, not of {wanted.store}; {remedy}")
+    for name, said in earlier.settings:
         if said != (asked := getattr(wanted.settings, name)):
             option = "--with" if name == "extras" else f"--{name.replace('_', '-')}"
             differ = f"{option} {_format_value(said)}, and {_format_value(asked)} was asked for"

@@ -72,13 +72,13 @@ class Snapshot:
 
     def sample(self, row: int) -> Sample:
         """The sample in a row; raises CorruptError if stored bytes are not what was committed."""
-        found: Sample = self._scene[self._place[row]]
-        return found
+        sample: Sample = self._scene[self._place[row]]
+        return sample
 
     def values(self, sample: Sample, columns: Sequence[Column]) -> Values:
         """The values of a sample, each in its column's type."""
-        found = self._facts(sample.row) | dict(zip(HALVES, sample.radiance, strict=True))
-        return {column.name: _take_value(sample, column, found) for column in columns}
+        values = self._facts(sample.row) | dict(zip(HALVES, sample.radiance, strict=True))
+        return {column.name: _take_value(sample, column, values) for column in columns}
 
     def inputs(self, row: int) -> tuple[Modification, View]:
         """The configuration and the view of a row, complete or not."""
@@ -145,10 +145,10 @@ class _Job:
         return dict(self._figures["versions"])
 
 
-def _take_value(sample: Sample, column: Column, found: Values) -> Any:
+def _take_value(sample: Sample, column: Column, values: Values) -> Any:
     """The value of a column, in its type."""
-    if column.name in found:
-        value = found[column.name]
+    if column.name in values:
+        value = values[column.name]
     elif column.name == "point_seen":
         value = sample.point_cloud.seen
     elif column.name == "photon_seen":

@@ -43,10 +43,10 @@ def _watch_options(command: Command) -> Command:
             help="A name, beside the host's, by which others may ask; may be repeated.",
         ),
     )
-    found: Any = command
+    decorated: Any = command
     for option in reversed(options):
-        found = option(found)
-    return found
+        decorated = option(decorated)
+    return decorated
 
 
 @click.command()

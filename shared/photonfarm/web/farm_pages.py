@@ -63,15 +63,15 @@ class FarmPages:
             if scene_id not in self._samples:
                 if scene_id not in self._store.scene_ids():
                     raise NotThereError(f"the store has no scene {scene_id}")
-                self._samples[scene_id] = found = SceneSamples(self._place, scene_id)
-                self._walls[scene_id] = Kept(found.look)
+                self._samples[scene_id] = samples = SceneSamples(self._place, scene_id)
+                self._walls[scene_id] = Kept(samples.look)
             return self._samples[scene_id]
 
     def wall(self, scene_id: str) -> dict[str, Any]:
         """The samples that landed last, and the maps of noise and cost."""
-        found = self.samples(scene_id)
+        samples = self.samples(scene_id)
         rows = self._walls[scene_id].get()
-        return {"rows": rows, "map": found.mapped(self._cost_of(scene_id))}
+        return {"rows": rows, "map": samples.mapped(self._cost_of(scene_id))}
 
     def about(self, scene_id: str, row: int) -> dict[str, Any]:
         """One sample in figures."""
@@ -130,7 +130,7 @@ def _steps(folder: Path) -> list[int]:
         names = [file.name for file in (folder / VIEWS).iterdir()]
     except OSError:
         return []
-    return sorted(int(found[1]) for name in names if (found := STEP.fullmatch(name)))
+    return sorted(int(match[1]) for name in names if (match := STEP.fullmatch(name)))
 
 
 def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:

@@ -134,25 +134,25 @@ def _of_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:
 
 def _failures(queue: StoreQueue | NoQueue) -> dict[Labels, int]:
     """The numbers of failed jobs by error and state; few errors, each the class before a cause's first colon."""
-    found: Counter[Labels] = Counter()
+    counts: Counter[Labels] = Counter()
     for cause in () if isinstance(queue, NoQueue) else queue.causes:
-        found[_error(cause.cause), "failed"] += len(cause.jobs)
+        counts[_error(cause.cause), "failed"] += len(cause.jobs)
     for cause in queue.kept:
-        found[_error(cause.cause), "kept"] += len(cause.jobs)
+        counts[_error(cause.cause), "kept"] += len(cause.jobs)
     by_error: Counter[str] = Counter()
-    for (error, _), count in found.items():
+    for (error, _), count in counts.items():
         by_error[error] += count
     told = {error for error, _ in by_error.most_common(MOST_ERRORS)}
     grouped: Counter[Labels] = Counter()
-    for (error, state), count in found.items():
+    for (error, state), count in counts.items():
         grouped[error if error in told else OTHER, state] += count
     return dict(grouped)
 
 
 def _error(cause: str) -> str:
     """The class of an error, by a failure's cause."""
-    found = _ERROR.match(cause)
-    return found[1] if found else OTHER
+    match = _ERROR.match(cause)
+    return match[1] if match else OTHER
 
 
 def _of_trainings(of: dict[Labels, TrainingProgress]) -> Iterator[Metric]:
@@ -167,8 +167,8 @@ def _of_trainings(of: dict[Labels, TrainingProgress]) -> Iterator[Metric]:
         ("standard_error", "standard_error", "The standard error of the held-out error."),
         ("samples", "held_out", "The samples that the last validation was on."),
     ):
-        found = {run: each.validation.get(key) for run, each in of.items() if each.validation is not None}
-        numbers = {run: value for run, value in found.items() if isinstance(value, int | float)}
+        values = {run: each.validation.get(key) for run, each in of.items() if each.validation is not None}
+        numbers = {run: value for run, value in values.items() if isinstance(value, int | float)}
         yield _gauge(f"trainer_heldout_{name}", about, numbers, "run")
     spent = {
         (*run, _text(activity)): seconds
@@ -191,13 +191,13 @@ def _state(training: TrainingProgress) -> str:
 
 def _named(trainings: Sequence[TrainingProgress]) -> dict[Labels, TrainingProgress]:
     """Runs by a label each: the name of the folder, with a number behind it where several are called so."""
-    found: dict[Labels, TrainingProgress] = {}
+    by_labels: dict[Labels, TrainingProgress] = {}
     for training in trainings:
         name, number = _text(training.run), 1
-        while (label := name if number == 1 else f"{name} {number}",) in found:
+        while (label := name if number == 1 else f"{name} {number}",) in by_labels:
             number += 1
-        found[label,] = training
-    return found
+        by_labels[label,] = training
+    return by_labels
 
 
 def _text(name: str) -> str:

@@ -154,12 +154,12 @@ class SceneSamples:
         with self._lock:
             noise = dict(self._noise)
             across = [axis for axis in range(3) if not self._reader.spec.view.up[axis]]
-            found = []
+            cells = []
             for row, value in noise.items():
                 if row in self._opened or self._is_complete(row):
                     _, view, _ = self._reader.inputs(row)
-                    found.append([row, *(float(view.origin[axis]) for axis in across), value, cost_of(row)])
-        return {"axes": ["xyz"[axis] for axis in across], "samples": found}
+                    cells.append([row, *(float(view.origin[axis]) for axis in across), value, cost_of(row)])
+        return {"axes": ["xyz"[axis] for axis in across], "samples": cells}
 
     # ------------------------------------------------------------------------------------------------------------------
 

@@ -66,8 +66,8 @@ def page_routes(pages: FarmPages) -> Routes:
         ),
         ("/run/([0-9]{1,3})/([0-9]{1,8}).png", True, lambda run, step: (PNG, pages.prediction(int(run), int(step)))),
     ]
-    found = [(re.compile(pattern.replace(".", r"\.")), stays, make) for pattern, stays, make in table]
-    return found + metric_routes(pages.view)
+    routes = [(re.compile(pattern.replace(".", r"\.")), stays, make) for pattern, stays, make in table]
+    return routes + metric_routes(pages.view)
 
 
 def metric_routes(look: Callable[[], FarmView]) -> Routes:
@@ -125,8 +125,8 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError:
             path = ""
         for pattern, stays, make in self.server.routes:
-            if found := pattern.fullmatch(path):
-                self._answer(make, found.groups(), stays)
+            if match := pattern.fullmatch(path):
+                self._answer(make, match.groups(), stays)
                 return
         self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
 

@@ -272,10 +272,10 @@ def _only_scene(store: str | Path) -> str | None:
 def _wait(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
     """Wait until `look` finds something, and return it; None once asked to stop, or after so many seconds."""
     end = time.monotonic() + seconds
-    while (found := look()) is None:
+    while (value := look()) is None:
         if stop.wait(min(POLL_S, max(end - time.monotonic(), 0.0))) or time.monotonic() >= end:
             return None
-    return found
+    return value
 
 
 @contextmanager

@@ -134,9 +134,9 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     from photonfarm.trainer.cli.show import measuring_progress
 
     with measuring_progress() as on_progress:
-        found = compare(store, loaded, on_progress=on_progress, **how)
-    pictures = write_evaluation(found, loaded)
-    click.echo(json.dumps(found.document(), indent=2) if as_json else evaluation_text(found))
+        evaluation = compare(store, loaded, on_progress=on_progress, **how)
+    pictures = write_evaluation(evaluation, loaded)
+    click.echo(json.dumps(evaluation.document(), indent=2) if as_json else evaluation_text(evaluation))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
 
 
@@ -223,14 +223,14 @@ def infer(
         shows.check_path(trained)
         asked = ["--orbit", str(orbit)] if orbit else ["--camera-path", str(path)]
         asked += ["--modification", modification] if modification else []
-        found = shows.show_frames(
+        result = shows.show_frames(
             store, trained, shows.rendered_frames(store, trained, asked), out, fps=fps, device=device
         )
     elif buffers is not None:
-        found = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
+        result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
     else:
         chosen = shows.find_row(store, trained, modification, view) if row is None else row
-        found = shows.show_sample(store, trained, chosen, out, device)
-    for file in found.files:
+        result = shows.show_sample(store, trained, chosen, out, device)
+    for file in result.files:
         click.echo(file)
-    click.echo(found.sentence, err=True)
+    click.echo(result.sentence, err=True)

@@ -44,25 +44,25 @@ def record(of: dict[str, Any]) -> None:
         )
 
 
-def dry_run(found: DryRun, as_json: bool) -> None:
+def dry_run(estimate: DryRun, as_json: bool) -> None:
     """Print the estimate of a training."""
     from photonfarm.trainer.dry_run.dry_run import describe, format_estimate
 
-    click.echo(json.dumps(describe(found), indent=2) if as_json else format_estimate(found))
+    click.echo(json.dumps(describe(estimate), indent=2) if as_json else format_estimate(estimate))
 
 
 def _recovered(log_record: dict[str, Any]) -> str:
     """Why a run went back, and to which step."""
     errors, back_to = log_record["errors"], f"the weights of step {log_record['back_to']}"
     if errors is None:
-        found = "the loss is not finite"
+        reason = "the loss is not finite"
     elif errors["now"] is None:
-        found = "the held-out error is not finite"
+        reason = "the held-out error is not finite"
     else:
-        found = f"held-out error {stated(errors['now'], None)} (best so far {stated(errors['best'], None)})"
+        reason = f"held-out error {stated(errors['now'], None)} (best so far {stated(errors['best'], None)})"
     if log_record["cause"] == "end":
-        return f"{found}; ends with {back_to}"
-    return f"{found}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"
+        return f"{reason}; ends with {back_to}"
+    return f"{reason}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"
 
 
 OnProgress = Callable[[str, int, int], None]

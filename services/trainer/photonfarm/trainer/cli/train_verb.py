@@ -43,17 +43,17 @@ class KeyValueOption(click.Option):
 
 def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
     """The values of `KeyValueOption` by their keys, each parsed as JSON, or kept as text."""
-    found: dict[str, Any] = {}
+    changes: dict[str, Any] = {}
     for pair in pairs:
         key, equals, value = pair.partition("=")
         if not equals:
             raise click.BadParameter(f"{pair!r} is not KEY=VALUE", param_hint="--set")
         name = key.strip().removeprefix("network.")
         try:
-            found[name] = json.loads(value)
+            changes[name] = json.loads(value)
         except ValueError:
-            found[name] = value.strip()
-    return found
+            changes[name] = value.strip()
+    return changes
 
 
 @click.command()

@@ -171,16 +171,16 @@ def compare(
     spec = samples.source.spec
     for _, kept in denoisers:
         kept_count(spec, kept)
-    found = {} if references is None else read_references(references, samples)
-    shown = samples.to_show(found)
-    network = load_inception(inception, str(place)) if found and not without_inception else None
-    test = _Test(store, samples, found, shown, network, str(place), on_progress or (lambda *_: None))
+    references_by_row = {} if references is None else read_references(references, samples)
+    shown = samples.to_show(references_by_row)
+    network = load_inception(inception, str(place)) if references_by_row and not without_inception else None
+    test = _Test(store, samples, references_by_row, shown, network, str(place), on_progress or (lambda *_: None))
     ready = [ReadyPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     test.on_progress("networks are loaded and timed", 0, 0)
     leading, *others = test.timed([*runs, *ready])
     first_of_all = test.measured(leading)
     if choose:
-        shown += [row for row in dict.fromkeys(choose(first_of_all.images, found)) if row not in shown]
+        shown += [row for row in dict.fromkeys(choose(first_of_all.images, references_by_row)) if row not in shown]
     rows = [first_of_all.row(shown), *(test.measured(other).row(shown) for other in others)]
     return Evaluation(
         scene=spec.name,
@@ -189,9 +189,9 @@ def compare(
         measured=tuple(samples.rows),
         device=described(place),
         threads=first.settings.threads,
-        references=References.of(found, spec.transport.half_spp),
+        references=References.of(references_by_row, spec.transport.half_spp),
         rows=tuple(rows),
-        shown=tuple(samples.target(row, found.get(row)) for row in shown),
+        shown=tuple(samples.target(row, references_by_row.get(row)) for row in shown),
     )
 
 

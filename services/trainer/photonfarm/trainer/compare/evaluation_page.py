@@ -52,14 +52,17 @@ def evaluation_text(evaluation: Evaluation) -> str:
 
 def notes(evaluation: Evaluation) -> list[str]:
     """Notes on the errors, a sentence each."""
-    found = [
+    sentences = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over "
         f"{format_count(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:
-        return [*found, "no references: the columns of the paper need them (`photonfarm store merge`, `--references`)"]
-    return [*found, *_of_references(evaluation, evaluation.references, metrics), *_of_inception(metrics)]
+        return [
+            *sentences,
+            "no references: the columns of the paper need them (`photonfarm store merge`, `--references`)",
+        ]
+    return [*sentences, *_of_references(evaluation, evaluation.references, metrics), *_of_inception(metrics)]
 
 
 def _of_few(units: int) -> str:
@@ -93,16 +96,16 @@ def _of_references(evaluation: Evaluation, references: References, metrics: Imag
         "out of MSE it is taken by their halves, but for what the display's curve makes of it"
     )
     units = metrics.mse.estimate.count
-    found = [
+    sentences = [
         f"references: of {format_count(references.views, 'view')}, of {references.spp} samples per pixel or more; "
         f"intervals over their {format_count(units, evaluation.unit)}{_of_few(units)}; {converged}"
     ]
     if any(row.kept is not None for row in evaluation.rows):
-        found.append(
+        sentences.append(
             f"denoisers: up to {references.half_a_share:.1%} of a reference is the half A that they were given, "
             "which flatters them in the columns from MSSIM on; out of both MSE it is taken"
         )
-    return found
+    return sentences
 
 
 def _of_inception(metrics: ImageMetrics) -> list[str]:
@@ -151,8 +154,8 @@ def _cells(row: PredictorRow, first: PredictorRow, columns: list[str]) -> list[s
 
 
 def _interval(estimate: Estimate) -> str:
-    found = confidence_interval(estimate)
-    return NOT_AVAILABLE if found is None else f"{found[0]:.5f} … {found[1]:.5f}"
+    interval = confidence_interval(estimate)
+    return NOT_AVAILABLE if interval is None else f"{interval[0]:.5f} … {interval[1]:.5f}"
 
 
 def views_of(evaluation: Evaluation, noun: str = "view") -> str:
@@ -197,11 +200,11 @@ def comparison(evaluation: Evaluation) -> Picture:
 
 def _place_pictures(evaluation: Evaluation) -> list[list[Picture]]:
     """The pictures of each shown sample; black where a predictor could not be measured, after a repair."""
-    found = []
+    lines = []
     for target in evaluation.shown:
         images = [row.shown.get(target.row, np.zeros_like(target.image)) for row in evaluation.rows]
-        found.append([enlarged(image) for image in (target.image, *images)])
-    return found
+        lines.append([enlarged(image) for image in (target.image, *images)])
+    return lines
 
 
 def _of_targets(shown: tuple[Target, ...]) -> str:

@@ -49,12 +49,12 @@ class References:
     half_a_share: float  # of that reference's samples: those of one half A, if all passes of the view were merged
 
     @classmethod
-    def of(cls, found: Mapping[int, Reference], half_spp: int) -> Self | None:
+    def of(cls, references: Mapping[int, Reference], half_spp: int) -> Self | None:
         """A summary of the references found; None if there are none."""
-        if not found:
+        if not references:
             return None
-        count = min(reference.count for reference in found.values())
-        return cls(len(found), count * half_spp, 1 / count)
+        count = min(reference.count for reference in references.values())
+        return cls(len(references), count * half_spp, 1 / count)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -114,15 +114,15 @@ def read_references(folder: Path, samples: HeldOutSamples) -> dict[int, Referenc
         raise StoreError(f"{folder}: there is no such folder")
     spec = samples.source.spec
     film = spec.film
-    found: dict[int, Reference] = {}
+    references: dict[int, Reference] = {}
     for row, key in zip(samples.rows, samples.view_keys, strict=True):
         if (file := folder / f"{key.hex()}.npz").is_file():
-            found[row] = Reference.of(MergedView.read(file), spec.exposure)
-            if (shape := found[row].half_a.shape) != (film.height, film.width, 3):
+            references[row] = Reference.of(MergedView.read(file), spec.exposure)
+            if (shape := references[row].half_a.shape) != (film.height, film.width, 3):
                 raise SpecError(f"{file}: has the shape {shape}, and the scene's film {(film.height, film.width, 3)}")
-    if not found:
+    if not references:
         raise StoreError(
             f"{folder}: holds no reference of the {len(samples.rows)} held-out views; "
             "`photonfarm store merge --out` writes them, named by their views' keys"
         )
-    return found
+    return references

@@ -217,18 +217,18 @@ class ImageMetrics:
 
     def estimates(self) -> dict[str, Estimate]:
         """The metrics that are available, by their names in `TITLES`; FID has no standard error."""
-        found = {name: getattr(self, name).estimate for name in ("mse", "mssim", "flip")}
-        found |= {f"feature-l1-{block}": each.estimate for block, each in enumerate(self.feature_l1 or ())}
-        found |= {"fid": Estimate(self.fid.value, None, self.fid.predictions)} if self.fid else {}
-        return found | ({"kid": self.kid} if self.kid else {})
+        estimates = {name: getattr(self, name).estimate for name in ("mse", "mssim", "flip")}
+        estimates |= {f"feature-l1-{block}": each.estimate for block, each in enumerate(self.feature_l1 or ())}
+        estimates |= {"fid": Estimate(self.fid.value, None, self.fid.predictions)} if self.fid else {}
+        return estimates | ({"kid": self.kid} if self.kid else {})
 
     def columns(self) -> dict[str, str]:
         """Column heads and their entries, `n/a` for a metric that is not available."""
-        found = self.estimates()
+        estimates = self.estimates()
         heads = {"mse": ("MSE", 5), "mssim": ("MSSIM", 4), "fid": ("FID", 2), "kid": ("KID", 5)}
         heads |= {HEADLINE: ("Feature L1", 4), "flip": ("FLIP", 4)}
         return {
-            head: f"{found[name].mean:.{digits}f}" if name in found else NOT_AVAILABLE
+            head: f"{estimates[name].mean:.{digits}f}" if name in estimates else NOT_AVAILABLE
             for name, (head, digits) in heads.items()
         }
 

@@ -185,10 +185,10 @@ def load_inception(path: Path | None = None, device: str = "cpu") -> Inception |
 
     Raises StoreError as `find_weights` and `read_weights` do.
     """
-    found = find_weights(path)
-    if found is None:
+    located = find_weights(path)
+    if located is None:
         return None
-    file, weights = found
+    file, weights = located
     network = FIDInceptionV3()
     network.load_state_dict(read_weights(file, network.state_dict()))
     network.requires_grad_(requires_grad=False)
@@ -350,11 +350,11 @@ def _is_torchscript(path: Path) -> bool:
 
 
 def _double(stored: Mapping[str, Tensor], key: str, shape: torch.Size, path: Path) -> Tensor:
-    found = stored.get(key)
-    if not isinstance(found, Tensor) or found.shape != shape:
-        what = f"shape {tuple(found.shape)}" if isinstance(found, Tensor) else "none"
+    tensor = stored.get(key)
+    if not isinstance(tensor, Tensor) or tensor.shape != shape:
+        what = f"shape {tuple(tensor.shape)}" if isinstance(tensor, Tensor) else "none"
         raise StoreError(
             f"Inception weights: tensor {key} must have the shape {tuple(shape)}, and {path.name} has {what}; "
             "it is of another network"
         )
-    return found.double()
+    return tensor.double()

@@ -103,9 +103,9 @@ class Guided(Network):
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """log(1 + light), (B, H, W, 3) each: of lit points, then of photons in each window."""
-        found = [] if self.lit_points is None else self.lit_points(inputs)
+        channels = [] if self.lit_points is None else self.lit_points(inputs)
         gathered = [] if self.photon_light is None else self.photon_light(inputs)
-        return [torch.log1p(light) for light in (*found, *gathered)]
+        return [torch.log1p(light) for light in (*channels, *gathered)]
 
     def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
         """Emission, reflected direct light, and albedo times further diffuse light, (B, H, W, 3).

@@ -170,15 +170,15 @@ class Inputs:
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], noisy: NoisyColour | None = None) -> Inputs:
         """The inputs that a `SceneDataset` has read, (B, …) by field, in the same memory; and noisy colour."""
-        found = cls(tensors["world_to_camera"], tensors["depth"], tensors["albedo"], tensors["normal"], noisy=noisy)
+        inputs = cls(tensors["world_to_camera"], tensors["depth"], tensors["albedo"], tensors["normal"], noisy=noisy)
         if POINTS[0] in tensors:
-            found = replace(found, points=PointInputs(*(tensors[name] for name in POINTS)))
+            inputs = replace(inputs, points=PointInputs(*(tensors[name] for name in POINTS)))
         if PHOTONS[0] in tensors:
             arrays = {name.removeprefix("photon_"): tensors[name] for name in (*PHOTONS, "photon_seen")}
-            found = replace(found, photons=PhotonInputs(**arrays, present=arrays["bounce"] >= 0))
+            inputs = replace(inputs, photons=PhotonInputs(**arrays, present=arrays["bounce"] >= 0))
         if GUIDES[0] in tensors:
-            found = replace(found, guides=GuideInputs(*(tensors[name] for name in GUIDES)))
-        return found
+            inputs = replace(inputs, guides=GuideInputs(*(tensors[name] for name in GUIDES)))
+        return inputs
 
 
 def given(member: M | None) -> M:

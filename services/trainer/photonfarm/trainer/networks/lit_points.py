@@ -152,9 +152,9 @@ class LitPoints(nn.Module):
     def _diffuse(self, surface: Tensor, normal: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
         """The points' light without and with learned visibility, (H, W, 3) each."""
         at, facing = (_pooled(image).reshape(-1, 3) for image in (surface, normal))
-        found = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, sent), dim=-1)
+        arriving = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, sent), dim=-1)
         height, width = surface.shape[0] // COARSE, surface.shape[1] // COARSE
-        coarse = found.reshape(1, height, width, 6).permute(0, 3, 1, 2)
+        coarse = arriving.reshape(1, height, width, 6).permute(0, 3, 1, 2)
         fine = functional.interpolate(coarse, scale_factor=COARSE, mode="bilinear")[0].permute(1, 2, 0)
         return fine[..., :3], fine[..., 3:]
 

@@ -198,11 +198,11 @@ class LightTransportPhotons(LightTransport):
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """The points' features, and log(1 + gathered light), (B, H, W, 3) each, or the photons' features, 64 wide."""
-        found, photons = super().further(inputs), given(inputs.photons)
+        features, photons = super().further(inputs), given(inputs.photons)
         if self.photon_transport is None:
-            return [*found, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
+            return [*features, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
         where = photons.position, photons.present, photons.seen
-        return [*found, self.project(self.photon_features(photons), *where, inputs)]
+        return [*features, self.project(self.photon_features(photons), *where, inputs)]
 
     def gathered(self, inputs: Inputs) -> list[Tensor]:
         """The light of all photons by `PhotonLight`, (B, H, W, 3) for each window."""

@@ -83,12 +83,12 @@ def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
     landed = power.flatten(0, 1).index_select(0, kept.point)
     flux = power.new_zeros(B * H * W, 3).index_add(0, kept.pixel, landed).view(B, H, W, 3)
     both = torch.cat([flux * (area > 0)[..., None], area[..., None]], dim=-1).permute(0, 3, 1, 2)
-    found = []
+    maps = []
     for share in WINDOWS:
         around = _blurred(both, max(round(0.5 * (share * W - 1)), 1)).permute(0, 2, 3, 1)
         seen = around[..., 3:]
-        found.append(around[..., :3] / torch.where(seen > 0, seen, torch.inf) / math.pi)
-    return found
+        maps.append(around[..., :3] / torch.where(seen > 0, seen, torch.inf) / math.pi)
+    return maps
 
 
 def _blurred(x: Tensor, beside: int) -> Tensor:

@@ -72,11 +72,11 @@ def table(parts: list[NetworkPart]) -> str:
 
 def _parameters(network: Network) -> dict[str, int]:
     """The number of parameters of each part; descriptors belong to the points."""
-    found = dict.fromkeys(PARTS, 0)
+    counts = dict.fromkeys(PARTS, 0)
     for name, parameter in network.named_parameters():
         module = name.split(".")[0]
-        found["point branch" if module == DESCRIPTOR else MODULES.get(module, OTHER)] += parameter.numel()
-    return found
+        counts["point branch" if module == DESCRIPTOR else MODULES.get(module, OTHER)] += parameter.numel()
+    return counts
 
 
 def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:

@@ -105,13 +105,13 @@ def network_predictor(network: Network) -> DevicePredictor:
     return DevicePredictor(partial(image_of, network), next(network.parameters()).device)
 
 
-def mean_colours(found: Iterator[TrainingBatch]) -> tuple[F32, F32]:
+def mean_colours(samples: Iterator[TrainingBatch]) -> tuple[F32, F32]:
     """The mean exposed colours over samples and pixels, (3,) each: the best predictions without any input.
 
     The first is for `error`, the second for `shown`, with light above white cut to white.
     """
     means, shown = [], []
-    for batch in found:
+    for batch in samples:
         for image in batch.target.double().mean(dim=1).numpy():
             means.append(image.mean(axis=(0, 1)))
             shown.append(np.minimum(block_means(image), WHITE).mean(axis=(0, 1)))
@@ -148,7 +148,7 @@ def block_means(image: F32) -> F32:
     return (sums / counts).astype(np.float32)
 
 
-def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOutErrors:
+def measure(predict: Predictor, samples: Iterator[TrainingBatch]) -> HeldOutErrors:
     """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
 
     For a predictor whose inputs include noisy colour, which is A's, it is mean f² − 2fB + AB.
@@ -157,7 +157,7 @@ def measure(predict: Predictor, found: Iterator[TrainingBatch]) -> HeldOutErrors
     """
     errors, shown, floors = [], [], []
     units: list[Key] = []
-    for batch in found:
+    for batch in samples:
         units.extend(batch.units)
         error = error_of(batch)
         for image, (half_a, half_b) in zip(predict(batch), batch.target.cpu().numpy(), strict=True):

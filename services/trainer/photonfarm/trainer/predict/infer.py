@@ -53,15 +53,15 @@ def find_row(store: str | Path, run: TrainedRun, modification: str | None, view:
 
     Raises IncompleteError if such samples are planned and none is complete, StoreError if none is planned.
     """
-    found = find_samples(Store(store), [run.scene_id], Query.of(modification=modification, view=view))
-    row = next((sample.row for sample in found.samples if sample.complete), None)
-    if row is None and found.count:
+    rows = find_samples(Store(store), [run.scene_id], Query.of(modification=modification, view=view))
+    row = next((sample.row for sample in rows.samples if sample.complete), None)
+    if row is None and rows.count:
         raise IncompleteError(
-            f"{store}: {found.count} samples of this configuration and view are planned, and none is complete; wait "
+            f"{store}: {rows.count} samples of this configuration and view are planned, and none is complete; wait "
             "for the workers"
         )
     if row is None:
-        nearest = "" if found.nearest is None else f"; the nearest one is {found.nearest:.3g} scene units away"
+        nearest = "" if rows.nearest is None else f"; the nearest one is {rows.nearest:.3g} scene units away"
         raise StoreError(
             f"{store}: no sample of this configuration and view is planned{nearest}. Any view can be shown with "
             "--camera-path, for which the renderer makes the buffers"
@@ -119,8 +119,8 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "buffers.npz"
         named = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
-        verb, found = command(VERB, *named, *arguments), with_scenes(run.folder)
-        if code := subprocess.run(verb, env=found, stdout=subprocess.DEVNULL, check=False).returncode:
+        verb, environment = command(VERB, *named, *arguments), with_scenes(run.folder)
+        if code := subprocess.run(verb, env=environment, stdout=subprocess.DEVNULL, check=False).returncode:
             raise _ended(code)
         return Frames.read(file)
 
@@ -146,10 +146,10 @@ def show_frames(
     _make(out)
     files = [out / f"frame-{i:04}.png" for i in range(len(frames))]
     seconds = 0.0
-    found = _batches(run, frames, source)
+    frame_batches = _batches(run, frames, source)
     for file in files:
         began = time.perf_counter()
-        image = predict(next(found))[0]
+        image = predict(next(frame_batches))[0]
         seconds += time.perf_counter() - began
         animation.write_png(animation.enlarged(image), file)
     sentence = f"{len(frames)} frames, {1e3 * seconds / len(frames):.1f} ms each for the network and what it reads"

@@ -62,9 +62,9 @@ class TrainedRun:
         try:
             network.load_state_dict(self.weights)
         except RuntimeError as error:  # a user's class has changed, or this version's
-            found = str(error).splitlines()[-1].strip().rstrip(".")
+            reason = str(error).splitlines()[-1].strip().rstrip(".")
             raise SpecError(
-                f"{self.folder}: its weights do not fit the network {settings.architecture!r} as it is now ({found}); "
+                f"{self.folder}: its weights do not fit the network {settings.architecture!r} as it is now ({reason}); "
                 "bring back the code that it was trained with, or train anew in another folder"
             ) from error
         return network

@@ -167,9 +167,9 @@ def gathered(
     )
     tell("the mean colour and the untrained network are measured", 0, 0)
     costs = close_look.costs
-    found = table_of(card.spec)
+    published = table_of(card.spec)
     names = short_names(list(runs))
-    entries = tuple(_entries(evaluation, names, (runs, denoisers), costs, found[1] if found else {}))
+    entries = tuple(_entries(evaluation, names, (runs, denoisers), costs, published[1] if published else {}))
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
@@ -180,7 +180,7 @@ def gathered(
         untimed=close_look.untimed,
         machine=close_look.machine,
         worst=tuple(close_look.worst),
-        published=found[0] if found and any(entry.published for entry in entries) else None,
+        published=published[0] if published and any(entry.published for entry in entries) else None,
         inputs=_inputs(store, first, [target.row for target in evaluation.shown]),
     )
 

@@ -50,7 +50,7 @@ class DatasetCard:
             for package, version in figures["versions"].items():
                 versions.setdefault(package, set()).add(version)
         requests = tuple(plan.request.model_dump(mode="json") for plan in scene.plans())
-        known = {package: sorted(found) for package, found in sorted(versions.items())}
+        known = {package: sorted(numbers) for package, numbers in sorted(versions.items())}
         return cls(
             scene.spec.model_copy(update={"exposure": exposure}),
             status,
@@ -111,17 +111,17 @@ class DatasetCard:
 
 def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanTotals]:
     """The totals by kind of request, given the seconds of the committed jobs."""
-    found: dict[str, PlanTotals] = {}
+    totals: dict[str, PlanTotals] = {}
     for plan in scene.plans():
         used = (plan.rows.sample_modification != UNUSED).reshape(plan.jobs, plan.shard_rows).sum(axis=1)
         done = [job for job in range(plan.first_job, plan.end_job) if job in core_s]
-        before = found.get(plan.request.kind, PlanTotals(0, 0, 0.0))
-        found[plan.request.kind] = PlanTotals(
+        before = totals.get(plan.request.kind, PlanTotals(0, 0, 0.0))
+        totals[plan.request.kind] = PlanTotals(
             before.planned + plan.samples,
             before.rows + sum(int(used[job - plan.first_job]) for job in done),
             before.core_s + sum(core_s[job] for job in done),
         )
-    return {kind: spent for kind, spent in found.items() if spent.rows}
+    return {kind: spent for kind, spent in totals.items() if spent.rows}
 
 
 def kind(spec: SceneSpec) -> str:

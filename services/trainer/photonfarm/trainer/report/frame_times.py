@@ -50,10 +50,10 @@ class Machine:
 
 def _model() -> str | None:
     try:
-        found = re.search(r"^model name\s*:\s*(.+)$", CPU_INFO.read_text(), re.MULTILINE)
+        model = re.search(r"^model name\s*:\s*(.+)$", CPU_INFO.read_text(), re.MULTILINE)
     except OSError:  # another system
         return None
-    return found[1] if found else None
+    return model[1] if model else None
 
 
 VERB = "measure-frames"  # of the renderer
@@ -108,8 +108,8 @@ def frame_costs(
         asked += ["--timed", str(TIMED), *([] if points is None else ["--points", str(points)])]
         asked += [argument for row in rows for argument in ("--row", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
-        verb, found = command(VERB, *asked), with_scenes(run.folder)
-        if code := subprocess.run(verb, env=found, stdout=subprocess.DEVNULL, check=False).returncode:
+        verb, environment = command(VERB, *asked), with_scenes(run.folder)
+        if code := subprocess.run(verb, env=environment, stdout=subprocess.DEVNULL, check=False).returncode:
             raise BackendError(f"`photonfarm {VERB}` ended with exit code {code} here")
         return FrameCosts.read(file)
 

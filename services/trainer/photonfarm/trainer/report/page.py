@@ -206,15 +206,15 @@ def page(contents: ReportContents, verdict: Verdict, views: Sequence[ShownView],
 
 def light_data(views: Sequence[ShownView]) -> list[dict[str, str]]:
     """The light of each view's layers by their names, as many as fit: first those of all views that come first."""
-    found: list[dict[str, str]] = [{} for _ in views]
+    layers_by_view: list[dict[str, str]] = [{} for _ in views]
     left = MOST_LIGHT
     for place, name, light in _by_importance(views):
         text = half_floats(light)
         left -= len(text)
         if left < 0:
             break
-        found[place][name] = text
-    return found
+        layers_by_view[place][name] = text
+    return layers_by_view
 
 
 def _by_importance(views: Sequence[ShownView]) -> Iterator[tuple[int, str, F32]]:

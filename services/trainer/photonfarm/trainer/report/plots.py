@@ -72,8 +72,8 @@ OF_CURVES = (
 def by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
     """The title, an explanation, and the plots of each kind, without empty kinds."""
     kinds = (("Metrics over the time of a frame", OF_TIME, TIMES), ("Learning", OF_CURVES, CURVES))
-    found = [(title, text, [plot for plot in drawn if plot.name.startswith(kind)]) for title, text, kind in kinds]
-    return [each for each in found if each[2]]
+    groups = [(title, text, [plot for plot in drawn if plot.name.startswith(kind)]) for title, text, kind in kinds]
+    return [each for each in groups if each[2]]
 
 
 def plots(contents: ReportContents) -> list[Plot]:

@@ -35,8 +35,8 @@ class Table:
 
 def tables(contents: ReportContents) -> list[Table]:
     """All tables, in the order of the report."""
-    found = [_paper(contents), _further(contents), *_frame_parts(contents), _runs(contents), *_worst(contents)]
-    return [table.without_empty_columns for table in found]
+    every = [_paper(contents), _further(contents), *_frame_parts(contents), _runs(contents), *_worst(contents)]
+    return [table.without_empty_columns for table in every]
 
 
 def facts(contents: ReportContents) -> list[tuple[str, str]]:
@@ -44,7 +44,7 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
     card, about = contents.card, contents.card.document()
     spec, status = card.spec, card.status
     t, owed = spec.transport, spec.credits
-    versions = ", ".join(f"{package} {' and '.join(found)}" for package, found in card.versions.items())
+    versions = ", ".join(f"{package} {' and '.join(numbers)}" for package, numbers in card.versions.items())
     return [
         ("scene", f"{spec.name}, {about['source']}, id {spec.scene_id}"),
         ("credits", "not said" if owed is None else f"“{owed.title}” by {owed.author}, {owed.licence}"),
@@ -90,12 +90,12 @@ def _cost(contents: ReportContents) -> str:
 def _gpu(contents: ReportContents) -> str:
     """The tasks that ran on a GPU."""
     trained = [story.name for story in contents.stories if story.on_gpu]
-    found = [f"trained {', '.join(trained)}"] if trained else []
+    tasks = [f"trained {', '.join(trained)}"] if trained else []
     if contents.evaluation.device != "cpu":
-        found.append(f"networks were measured on {contents.evaluation.device}")
+        tasks.append(f"networks were measured on {contents.evaluation.device}")
     return (
-        "; ".join(found)
-        if found
+        "; ".join(tasks)
+        if tasks
         else "none took part: images were rendered, and networks trained and measured, on CPUs"
     )
 
@@ -175,14 +175,14 @@ def _of_paper(contents: ReportContents) -> str:
 
 
 def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) -> tuple[str, ...]:
-    found, paper, unit = entry.estimates, entry.published, contents.measure
+    estimates, paper, unit = entry.estimates, entry.published, contents.measure
     cells = [
         (format_milliseconds(entry.time.total) if entry.time else NOT_AVAILABLE, None),
         (_ratio(entry, unit, alone=len(contents.entries) == 1), _published_ratio(entry, unit)),
-        (with_interval(found.get("mse"), 5), f"{paper.mse:.4f}" if paper else ""),
-        (with_interval(found.get("mssim"), 3), f"{paper.mssim:.3f}" if paper else ""),
-        (with_interval(found.get("fid"), 1), f"{paper.fid:.1f}" if paper else ""),
-        (with_interval(found.get(HEADLINE), 3), f"{paper.feature_l1:.3f}" if paper else ""),
+        (with_interval(estimates.get("mse"), 5), f"{paper.mse:.4f}" if paper else ""),
+        (with_interval(estimates.get("mssim"), 3), f"{paper.mssim:.3f}" if paper else ""),
+        (with_interval(estimates.get("fid"), 1), f"{paper.fid:.1f}" if paper else ""),
+        (with_interval(estimates.get(HEADLINE), 3), f"{paper.feature_l1:.3f}" if paper else ""),
     ]
     row = [entry.name]
     for ours, theirs in cells:
@@ -208,8 +208,8 @@ def with_interval(estimate: Estimate | None, digits: int) -> str:
     """Mean and 95 % interval."""
     if estimate is None:
         return NOT_AVAILABLE
-    found = confidence_interval(estimate)
-    reach = "" if found is None else f" ({found[0]:.{digits}f} … {found[1]:.{digits}f})"
+    interval = confidence_interval(estimate)
+    reach = "" if interval is None else f" ({interval[0]:.{digits}f} … {interval[1]:.{digits}f})"
     return f"{estimate.mean:.{digits}f}{reach}"
 
 
@@ -223,9 +223,9 @@ def _further(contents: ReportContents) -> Table:
     rows = []
     for entry in contents.entries:
         behind = "–" if entry.row is first else with_interval(entry.row.behind(first), 5)
-        found = entry.estimates
-        cells = [f"{found[m].mean:.4f}" if m in found else NOT_AVAILABLE for m in shown]
-        kid = [with_interval(found.get("kid"), 4)] if shown else []
+        estimates = entry.estimates
+        cells = [f"{estimates[m].mean:.4f}" if m in estimates else NOT_AVAILABLE for m in shown]
+        kid = [with_interval(estimates.get("kid"), 4)] if shown else []
         rows.append((entry.name, with_interval(entry.row.held_out.error, 5), behind, *cells, *kid))
     titles = (*(TITLES[m] for m in shown), *(["KID (95 %)"] if shown else []))
     head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *titles)

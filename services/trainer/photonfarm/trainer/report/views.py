@@ -62,10 +62,10 @@ class ShownView:
 def shown_views(contents: ReportContents) -> list[ShownView]:
     """The views with an image by the first predictor: that of median error first, so that no choice flatters."""
     there = contents.entries[0].row.shown
-    found = [_view(contents, target) for target in contents.evaluation.shown if target.row in there]
-    median = sorted(found, key=lambda view: view.mse)[(len(found) - 1) // 2 :][:1]
+    views = [_view(contents, target) for target in contents.evaluation.shown if target.row in there]
+    median = sorted(views, key=lambda view: view.mse)[(len(views) - 1) // 2 :][:1]
     first = [replace(view, caption=caption(contents.worst, view.row, is_median=True)) for view in median]
-    return [*first, *(view for view in found if view not in median)]
+    return [*first, *(view for view in views if view not in median)]
 
 
 def _view(contents: ReportContents, target: Target) -> ShownView:

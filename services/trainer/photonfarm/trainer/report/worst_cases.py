@@ -144,5 +144,5 @@ def _alike(buffers: ViewBuffers, first: Part, second: Part) -> Mask:
     colour = np.abs(buffers.albedo[first] - buffers.albedo[second]).max(axis=-1) < SAME_ALBEDO
     turned = (buffers.normal[first] * buffers.normal[second]).sum(axis=-1) > SAME_NORMAL
     diffuse = buffers.albedo[first].max(axis=-1) > 0
-    found: Mask = near & colour & turned & diffuse
-    return found
+    mask: Mask = near & colour & turned & diffuse
+    return mask

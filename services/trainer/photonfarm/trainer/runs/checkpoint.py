@@ -73,9 +73,9 @@ def load(path: Path, *, without: str = "") -> dict[str, Any]:
         document, tensors = _read(path)
     except _DamagedError as error:
         raise StoreError(f"{path}: {error}; {without or _remedy(path)}") from error.__cause__
-    if (found := document.get("format")) != FORMAT:
+    if (stored := document.get("format")) != FORMAT:
         raise StoreError(
-            f"{path}: has format {found!r}, but this version reads format {FORMAT}; train anew in another folder"
+            f"{path}: has format {stored!r}, but this version reads format {FORMAT}; train anew in another folder"
         )
     state: dict[str, Any] = _together(document, tensors)
     return state
@@ -119,11 +119,11 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:
     """The digest of the tensors' names and bytes."""
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for name in sorted(tensors):
-        found.update(name.encode())
-        found.update(tensors[name].numpy().tobytes())
-    return found.hexdigest()
+        digest.update(name.encode())
+        digest.update(tensors[name].numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
@@ -173,10 +173,12 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     changed = differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
-        found = "; ".join(f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items())
+        differences = "; ".join(
+            f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items()
+        )
         options = " ".join(_option(key, then) for key, (then, _) in lasting.items() if key not in kept)
         same = f"the same values{f' ({options})' if options else ''}"
-        raise SpecError(f"{path}: was trained with {found}; use another run directory, or {same}")
+        raise SpecError(f"{path}: was trained with {differences}; use another run directory, or {same}")
     return changed
 
 

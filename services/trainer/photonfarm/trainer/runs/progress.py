@@ -168,10 +168,10 @@ class RunProgress:
 
     def line(self) -> str:
         """The present state in words."""
-        found = self.look()
-        left = f", {in_words(found['left_s'])} left" if isinstance(found["left_s"], float) else ""
-        since = f" for {found['phase_s']:.0f} s" if found["phase"] != TRAINS else ""
-        return f"{self._steps_done}: {found['phase']}{since}, {self._samples} samples have arrived{left}"
+        state = self.look()
+        left = f", {in_words(state['left_s'])} left" if isinstance(state["left_s"], float) else ""
+        since = f" for {state['phase_s']:.0f} s" if state["phase"] != TRAINS else ""
+        return f"{self._steps_done}: {state['phase']}{since}, {self._samples} samples have arrived{left}"
 
     def last_line(self) -> str:
         """The state at the end of the session, in words; "" if nothing has arrived."""

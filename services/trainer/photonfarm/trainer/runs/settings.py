@@ -78,16 +78,16 @@ def refuse(settings: Any) -> Any:
     """Return the settings unchanged; ValidationError, which names key, value and reason, if one of them biases."""
     if not isinstance(settings, Mapping):
         return settings
-    found = {key: BIASING_KEYS[key].rule("leave the key out") for key in settings if key in BIASING_KEYS}
+    rules = {key: BIASING_KEYS[key].rule("leave the key out") for key in settings if key in BIASING_KEYS}
     loss = settings.get("loss")
     if isinstance(loss, str) and loss.lower() in BIASING_LOSSES:
-        found["loss"] = BIASING_LOSSES[loss.lower()].rule(
+        rules["loss"] = BIASING_LOSSES[loss.lower()].rule(
             "use 'linear', or 'relative' or 'paired', whose weights are detached"
         )
-    if found:
+    if rules:
         faults = [
             InitErrorDetails(type=PydanticCustomError("biased", rule), loc=(key,), input=settings[key])
-            for key, rule in found.items()
+            for key, rule in rules.items()
         ]
         raise ValidationError.from_exception_data("TrainSettings", faults)
     return settings

@@ -30,7 +30,7 @@ def load(key: str, name: str) -> Any:
     if (here := str(Path.cwd())) not in sys.path:
         sys.path.insert(0, here)
     try:
-        found = import_module(module)
+        loaded = import_module(module)
     except ModuleNotFoundError as error:
         raise SpecError(
             f"{key} = {name!r}: Python finds no module {error.name!r}; run in the folder that holds it, or put that "
@@ -42,10 +42,10 @@ def load(key: str, name: str) -> Any:
         raise SpecError(
             f"{key} = {name!r}: module {module} cannot be imported{line}: {type(error).__name__}: {error}"
         ) from error
-    if not hasattr(found, attribute):
-        exist = ", ".join(each for each in vars(found) if not each.startswith("_")) or "nothing"
-        raise SpecError(f"{key} = {name!r}: {found.__file__} has no {attribute!r}; it has {exist}")
-    return getattr(found, attribute)
+    if not hasattr(loaded, attribute):
+        exist = ", ".join(each for each in vars(loaded) if not each.startswith("_")) or "nothing"
+        raise SpecError(f"{key} = {name!r}: {loaded.__file__} has no {attribute!r}; it has {exist}")
+    return getattr(loaded, attribute)
 
 
 def _hint(error: Exception) -> str:
@@ -67,7 +67,7 @@ def named_in_errors(**own: str) -> Iterator[None]:
         frames = traceback.extract_tb(error.__traceback__)
         for key, name in own.items():
             file = getattr(sys.modules.get(name.partition(":")[0]), "__file__", None)
-            if is_own(name) and (found := [frame for frame in frames if frame.filename == file]):
-                where = f"{file}, line {found[-1].lineno}, in {found[-1].name}"
+            if is_own(name) and (own_frames := [frame for frame in frames if frame.filename == file]):
+                where = f"{file}, line {own_frames[-1].lineno}, in {own_frames[-1].name}"
                 raise SpecError(f"{key} = {name!r}: {where}: {type(error).__name__}: {error}{_hint(error)}") from error
         raise

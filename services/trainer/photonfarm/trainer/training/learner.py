@@ -147,9 +147,9 @@ class DivergedError(IncompleteError):
 
     exit_code = 8
 
-    def __init__(self, found: str) -> None:
+    def __init__(self, fault: str) -> None:
         super().__init__(
-            f"{found}; training cannot go on. What the run has saved is kept; a smaller learning_rate or a larger "
+            f"{fault}; training cannot go on. What the run has saved is kept; a smaller learning_rate or a larger "
             "batch may help"
         )
 

@@ -245,12 +245,12 @@ class Session:
 
     def _wait(self, look: Callable[[], T | None]) -> T | None:
         """Wait until the samples are there and `look` finds something, and return it; None once training has ended."""
-        while not (self._are_samples_there() and (found := look())):
+        while not (self._are_samples_there() and (value := look())):
             if self._ended() is not None:
                 return None
             with self._watch.on("wait_data"):
                 self._stop.wait(NAP_SECONDS)
-        return found
+        return value
 
     def _are_samples_there(self) -> bool:
         """Whether all samples that have arrived are complete; first leave the scene to whoever has taken its lease.
@@ -302,9 +302,9 @@ class Session:
         rows = self._stream.held_out[: self._settings.validation_samples]
         with self._watch.on("validate"):
             self._stream.drop()
-            found = batches(self._feed, rows, self._settings.batch)
+            held_out_batches = batches(self._feed, rows, self._settings.batch)
             predict, loss = network_predictor(self._learner.predicting.eval()), self._settings.loss
-            now = validate(predict, self._step, found, self._hooks.on_images, loss=loss)
+            now = validate(predict, self._step, held_out_batches, self._hooks.on_images, loss=loss)
             self._learner.network.train()
             self._stream.ask_again()
         self._validated = self._step
@@ -338,13 +338,13 @@ class Session:
 
     def _keep_or_go_back(self) -> None:
         """Keep the state after the last validation, or go back, in all processes."""
-        found = self._compared
-        if found is not None and found.is_clearly_worse:
-            reason = f"step {self._step}: {found.stated}"
+        comparison = self._compared
+        if comparison is not None and comparison.is_clearly_worse:
+            reason = f"step {self._step}: {comparison.stated}"
             self._hooks.group.send("back", reason)
             self._good.go_back(reason)
-            self._log_recovered("held-out error", found)
-        elif found is not None and not found.is_worse:
+            self._log_recovered("held-out error", comparison)
+        elif comparison is not None and not comparison.is_worse:
             self._hooks.group.send("keep", self._step)
             self._keep()
 
@@ -352,22 +352,22 @@ class Session:
         """Validate the last step, and end with the last good state if the last one is worse than allowed."""
         if self._step != self._validated:
             self._validate()
-        found = self._compared
-        if found is not None and not found.is_worse:
+        comparison = self._compared
+        if comparison is not None and not comparison.is_worse:
             self._keep()
-        elif found is not None:
-            self._good.give(f"step {self._step}: {found.stated}")
-            self._log_recovered("end", found)
+        elif comparison is not None:
+            self._good.give(f"step {self._step}: {comparison.stated}")
+            self._log_recovered("end", comparison)
             self._validate()
 
-    def _log_recovered(self, cause: str, found: Comparison | None = None) -> None:
+    def _log_recovered(self, cause: str, comparison: Comparison | None = None) -> None:
         self._compared = None  # the learner has changed
         self._log.write(
             "recovered",
             step=self._step,
             cause=cause,
             back_to=self._good.step,
-            errors=found.document() if found else None,
+            errors=comparison.document() if comparison else None,
             recoveries=self._good.recoveries,
             rate_factor=self._learner.rate_factor,
         )

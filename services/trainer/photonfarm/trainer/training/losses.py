@@ -48,15 +48,15 @@ class Verdict:
         return self.at_clean <= LIMIT
 
     def __str__(self) -> str:
-        found = f"at the clean image its gradient over {DRAWS} noisy targets is 0 to within {self.at_clean:.1f}"
+        sentence = f"at the clean image its gradient over {DRAWS} noisy targets is 0 to within {self.at_clean:.1f}"
         if not self.is_unbiased:
             return (
                 f"at the clean image its mean gradient over {DRAWS} noisy targets is {self.at_clean:.0f} standard "
                 f"errors from 0 ({LIMIT:g} are allowed)"
             )
         if self.elsewhere <= LIMIT:
-            return f"{found} standard errors, and elsewhere it equals the gradient with the clean target"
-        return f"{found} standard errors; elsewhere it is not that with the clean target ({self.elsewhere:.0f})"
+            return f"{sentence} standard errors, and elsewhere it equals the gradient with the clean target"
+        return f"{sentence} standard errors; elsewhere it is not that with the clean target ({self.elsewhere:.0f})"
 
 
 def judged(loss: LossFunction) -> Verdict:

@@ -112,6 +112,6 @@ class Presence:
         """Whether somebody has taken the lease, by a look now and then."""
         if (began := time.monotonic()) < self._due:
             return False
-        found = self._source.lease() is not None
+        is_leased = self._source.lease() is not None
         self._due = (now := time.monotonic()) + pause_after_look(now - began, LOOK_S)
-        return found
+        return is_leased

@@ -63,7 +63,7 @@ class Validation:
 
 
 def validate(
-    predict: Predictor, step: int, found: Iterator[TrainingBatch], show: Show | None = None, *, loss: str = "linear"
+    predict: Predictor, step: int, samples: Iterator[TrainingBatch], show: Show | None = None, *, loss: str = "linear"
 ) -> Validation:
     """Measure a network over held-out samples; `show` gets targets and predictions of the first `SHOWN` or more.
 
@@ -76,7 +76,7 @@ def validate(
     shown: list[tuple[tuple[int, ...], F32, F32]] = []
 
     def noted() -> Iterator[TrainingBatch]:
-        for batch in found:
+        for batch in samples:
             rows.extend(batch.rows)
             yield batch
 
@@ -207,21 +207,21 @@ class GoodState:
         self.go_back(f"step {number}: the loss is {value} on rows {list(batch.rows)}")
         return None
 
-    def go_back(self, found: str) -> None:
+    def go_back(self, fault: str) -> None:
         """Give the learner the kept state, and half the rate from now on.
 
         Raises DivergedError, with `found` in its message, if nothing is kept, or after `MOST` times.
         """
         if self.recoveries == MOST:
-            raise DivergedError(f"{found}, after the run has gone back {MOST} times")
-        self.give(found)
+            raise DivergedError(f"{fault}, after the run has gone back {MOST} times")
+        self.give(fault)
         self.recoveries += 1
         self._learner.rate_factor *= FACTOR
 
-    def give(self, found: str) -> None:
+    def give(self, fault: str) -> None:
         """Give the learner the kept state; DivergedError, with `found` in its message, if nothing is kept."""
         if self.step is None:
-            raise DivergedError(found)
+            raise DivergedError(fault)
         self._learner.restore(_copied(self._kept))  # a copy, as the optimiser changes the tensors it is given
 
     def state(self) -> dict[str, Any]:

@@ -86,8 +86,8 @@ def format_card(exported: Exported) -> str:
         f"# {name}\n",
         f"{manifest.samples} samples of the scene {name}. Each has two noisy images A and B of one view, rendered by "
         "an unbiased bidirectional path tracer with seeds of their own: they are independent, and the mean of many "
-        "such images is the true one. So the mean of (f − A)(f − B) estimates the squared error of an image f against the "
-        "noise-free image. Values are linear and not clipped.\n",
+        "such images is the true one. So the mean of (f − A)(f − B) estimates the squared error of an image f against "
+        "the noise-free image. Values are linear and not clipped.\n",
         f"## Licence and credits\n\n{_format_credits(manifest)}\n",
         f"## Reading it\n\n```python\n{reading}```\n",
         f"## What a sample holds\n\n{_format_table(exported.contents.columns)}\n",

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.metrics import (
     Features,
-    FIDInceptionV3,
     Inception,
     InceptionWeights,
     feature_l1,
@@ -159,13 +158,15 @@ def test_kid_needs_two_sets_of_the_same_size_and_three_images() -> None:
 
 
 def _random_inception() -> Inception:
-    """The network with seeded random weights, as loud as a trained one."""
+    """A small network with the published one's blocks, and seeded random weights, as loud as a trained one."""
     torch.manual_seed(0)
-    network = FIDInceptionV3().requires_grad_(requires_grad=False).eval()
-    for name, tensor in network.named_parameters():
-        if name.endswith(".weight"):
-            torch.nn.init.kaiming_normal_(tensor, nonlinearity="relu")
-    return Inception(network, InceptionWeights("seeded random numbers", "0" * 64, published=False))
+    widths = {"pool0": (3, 64), "pool1": (64, 192), "mixed_7": (192, 768), "mixed_10": (768, 2048)}
+    network = torch.nn.Sequential()
+    for name, (width_in, width) in widths.items():
+        convolution = torch.nn.Conv2d(width_in, width, 3, stride=4)
+        torch.nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
+        network.add_module(name, torch.nn.Sequential(convolution, torch.nn.ReLU()))
+    return Inception(network.requires_grad_(requires_grad=False), InceptionWeights("seeded", "0" * 64, published=False))
 
 
 def _rooms(count: int, size: int = 16, seed: int = 0) -> NDArray[np.float32]:
@@ -203,7 +204,7 @@ def test_a_row_holds_every_metric_per_image_with_intervals_and_is_json() -> None
     assert found.kid is not None
     record = json.loads(json.dumps(asdict(found), allow_nan=False))
     assert record["fid"]["predictions"] == 4
-    assert record["inception"] == {"source": "seeded random numbers", "sha256": "0" * 64, "published": False}
+    assert record["inception"] == {"source": "seeded", "sha256": "0" * 64, "published": False}
     assert record["mse"]["estimate"]["mean"] == found.mse.estimate.mean
     assert set(found.columns()) == {"MSE", "MSSIM", "FID", "KID", "Feature L1", "FLIP"}
     assert "n/a" not in found.columns().values()

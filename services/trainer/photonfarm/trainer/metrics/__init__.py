@@ -16,7 +16,6 @@ from photonfarm.trainer.metrics.image_metrics import (
 )
 from photonfarm.trainer.metrics.inception import (
     Features,
-    FIDInceptionV3,
     Inception,
     InceptionWeights,
     find_weights,
@@ -25,7 +24,6 @@ from photonfarm.trainer.metrics.inception import (
 
 __all__ = [
     "HEADLINE_BLOCK",
-    "FIDInceptionV3",
     "Features",
     "Fid",
     "ImageMetrics",

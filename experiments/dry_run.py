@@ -45,7 +45,7 @@ class Need:
             passes,
             of_passes / 3600,
             len(runs),
-            sum(operations(spec, run) for run in runs),
+            sum(count_operations(spec, run) for run in runs),
         )
 
     def line(self, tflops: float) -> str:
@@ -57,22 +57,22 @@ class Need:
         )
 
 
-def measured(experiment: Experiment) -> Need:
+def measure_need(experiment: Experiment) -> Need:
     """What an experiment needs, its scene's costs measured here. Raises SpecError."""
     from photonfarm.renderer.measure.sample_costs import measured_costs
 
     return Need.of(experiment, measured_costs(experiment.spec(), frames=FRAMES))
 
 
-def operations(spec: SceneSpec, run: Run) -> float:
+def count_operations(spec: SceneSpec, run: Run) -> float:
     """Floating-point operations of a run's convolutions and matrix products."""
-    from photonfarm.trainer.networks import kind_of
-    from photonfarm.trainer.networks.summary import summary
-    from photonfarm.trainer.runs.settings import NetworkSettings, preset
+    from photonfarm.trainer.networks import find_kind
+    from photonfarm.trainer.networks.summary import summarise
+    from photonfarm.trainer.runs.settings import NetworkSettings, make_preset
 
     told = {key: value for key, value in run.train.items() if key != "preset"}
     network = {key: told.pop(key) for key in [*told] if key in NetworkSettings.model_fields}
-    settings = preset(run.train["preset"], network=network, **told)
-    of_image = sum(part.gmacs for part in summary(spec, settings.network)) * 2e9
-    images = settings.batch * (2 if kind_of(settings.network.architecture).needs.kept else 1)  # a denoiser's halves
+    settings = make_preset(run.train["preset"], network=network, **told)
+    of_image = sum(part.gmacs for part in summarise(spec, settings.network)) * 2e9
+    images = settings.batch * (2 if find_kind(settings.network.architecture).needs.kept else 1)  # a denoiser's halves
     return OF_A_STEP * of_image * images * settings.max_steps

@@ -76,7 +76,7 @@ class AtTime:
         return mixed
 
 
-def placed(room: Room, names: Sequence[str]) -> list[Placed]:
+def place_rows(room: Room, names: Sequence[str]) -> list[Placed]:
     """Those of the rows that were timed and have errors, by ascending time. Raises SpecError as `Room.errors` does."""
     edit, entries = room.document["edit_seconds"], []
     for name in names:
@@ -86,12 +86,12 @@ def placed(room: Room, names: Sequence[str]) -> list[Placed]:
     return sorted(entries, key=lambda each: each.milliseconds)
 
 
-def family(room: Room, begins: str) -> list[Placed]:
+def order_family(room: Room, begins: str) -> list[Placed]:
     """The members of a family, by ascending time."""
-    return placed(room, [name for name in room.rows if name.startswith(begins)])
+    return place_rows(room, [name for name in room.rows if name.startswith(begins)])
 
 
-def at(members: Sequence[Placed], milliseconds: float) -> AtTime | None:
+def interpolate(members: Sequence[Placed], milliseconds: float) -> AtTime | None:
     """The least error of a family after so many milliseconds; None where all of it takes longer."""
     in_time = [each for each in members if each.milliseconds <= milliseconds]
     if not in_time:
@@ -107,7 +107,7 @@ def at(members: Sequence[Placed], milliseconds: float) -> AtTime | None:
     return reached
 
 
-def ratio(ours: Placed, theirs: AtTime) -> tuple[float, float, float]:
+def measure_ratio(ours: Placed, theirs: AtTime) -> tuple[float, float, float]:
     """Our error over theirs, and its 95 % interval: a bootstrap over configurations, the same for both."""
     errors = np.stack([ours.errors, theirs.first.errors, theirs.second.errors])
     views = errors.shape[1]
@@ -118,27 +118,27 @@ def ratio(ours: Placed, theirs: AtTime) -> tuple[float, float, float]:
     return float(ratios[0]), float(low), float(high)
 
 
-def table(rooms: Sequence[Room]) -> str:
+def format_table(rooms: Sequence[Room]) -> str:
     """Ours in each room: time, error, and that as a share of each family's after the same time."""
     head = ["room", "network", "ms a frame", "MSE"]
     head += [f"MSE over that of {called} at that time (95 %)" for called in FAMILIES.values()]
     lines = []
     for room in rooms:
-        for ours in placed(room, OURS):
+        for ours in place_rows(room, OURS):
             line = [room.name, ours.name, f"{ours.milliseconds:.0f}", f"{ours.mse:.5f}"]
-            lines.append([*line, *(_against(ours, family(room, begins)) for begins in FAMILIES)])
+            lines.append([*line, *(_format_ratio(ours, order_family(room, begins)) for begins in FAMILIES)])
     return format_markdown_table(head, lines)
 
 
-def _against(ours: Placed, members: Sequence[Placed]) -> str:
-    theirs = at(members, ours.milliseconds)
+def _format_ratio(ours: Placed, members: Sequence[Placed]) -> str:
+    theirs = interpolate(members, ours.milliseconds)
     if theirs is None:
         return f"all take longer, from {members[0].milliseconds:.0f} ms" if members else "n/a"
-    share, low, high = ratio(ours, theirs)
+    share, low, high = measure_ratio(ours, theirs)
     return f"{'≥ ' if theirs.beyond else ''}{share:.2f} ({low:.2f} … {high:.2f})"
 
 
-def picture(rooms: Sequence[Room]) -> bytes:
+def draw_picture(rooms: Sequence[Room]) -> bytes:
     """The plot of every room, as PNG."""
     import matplotlib as mpl
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -170,14 +170,14 @@ def _draw(axes: Axes, room: Room) -> None:
 
     colours = [colour for colour in COLOURS if colour != GREY]
     for begins, marker, line in zip(FAMILIES, "os", ("-", "--"), strict=True):
-        members = family(room, begins)
+        members = order_family(room, begins)
         places = [each.milliseconds for each in members], [each.mse for each in members]
         axes.plot(*places, marker=marker, linestyle=line, color=GREY, label=FAMILIES[begins])
         for each in members:
             x, y, side = BESIDE.get(each.name, BESIDE[begins])
             place = each.milliseconds, each.mse
             axes.annotate(each.kept, place, (x, y), textcoords="offset points", ha=side, fontsize=7.5, color=GREY)
-    for each in placed(room, NETWORKS):
+    for each in place_rows(room, NETWORKS):
         axes.plot(each.milliseconds, each.mse, "D", color=colours[NETWORKS.index(each.name)], label=each.name)
     axes.margins(0.09, 0.1)
     axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", yscale="log")

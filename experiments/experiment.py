@@ -71,18 +71,18 @@ class Experiment(Frozen):
         """The experiment in NAME.toml; raises SpecError with a sentence for each fault."""
         file = HERE / f"{name}.toml"
         if not file.is_file():
-            raise SpecError(f"{name}: no such experiment; there are {', '.join(names())}")
-        described, sizes = _toml(file), _toml(HERE / SIZES)
+            raise SpecError(f"{name}: no such experiment; there are {', '.join(list_names())}")
+        described, sizes = _read_toml(file), _read_toml(HERE / SIZES)
         own = {key: described.pop(key, {}) for key in sizes}
         try:
-            return cls.model_validate({**described, "name": name, "size": merged(sizes[size], own[size])})
+            return cls.model_validate({**described, "name": name, "size": merge(sizes[size], own[size])})
         except ValidationError as error:
             raise SpecError(f"{file}: {'; '.join(sentences(error))}") from error
 
     def spec(self) -> SceneSpec:
         """The scene's spec with the changes of the experiment and of the size; raises SpecError."""
         file = HERE / self.scene
-        described = merged(merged(_toml(file), self.changes), self.size.changes)
+        described = merge(merge(_read_toml(file), self.changes), self.size.changes)
         described["name"] = self.name
         return parse_spec(described, where=str(HERE / f"{self.name}.toml"), beside=file.parent)
 
@@ -93,42 +93,42 @@ class Experiment(Frozen):
 
     def again(self) -> list[Run]:
         """The same networks from each further seed, but for denoisers."""
-        networks = [run for run in self.trained() if not _denoises(run)]
+        networks = [run for run in self.trained() if not _is_denoiser(run)]
         return [
-            Run(name=seeded(run.name, seed), train={**run.train, "seed": seed})
+            Run(name=name_seeded(run.name, seed), train={**run.train, "seed": seed})
             for seed in self.size.seeds[1:]
             for run in networks
         ]
 
     def _settings(self, run: Run) -> dict[str, Any]:
-        own = self.size.train_denoisers if _denoises(run) else {}
+        own = self.size.train_denoisers if _is_denoiser(run) else {}
         return {"seed": self.size.seeds[0], **self.size.train, **own, **run.train}
 
 
-def seeded(name: str, seed: int) -> str:
+def name_seeded(name: str, seed: int) -> str:
     """The name of a network's run from a further seed."""
     return f"{name}-seed-{seed}"
 
 
-def _denoises(run: Run) -> bool:
+def _is_denoiser(run: Run) -> bool:
     return str(run.train["architecture"]).startswith("denoise")
 
 
-def names() -> list[str]:
+def list_names() -> list[str]:
     """All experiments, in the order of their files' names."""
     return sorted(file.stem for file in HERE.glob("*.toml") if file.name != SIZES)
 
 
-def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
     """Tables merged key by key, as deep as they go; of anything else, what is above."""
     whole = dict(below)
     for key, value in above.items():
         old = whole.get(key)
-        whole[key] = merged(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
+        whole[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return whole
 
 
-def _toml(file: Path) -> dict[str, Any]:
+def _read_toml(file: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:

@@ -30,8 +30,8 @@ from photonfarm.core.errors import IncompleteError
 from photonfarm.core.pictures import Picture
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, GAP, LINE
 from photonfarm.trainer.predict.animation import read_png, write_png
-from photonfarm.trainer.report.views import OVERVIEW, coloured
-from photonfarm.trainer.report.worst_cases import caption as worst_view
+from photonfarm.trainer.report.views import OVERVIEW, colour_difference
+from photonfarm.trainer.report.worst_cases import name_kinds as worst_view
 
 ROOMS = [
     "static-bathroom",
@@ -82,7 +82,8 @@ class Report:
         top = sheet.shape[0] + GAP - len(shown) * step + LINE
         self.tiles = {
             name: {
-                row: _tile(sheet, top + place * step, column * (width + GAP), width) for place, row in enumerate(shown)
+                row: _make_tile(sheet, top + place * step, column * (width + GAP), width)
+                for place, row in enumerate(shown)
             }
             for column, name in enumerate(names)
         }
@@ -94,18 +95,18 @@ class Report:
             self.worst.setdefault(case["row"], []).append(case["kind"])
 
 
-def _tile(sheet: Picture, y: int, x: int, size: int) -> Picture:
+def _make_tile(sheet: Picture, y: int, x: int, size: int) -> Picture:
     tile = Image.fromarray(sheet[y : y + size, x : x + size]).resize((SIZE, SIZE), Image.Resampling.NEAREST)
     return np.asarray(tile)
 
 
-def error(tile: Picture, reference: Picture) -> Picture:
+def draw_error(tile: Picture, reference: Picture) -> Picture:
     """|prediction − reference| as shown, the mean of the channels, as colours."""
     apart: NDArray[np.float32] = np.abs(tile.astype(np.float32) - reference).mean(axis=-1) / np.float32(255)
-    return coloured(apart)
+    return colour_difference(apart)
 
 
-def predictions(report: Report) -> Picture:
+def draw_predictions(report: Report) -> Picture:
     """A column for the reference and one for each network, with the error below each image."""
     names = [name for name in COMPARED if name in report.tiles]
     blank = np.full((SIZE, SIZE, 3), 255, np.uint8)
@@ -113,24 +114,24 @@ def predictions(report: Report) -> Picture:
     for view in report.first:
         reference, *shown = (report.tiles[name][view] for name in (REFERENCE, *names))
         rows.append([reference, *shown])
-        rows.append([blank, *(error(tile, reference) for tile in shown)])
-    return sheet_of([REFERENCE, *names], rows, [""] * len(rows))
+        rows.append([blank, *(draw_error(tile, reference) for tile in shown)])
+    return make_sheet([REFERENCE, *names], rows, [""] * len(rows))
 
 
-def worst_cases(report: Report) -> Picture:
+def draw_worst_cases(report: Report) -> Picture:
     """The worst views: reference, the published networks' best and ours, each with its error."""
     rows = []
     for view in report.worst:
         reference, before, after = (report.tiles[name][view] for name in (REFERENCE, BEFORE, AFTER))
-        rows.append([reference, before, error(before, reference), after, error(after, reference)])
+        rows.append([reference, before, draw_error(before, reference), after, draw_error(after, reference)])
     captions = [worst_view(kinds) for kinds in report.worst.values()]
-    return sheet_of([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, captions)
+    return make_sheet([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, captions)
 
 
-def sheet_of(heads: list[str], rows: list[list[Picture]], captions: list[str]) -> Picture:
+def make_sheet(heads: list[str], rows: list[list[Picture]], captions: list[str]) -> Picture:
     """Tiles in rows, a head above each column and a caption above each row that has one."""
     font = ImageFont.load_default(TEXT)
-    wrapped = [_wrapped(head, font) for head in heads]
+    wrapped = [_wrap(head, font) for head in heads]
     y = max(map(len, wrapped)) * TEXT_LINE + GAP
     step = [SIZE + GAP + (TEXT_LINE if caption else 0) for caption in captions]
     sheet = Image.new("RGB", (len(heads) * (SIZE + GAP) - GAP, y + sum(step) - GAP), "white")
@@ -146,7 +147,7 @@ def sheet_of(heads: list[str], rows: list[list[Picture]], captions: list[str]) -
     return np.asarray(sheet)
 
 
-def _wrapped(head: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[str]:
+def _wrap(head: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[str]:
     """The lines of a head that are no wider than a tile, broken after underscores and blanks."""
     lines = [""]
     for part in re.findall("[^_ ]+[_ ]?", head):
@@ -156,15 +157,15 @@ def _wrapped(head: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> l
     return lines
 
 
-def make(name: str, report: Report, out: Path) -> None:
+def make_figures(name: str, report: Report, out: Path) -> None:
     """The figures of one room."""
     if Experiment.load(name, "small").part == "static":
         shutil.copy(report.folder / OVERVIEW, out / f"{name}.png")
         return
     for metric in METRICS:
         shutil.copy(report.folder / f"time-{metric}.svg", out / f"{name}-time-{metric}.svg")
-    write_png(predictions(report), out / f"{name}-predictions.png")
-    write_png(worst_cases(report), out / f"{name}-worst.png")
+    write_png(draw_predictions(report), out / f"{name}-predictions.png")
+    write_png(draw_worst_cases(report), out / f"{name}-worst.png")
 
 
 def main() -> int:
@@ -178,7 +179,7 @@ def main() -> int:
     code = 0
     for name in told.rooms:
         try:
-            make(name, Report(told.work / name / "report"), told.out)
+            make_figures(name, Report(told.work / name / "report"), told.out)
         except IncompleteError as error_:
             print(f"error: {error_}", file=sys.stderr)
             code = IncompleteError.exit_code

@@ -10,13 +10,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from experiments.rooms import Room, estimate
+from experiments.rooms import Room, read_estimate
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 from photonfarm.trainer.report.contents import Published, PublishedTable
-from photonfarm.trainer.report.tables import with_interval
+from photonfarm.trainer.report.tables import format_with_interval
 
 T = TypeVar("T")
 
@@ -49,53 +49,53 @@ class Column:
     theirs: Callable[[Published, Published], str] | None = None
 
 
-def _each(rooms: Sequence[Room], name: str, of: Callable[[Mapping[str, Any]], T | None]) -> list[T] | None:
+def _collect(rooms: Sequence[Room], name: str, of: Callable[[Mapping[str, Any]], T | None]) -> list[T] | None:
     """A value of each room's row; None where one lacks it."""
     values = [value for room in rooms if (value := of(room.rows[name])) is not None]
     return values if len(values) == len(rooms) else None
 
 
-def _mean(of: Callable[[Mapping[str, Any]], float | None], digits: int) -> Callable[[Sequence[Room], str], str]:
+def _average(of: Callable[[Mapping[str, Any]], float | None], digits: int) -> Callable[[Sequence[Room], str], str]:
     def cell(rooms: Sequence[Room], name: str) -> str:
-        values = _each(rooms, name, of)
+        values = _collect(rooms, name, of)
         return NOT_AVAILABLE if values is None else f"{np.mean(values):.{digits}f}"
 
     return cell
 
 
-def _interval(metric: str, digits: int) -> Callable[[Sequence[Room], str], str]:
+def _format_interval(metric: str, digits: int) -> Callable[[Sequence[Room], str], str]:
     def cell(rooms: Sequence[Room], name: str) -> str:
-        values = _each(rooms, name, lambda row: estimate(row, metric))
-        return with_interval(None if values is None else mean(values), digits)
+        values = _collect(rooms, name, lambda row: read_estimate(row, metric))
+        return format_with_interval(None if values is None else average(values), digits)
 
     return cell
 
 
-def _of_set(metric: str, key: str) -> Callable[[Mapping[str, Any]], float | None]:
+def _format_set(metric: str, key: str) -> Callable[[Mapping[str, Any]], float | None]:
     """A function to a metric of a set of images, by the key of its value; None where it could not be computed."""
     return lambda row: row[metric][key] if row.get(metric) is not None else None
 
 
-def _mse(rooms: Sequence[Room], name: str) -> str:
+def _format_mse(rooms: Sequence[Room], name: str) -> str:
     """The MSE of all seeds."""
     errors = [mse for room in rooms if (mse := room.mse(name)) is not None]
-    return with_interval(mean(errors) if len(errors) == len(rooms) else None, 5)
+    return format_with_interval(average(errors) if len(errors) == len(rooms) else None, 5)
 
 
-def _network(rooms: Sequence[Room], name: str) -> str:
+def _format_network_time(rooms: Sequence[Room], name: str) -> str:
     """The time of the network alone, and its range."""
-    middle = _mean(lambda row: 1e3 * row["network_seconds"], 1)(rooms, name)
-    low = _mean(lambda row: 1e3 * row["network_seconds_range"][0], 1)(rooms, name)
-    high = _mean(lambda row: 1e3 * row["network_seconds_range"][1], 1)(rooms, name)
+    middle = _average(lambda row: 1e3 * row["network_seconds"], 1)(rooms, name)
+    low = _average(lambda row: 1e3 * row["network_seconds_range"][0], 1)(rooms, name)
+    high = _average(lambda row: 1e3 * row["network_seconds_range"][1], 1)(rooms, name)
     return f"{middle} ({low} … {high})"
 
 
-def _time_ratio(rooms: Sequence[Room], name: str) -> str:
+def _format_time_ratio(rooms: Sequence[Room], name: str) -> str:
     ratios = [room.time_ratio(name) for room in rooms]
     return NOT_AVAILABLE if None in ratios else f"{np.mean([*filter(None, ratios)]):.2f}"
 
 
-def mean(estimates: Sequence[Estimate]) -> Estimate:
+def average(estimates: Sequence[Estimate]) -> Estimate:
     """The mean over several rooms of their means, each room alike; each with the standard error over its views."""
     errors = [each.standard_error for each in estimates if each.standard_error is not None]
     spread = math.hypot(*errors) / len(errors) if len(errors) == len(estimates) else None
@@ -105,42 +105,46 @@ def mean(estimates: Sequence[Estimate]) -> Estimate:
 # ------------------------------------------------------------------------------------------------------------- tables
 
 ERRORS = (
-    Column("ms a frame", _mean(lambda row: row["frame_seconds"] and 1e3 * row["frame_seconds"]["total"], 1)),
-    Column("MSE (95 %)", _mse, lambda paper, _: f"{paper.mse:.4f}"),
-    Column("MSSIM (95 %)", _interval("mssim", 3), lambda paper, _: f"{paper.mssim:.3f}"),
+    Column("ms a frame", _average(lambda row: row["frame_seconds"] and 1e3 * row["frame_seconds"]["total"], 1)),
+    Column("MSE (95 %)", _format_mse, lambda paper, _: f"{paper.mse:.4f}"),
+    Column("MSSIM (95 %)", _format_interval("mssim", 3), lambda paper, _: f"{paper.mssim:.3f}"),
 )
 FURTHER = (
-    Column("network alone, ms (range)", _network),
-    Column(f"× {UNIT}", _time_ratio, lambda paper, unit: f"{paper.seconds / unit.seconds:.2f}"),
-    Column("FID", _mean(_of_set("fid", "value"), 1), lambda paper, _: f"{paper.fid:.1f}"),
-    Column("KID", _mean(_of_set("kid", "mean"), 4)),
+    Column("network alone, ms (range)", _format_network_time),
+    Column(f"× {UNIT}", _format_time_ratio, lambda paper, unit: f"{paper.seconds / unit.seconds:.2f}"),
+    Column("FID", _average(_format_set("fid", "value"), 1), lambda paper, _: f"{paper.fid:.1f}"),
+    Column("KID", _average(_format_set("kid", "mean"), 4)),
     Column(
-        "Feature L1 (95 %)", _interval(f"feature_l1_{HEADLINE_BLOCK}", 3), lambda paper, _: f"{paper.feature_l1:.3f}"
+        "Feature L1 (95 %)",
+        _format_interval(f"feature_l1_{HEADLINE_BLOCK}", 3),
+        lambda paper, _: f"{paper.feature_l1:.3f}",
     ),
 )
 
 
-def error_table(rooms: Sequence[Room], published: PublishedTable) -> str:
+def format_errors(rooms: Sequence[Room], published: PublishedTable) -> str:
     """The time of a frame and its errors, each a mean over the rooms that have the row. Raises SpecError."""
-    return _table(rooms, published, ERRORS)
+    return _format_table(rooms, published, ERRORS)
 
 
-def further_table(rooms: Sequence[Room], published: PublishedTable) -> str:
+def format_further_metrics(rooms: Sequence[Room], published: PublishedTable) -> str:
     """Times of networks and metrics of features, each a mean over the rooms that have the row."""
-    return _table(rooms, published, FURTHER)
+    return _format_table(rooms, published, FURTHER)
 
 
-def _table(rooms: Sequence[Room], published: PublishedTable, columns: Sequence[Column]) -> str:
+def _format_table(rooms: Sequence[Room], published: PublishedTable, columns: Sequence[Column]) -> str:
     """A row for each predictor; behind a column that the paper has, its figures."""
     head = ["architecture"]
     for column in columns:
         head.append(column.head)
         if published and column.theirs:
             head.append(f"paper: {column.head.removesuffix(' (95 %)')}")
-    return format_markdown_table(head, [_line(rooms, name, published, columns) for name in _row_names(rooms)])
+    return format_markdown_table(
+        head, [_format_line(rooms, name, published, columns) for name in _list_row_names(rooms)]
+    )
 
 
-def _line(rooms: Sequence[Room], name: str, published: PublishedTable, columns: Sequence[Column]) -> list[str]:
+def _format_line(rooms: Sequence[Room], name: str, published: PublishedTable, columns: Sequence[Column]) -> list[str]:
     having, paper = [room for room in rooms if name in room.rows], published.get(name)
     line = [name]
     for column in columns:
@@ -150,21 +154,21 @@ def _line(rooms: Sequence[Room], name: str, published: PublishedTable, columns: 
     return line
 
 
-def lacking(rooms: Sequence[Room]) -> str:
+def describe_lacking(rooms: Sequence[Room]) -> str:
     """Which rows are no mean over all rooms, a sentence; empty where all are."""
-    without = {name: [room.name for room in rooms if name not in room.rows] for name in _row_names(rooms)}
+    without = {name: [room.name for room in rooms if name not in room.rows] for name in _list_row_names(rooms)}
     said = "; ".join(f"{name} without {', '.join(rooms)}" for name, rooms in without.items() if rooms)
     return f" Rows that a room lacks are means over the others: {said}." if said else ""
 
 
-def _row_names(rooms: Sequence[Room]) -> list[str]:
+def _list_row_names(rooms: Sequence[Room]) -> list[str]:
     return list(dict.fromkeys(name for room in rooms for name in room.rows))
 
 
 # -------------------------------------------------------------------------------------------------------------- pairs
 
 
-def order_table(rooms: Sequence[Room], published: PublishedTable) -> str:
+def format_orders(rooms: Sequence[Room], published: PublishedTable) -> str:
     """Neighbours in the paper's order, then ours: the gaps there and in each room. Raises SpecError as `Room.gap`."""
     head = ("pair", *(["paper"] if published else []), *(room.name for room in rooms))
     lines = []
@@ -172,13 +176,13 @@ def order_table(rooms: Sequence[Room], published: PublishedTable) -> str:
         theirs = UNPUBLISHED
         if first in published and second in published:
             share = 1 - published[second].mse / published[first].mse
-            theirs = f"{share:+.0%} {sign(share)}"
+            theirs = f"{share:+.0%} {choose_sign(share)}"
         paper = [theirs] if published else []
-        lines.append([f"`{first}` − `{second}`", *paper, *(gap(room, first, second) for room in rooms)])
+        lines.append([f"`{first}` − `{second}`", *paper, *(format_gap(room, first, second) for room in rooms)])
     return format_markdown_table(head, lines)
 
 
-def gap(room: Room, first: str, second: str) -> str:
+def format_gap(room: Room, first: str, second: str) -> str:
     """How far the first's MSE is above the second's, as a share of it. Raises SpecError as `Room.gap`."""
     pair = room.gap(first, second)
     if pair is None:
@@ -187,11 +191,13 @@ def gap(room: Room, first: str, second: str) -> str:
     if interval is None:
         return f"{share:+.0%}"
     seeds = ", ".join(f"{of_seed:+.0%}" for of_seed in pair.of_seeds)
-    text = f"{share:+.0%} ({interval[0] / pair.unit:+.0%} … {interval[1] / pair.unit:+.0%}; {seeds}) {sign(share)}"
+    text = (
+        f"{share:+.0%} ({interval[0] / pair.unit:+.0%} … {interval[1] / pair.unit:+.0%}; {seeds}) {choose_sign(share)}"
+    )
     agree = len({of_seed > 0 for of_seed in pair.of_seeds}) == 1 and (interval[0] > 0 or interval[1] < 0)
     return text if agree else f"{text}, not told apart"
 
 
-def sign(share: float) -> str:
+def choose_sign(share: float) -> str:
     """≈ for a small gap, whatever its significance; > where the first's error is larger."""
     return "≈" if abs(share) < CLOSE else ">" if share > 0 else "<"

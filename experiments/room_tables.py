@@ -13,7 +13,7 @@ from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
 WIDTH = 120  # characters of a line
 
 
-def room_table(rooms: Sequence[Room]) -> str:
+def format_rooms(rooms: Sequence[Room]) -> str:
     """The images of each room, and how they were rendered."""
     head = (
         "experiment",
@@ -26,10 +26,10 @@ def room_table(rooms: Sequence[Room]) -> str:
         "light ratio",
         "light samples",
     )
-    return format_markdown_table(head, [_rendered(room) for room in rooms])
+    return format_markdown_table(head, [_describe_rendering(room) for room in rooms])
 
 
-def _rendered(room: Room) -> list[str]:
+def _describe_rendering(room: Room) -> list[str]:
     card, evaluation = room.document["dataset"], room.document["evaluation"]
     trained_on = sorted({run["trained_on"] for run in room.document["runs"].values()})
     images, references, guides = room.spent("samples"), evaluation["references"], card.get("guides")
@@ -46,7 +46,7 @@ def _rendered(room: Room) -> list[str]:
     ]
 
 
-def cost_table(rooms: Sequence[Room]) -> str:
+def format_costs(rooms: Sequence[Room]) -> str:
     """What each room took, and whether the machine was quiet."""
     head = (
         "experiment",
@@ -57,10 +57,10 @@ def cost_table(rooms: Sequence[Room]) -> str:
         "edit, ms",
         "load average of 1, 5, 15 min",
     )
-    return format_markdown_table(head, [_cost(room) for room in rooms])
+    return format_markdown_table(head, [_describe_cost(room) for room in rooms])
 
 
-def _cost(room: Room) -> list[str]:
+def _describe_cost(room: Room) -> list[str]:
     images, passes, edit = room.spent("samples"), room.spent("top-up"), room.document["edit_seconds"]
     return [
         room.name,
@@ -73,12 +73,12 @@ def _cost(room: Room) -> list[str]:
     ]
 
 
-def descriptions(rooms: Sequence[Room]) -> str:
+def format_descriptions(rooms: Sequence[Room]) -> str:
     """A list of the rooms: what moves, why they are rendered so, who is credited for them, and commits."""
-    return "\n".join(wrapped(_described(room), "- ", "  ") for room in rooms)
+    return "\n".join(wrap(_describe(room), "- ", "  ") for room in rooms)
 
 
-def _described(room: Room) -> str:
+def _describe(room: Room) -> str:
     document, owed = room.document, room.document["dataset"]["credits"]
     scene = "" if owed is None else f" Scene: “{owed['title']}” by {owed['author']}, {owed['licence']}."
     commits = ", ".join(room.commits())
@@ -89,7 +89,7 @@ def _described(room: Room) -> str:
     )
 
 
-def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
+def summarise(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
     """What holds of most rooms, and then what holds of the others, with their names."""
     rooms_by_text: dict[str, list[str]] = {}
     for room in rooms:
@@ -99,7 +99,7 @@ def said(rooms: Sequence[Room], of: Callable[[Room], str]) -> str:
     return f"{most} ({'; '.join(others)})" if others else most
 
 
-def wrapped(text: str, first: str = "", others: str = "") -> str:
+def wrap(text: str, first: str = "", others: str = "") -> str:
     """A paragraph in lines of at most WIDTH characters after `first` and `others`; code and links are not broken."""
     whole = re.sub(r"`[^`]*`|\[[^\]]*\]", lambda match: match[0].replace(" ", "\0"), text)
     filled = textwrap.fill(

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.experiment import Experiment, seeded
+from experiments.experiment import Experiment, name_seeded
 from experiments.stages import EVALUATION
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.statistics import Estimate
@@ -36,7 +36,7 @@ class Room:
         room = cls.of(experiment, report, commit)
         if again := experiment.again():
             evaluated = file.parents[1] / "runs" / again[0].name / EVALUATION
-            room.document["further_seeds"] = _further_seeds(experiment, evaluated)
+            room.document["further_seeds"] = _read_further_seeds(experiment, evaluated)
         return room
 
     @classmethod
@@ -175,13 +175,13 @@ class Gap:
     of_seeds: tuple[float, ...]  # each seed's difference as a share of the unit
 
 
-def estimate(row: Mapping[str, Any], metric: str) -> Estimate | None:
+def read_estimate(row: Mapping[str, Any], metric: str) -> Estimate | None:
     """Mean and standard error of a metric that each image has; None where it could not be computed."""
     values = row.get(metric)
     return None if values is None else Estimate(**values)
 
 
-def _further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[float]]]:
+def _read_further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[float]]]:
     """MSE of each image by each further seed, of each network; raises IncompleteError where they were not measured."""
     if not file.is_file():
         raise IncompleteError(f"{file}: not there; `python experiments/run.py {experiment.name}` makes it")
@@ -189,7 +189,7 @@ def _further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[fl
     errors = {run.name: row["metric_space"]["mse"]["values"] for run, row in zip(experiment.again(), rows, strict=True)}
     by_run: dict[str, list[list[float]]] = {}
     for run in experiment.trained():
-        names = [seeded(run.name, seed) for seed in experiment.size.seeds[1:]]
+        names = [name_seeded(run.name, seed) for seed in experiment.size.seeds[1:]]
         by_run[run.name] = [[round(value, 6) for value in errors[name]] for name in names if name in errors]
     return {name: values for name, values in by_run.items() if values}
 

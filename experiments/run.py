@@ -21,24 +21,24 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its
 
 from bench.harness.results import ROOT
 from experiments import dry_run
-from experiments.experiment import Experiment, SizeName, names
+from experiments.experiment import Experiment, SizeName, list_names
 from experiments.stages import Stages, tell
 from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError
 
 
-def options() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """The options of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="experiments (all)")
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
-    parser.add_argument("--workers", type=_count, default=2, help="processes at a time, a core each (2)")
+    parser.add_argument("--workers", type=_parse_count, default=2, help="processes at a time, a core each (2)")
     parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
     parser.add_argument("--dry-run", action="store_true", help="say what it would take, and do none of it")
     parser.add_argument("--tflops", type=float, default=50.0, help="10¹² operations a second that a GPU sustains (50)")
     return parser
 
 
-def _count(text: str) -> int:
+def _parse_count(text: str) -> int:
     """A whole number of at least 1; raises ArgumentTypeError."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} is no number of processes; at least 1 is needed")
@@ -47,9 +47,9 @@ def _count(text: str) -> int:
 
 def main() -> int:
     """Run them; returns the exit code."""
-    arguments = options().parse_args()
+    arguments = make_parser().parse_args()
     try:
-        experiments = [Experiment.load(name, arguments.size) for name in arguments.names or names()]
+        experiments = [Experiment.load(name, arguments.size) for name in arguments.names or list_names()]
         for experiment in experiments:
             experiment.spec()  # what is wrong should be said before hours go by
     except SpecError as error:
@@ -57,7 +57,7 @@ def main() -> int:
         return SpecError.exit_code
     if arguments.dry_run:
         for experiment in experiments:
-            print(dry_run.measured(experiment).line(arguments.tflops), flush=True)
+            print(dry_run.measure_need(experiment).line(arguments.tflops), flush=True)
         return 0
     failed = False
     for experiment in experiments:

@@ -151,7 +151,9 @@ class Stages:
         return {**own, "hold_out": self.experiment.size.hold_out}
 
     def _train(self, run: Run) -> None:
-        pairs = [part for key, value in self._settings(run).items() for part in ("--set", f"{key}={_text(value)}")]
+        pairs = [
+            part for key, value in self._settings(run).items() for part in ("--set", f"{key}={_format_text(value)}")
+        ]
         place = ["--store", self.folder / "store", "--run", self._folder(run), "--preset", run.train["preset"]]
         self._keep_commit(run)
         self._verb(f"train-{run.name}", ["train", self.folder / "spec.json", *place, *pairs])
@@ -249,5 +251,5 @@ def tell(line: str) -> None:
     print(f"{time.strftime('%H:%M:%S')} {line}", file=sys.stderr, flush=True)
 
 
-def _text(value: Any) -> str:
+def _format_text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)

@@ -24,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its
 
 from bench.harness import results
 from experiments import equal_time
-from experiments.experiment import HERE, Experiment, Part, SizeName, names
-from experiments.paper_tables import CLOSE, error_table, further_table, lacking, order_table
-from experiments.room_tables import cost_table, descriptions, room_table, said, wrapped
+from experiments.experiment import HERE, Experiment, Part, SizeName, list_names
+from experiments.paper_tables import CLOSE, describe_lacking, format_errors, format_further_metrics, format_orders
+from experiments.room_tables import format_costs, format_descriptions, format_rooms, summarise, wrap
 from experiments.rooms import Room
 from photonfarm.core.errors import IncompleteError, PhotonfarmError
 from photonfarm.trainer.report.contents import FIXED_LIGHTS, MOVABLE_LIGHTS, PublishedTable
@@ -49,69 +49,70 @@ RECIPES: Mapping[SizeName, str] = {
 """What differs from the supplement in the training of its networks, beside the loss."""
 
 
-def page(rooms: Sequence[Room], size: SizeName) -> str:
+def format_page(rooms: Sequence[Room], size: SizeName) -> str:
     """All of it as Markdown. Raises SpecError as `Room.gap` does."""
-    parts = [f"# The paper's tables over our rooms, `{size}`", wrapped(introduction(rooms, size))]
+    parts = [f"# The paper's tables over our rooms, `{size}`", wrap(introduce(rooms, size))]
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
-    parts.append(reading(size, said(rooms, lambda room: str(room.experiment.size.train["loss"]))))
+    parts.append(explain_reading(size, summarise(rooms, lambda room: str(room.experiment.size.train["loss"]))))
     for part, (title, published) in PARTS.items():
         if of_part := [room for room in rooms if room.experiment.part == part]:
-            parts += _part(of_part, title, published)
-    parts.append(OF_TIME.format(picture=f"{page_of(size)}.png", table=equal_time.table(rooms)))
+            parts += _format_part(of_part, title, published)
+    parts.append(OF_TIME.format(picture=f"{name_page(size)}.png", table=equal_time.format_table(rooms)))
     made = (
-        f"Timed on {said(rooms, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
-        f"`{command(size)}`."
+        f"Timed on {summarise(rooms, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
+        f"`{name_command(size)}`."
     )
-    return "\n\n".join([*parts, wrapped(made)])
+    return "\n\n".join([*parts, wrap(made)])
 
 
-def _part(rooms: Sequence[Room], title: str, published: PublishedTable) -> list[str]:
+def _format_part(rooms: Sequence[Room], title: str, published: PublishedTable) -> list[str]:
     """The tables of some rooms: pairs, errors, further metrics, and what they were measured on."""
-    means = wrapped(f"Means over: {', '.join(room.name for room in rooms)}.{lacking(rooms)}")
+    means = wrap(f"Means over: {', '.join(room.name for room in rooms)}.{describe_lacking(rooms)}")
     return [
         f"## {title}",
-        f"### Pairs of networks, by MSE\n\n{order_table(rooms, published)}",
-        f"### Time and errors\n\n{means}\n\n{error_table(rooms, published)}",
-        f"### Further times and metrics\n\n{further_table(rooms, published)}",
-        f"### The rooms\n\n{room_table(rooms)}",
-        cost_table(rooms),
-        descriptions(rooms),
+        f"### Pairs of networks, by MSE\n\n{format_orders(rooms, published)}",
+        f"### Time and errors\n\n{means}\n\n{format_errors(rooms, published)}",
+        f"### Further times and metrics\n\n{format_further_metrics(rooms, published)}",
+        f"### The rooms\n\n{format_rooms(rooms)}",
+        format_costs(rooms),
+        format_descriptions(rooms),
     ]
 
 
-def page_of(size: SizeName) -> str:
+def name_page(size: SizeName) -> str:
     """The name of a size's page."""
     return "tables" if size == "small" else f"tables-{size}"
 
 
-def command(size: SizeName) -> str:
+def name_command(size: SizeName) -> str:
     """What makes the page of the reports."""
     return f"python experiments/tables.py --size {size}"
 
 
-def introduction(rooms: Sequence[Room], size: SizeName) -> str:
+def introduce(rooms: Sequence[Room], size: SizeName) -> str:
     """What was run, as the sizes and the reports tell."""
     kinds: dict[str, Callable[[Room], str]] = {
         "networks": lambda room: room.steps(denoisers=False),
         "denoisers": lambda room: room.steps(denoisers=True),
     }
     trained = [
-        f"{kind} for {said(having, steps)}"
+        f"{kind} for {summarise(having, steps)}"
         for kind, steps in kinds.items()
         if (having := [room for room in rooms if steps(room)])
     ]
+    sizes = summarise(rooms, lambda room: str(room.document["size"]))
     return (
-        f"The size `{size}`: {said(rooms, lambda room: str(room.document['size']))}. {_resolution(rooms)} All networks "
+        f"The size `{size}`: {sizes}. {_describe_resolution(rooms)} All networks "
         f"and denoisers but OIDN are trained on one room's images alone: {', '.join(trained)}. denoise_k and oidn 1/k "
         "are denoisers, which are given 1/k of the pixels of one noisy half-estimate."
     )
 
 
-def _resolution(rooms: Sequence[Room]) -> str:
+def _describe_resolution(rooms: Sequence[Room]) -> str:
     """Whether a GPU took part, and what is at the paper's resolution."""
-    films = said(rooms, lambda room: f"{room.film[0]} × {room.film[1]}")
+    films = summarise(rooms, lambda room: f"{room.film[0]} × {room.film[1]}")
     at_paper = [room.name for room in rooms if room.film == room.paper_film]
     if len(at_paper) == len(rooms):
         reached = "everything"
@@ -119,7 +120,7 @@ def _resolution(rooms: Sequence[Room]) -> str:
         reached = f"of the rooms only {', '.join(at_paper)}" if at_paper else "nothing here"
     size = f"{reached} is at the paper's resolution; images are {films}."
     if any(room.device.startswith("cuda") for room in rooms):
-        return f"A GPU took part: networks ran on {said(rooms, lambda room: room.device)}; {size}"
+        return f"A GPU took part: networks ran on {summarise(rooms, lambda room: room.device)}; {size}"
     return f"No GPU was at hand: {size}"
 
 
@@ -153,10 +154,10 @@ renderer costs most.
 n/a: not measured, or a row that a room lacks. –: not in the paper."""
 
 
-def reading(size: SizeName, loss: str) -> str:
+def explain_reading(size: SizeName, loss: str) -> str:
     """What the tables' figures are, and what they can be compared with."""
     paragraphs = READING.format(loss=loss, recipe=RECIPES[size], close=100 * CLOSE).split("\n\n")
-    return "\n\n".join(wrapped(paragraph) for paragraph in paragraphs)
+    return "\n\n".join(wrap(paragraph) for paragraph in paragraphs)
 
 
 OF_TIME = """\
@@ -176,7 +177,7 @@ what they say.
 {table}"""
 
 
-def options() -> argparse.ArgumentParser:
+def make_parser() -> argparse.ArgumentParser:
     """The options of the command line."""
     parser = results.parser(__doc__)
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
@@ -184,7 +185,7 @@ def options() -> argparse.ArgumentParser:
     return parser
 
 
-def rooms_of(work: Path, size: SizeName, earlier: Path) -> list[Room]:
+def read_rooms(work: Path, size: SizeName, earlier: Path) -> list[Room]:
     """Those that have a report here, and those that an earlier page has.
 
     Raises IncompleteError where none is, and for what an earlier version has left.
@@ -194,7 +195,7 @@ def rooms_of(work: Path, size: SizeName, earlier: Path) -> list[Room]:
     except (ValueError, KeyError, TypeError) as error:
         raise IncompleteError(f"{earlier}: holds no rooms ({error!r}); move it away, and it is made anew") from error
     rooms = []
-    for name in names():
+    for name in list_names():
         experiment, report = Experiment.load(name, size), work / name / "report/report.json"
         if report.is_file():
             rooms.append(Room.read(experiment, report, results.commit()))
@@ -208,23 +209,23 @@ def rooms_of(work: Path, size: SizeName, earlier: Path) -> list[Room]:
 
 def main() -> int:
     """Write the page; returns the exit code."""
-    told = options().parse_args()
+    told = make_parser().parse_args()
     try:
-        rooms = rooms_of(told.work / told.size, told.size, told.out / f"{page_of(told.size)}.json")
-        text = page(rooms, told.size)
+        rooms = read_rooms(told.work / told.size, told.size, told.out / f"{name_page(told.size)}.json")
+        text = format_page(rooms, told.size)
     except PhotonfarmError as error:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     told.out.mkdir(parents=True, exist_ok=True)
-    (told.out / f"{page_of(told.size)}.png").write_bytes(equal_time.picture(rooms))
+    (told.out / f"{name_page(told.size)}.png").write_bytes(equal_time.draw_picture(rooms))
     told_of = {
-        "command": command(told.size),
+        "command": name_command(told.size),
         "commit": results.commit(),
         "machine": "each room's own",  # and not the one that this runs on
         "size": told.size,
         "rooms": {room.name: room.document for room in rooms},
     }
-    results.save(page_of(told.size), text, told_of, told.out)
+    results.save(name_page(told.size), text, told_of, told.out)
     return 0
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.records import F32
-from photonfarm.trainer.predict.animation import enlarged
+from photonfarm.trainer.predict.animation import enlarge
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -29,7 +29,7 @@ def mosaic(columns: Sequence[Column]) -> Image.Image:
     from PIL import Image, ImageDraw
 
     count = len(columns[0][1])
-    height, width = enlarged(columns[0][1][0]).shape[:2]
+    height, width = enlarge(columns[0][1][0]).shape[:2]
     across, down = width + GAP, height + LINE
     whole = Image.new("RGB", (GAP + across * len(columns), LINE + GAP + down * count), "white")
     draw = ImageDraw.Draw(whole)
@@ -38,7 +38,7 @@ def mosaic(columns: Sequence[Column]) -> Image.Image:
         draw.text((x, 2), caption, fill="black")
         for line, image in enumerate(images):
             y = LINE + GAP + down * line
-            whole.paste(Image.fromarray(enlarged(image)), (x, y))
+            whole.paste(Image.fromarray(enlarge(image)), (x, y))
             if numbers is not None:
                 draw.text((x, y + height + 1), f"{numbers[line]:.4f}", fill="black")
     return whole

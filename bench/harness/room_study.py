@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 from torch.nn.functional import avg_pool2d
 
 from bench.harness.results import ROOT
-from experiments.experiment import Experiment, names
+from experiments.experiment import Experiment, list_names
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import clean_error
@@ -44,11 +44,11 @@ from photonfarm.store.read.merge import merge_view
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.metrics import metric_space
-from photonfarm.trainer.predict.evaluation import batches
+from photonfarm.trainer.predict.evaluation import read_batches
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
-from photonfarm.trainer.runs.settings import Architecture, TrainSettings, preset
+from photonfarm.trainer.runs.settings import Architecture, TrainSettings, make_preset
 from photonfarm.trainer.runs.user_code import is_own
 from photonfarm.trainer.training.loop import train
 
@@ -67,7 +67,7 @@ def tell(line: str) -> None:
 
 def named_room(name: str) -> SceneSpec:
     """A built-in spec, or the scene of an experiment in its small size; raises SpecError for any other name."""
-    return Experiment.load(name, "small").spec() if name in names() else load_spec(name)
+    return Experiment.load(name, "small").spec() if name in list_names() else load_spec(name)
 
 
 def render(spec: SceneSpec, store: Store, requests: Sequence[Request | TopUp], processes: int) -> None:
@@ -180,7 +180,7 @@ def opened(options: argparse.Namespace, size: str) -> tuple[Path, Store]:
 
 def settings_of(options: argparse.Namespace, seed: int, hold_out: float = HELD_OUT) -> TrainSettings:
     """The preset `small` from a seed, judged after its last step alone."""
-    return preset(
+    return make_preset(
         "small", network={"architecture": options.architecture}, seed=seed, max_steps=options.steps, hold_out=hold_out,
         recover=False, validate_every=options.steps, validation_samples=1, minimum_samples=1, checkpoint_every=1000,
     )  # fmt: skip
@@ -322,7 +322,7 @@ def images(run: TrainedRun, source: SampleSource, rows: Sequence[int]) -> F32:
     """A run's images of complete rows, (N, H, W, 3) linear radiance × exposure."""
     with Feed(source, run.settings, needs=run.needs) as feed:
         predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), "cpu")
-        return np.concatenate([predict(batch).copy() for batch in batches(feed, rows, run.settings.batch)])
+        return np.concatenate([predict(batch).copy() for batch in read_batches(feed, rows, run.settings.batch)])
 
 
 def counted(count: int, what: str) -> str:

@@ -12,7 +12,7 @@ import sys
 from dataclasses import asdict, dataclass
 
 from bench.harness import results, room_study
-from experiments.experiment import names
+from experiments.experiment import list_names
 from photonfarm.core.errors import SpecError
 from photonfarm.plan.allocation import KAPPA, RHO, Allocation, CostModel
 from photonfarm.plan.sample_costs import SampleCosts
@@ -101,7 +101,7 @@ def main() -> int:
     parser.add_argument("--views", type=int, default=12, help="that are measured of each (%(default)s)")
     options = parser.parse_args()
     try:
-        rooms = [measured(name, options.views) for name in names()]
+        rooms = [measured(name, options.views) for name in list_names()]
     except SpecError as error:
         parser.error(str(error))
     values = {room.name: asdict(room.costs) for room in rooms}

@@ -37,9 +37,9 @@ from photonfarm.trainer.data.batch_stream import RoundSampler
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.dry_run.made_up import MadeUpScene
 from photonfarm.trainer.metrics.image_metrics import confidence_interval
-from photonfarm.trainer.networks import image_of
+from photonfarm.trainer.networks import predict_image
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs.settings import Precision, TrainSettings, preset
+from photonfarm.trainer.runs.settings import Precision, TrainSettings, make_preset
 from photonfarm.trainer.training.learner import Learner
 
 AS_IT_IS = "float32, activations channels-last"
@@ -150,7 +150,7 @@ class GradientDifference:
 def gradient(learner: Learner, batch: TrainingBatch) -> Tensor:
     """The gradient of the loss on a batch, all weights as one, float64."""
     learner.optimiser.zero_grad()
-    loss = learner._loss(image_of(learner.network, batch.inputs), batch.target)
+    loss = learner._loss(predict_image(learner.network, batch.inputs), batch.target)
     torch.autograd.backward(loss)
     return torch.cat(
         [weight.grad.double().flatten() for weight in learner.network.parameters() if weight.grad is not None]
@@ -208,7 +208,7 @@ def shown(network: Network, feed: Feed, rows: Sequence[int]) -> tuple[F32, float
     for row in rows:
         feed.ask([row])
         batch = feed.take()
-        (image,) = image_of(network, batch.inputs).numpy()
+        (image,) = predict_image(network, batch.inputs).numpy()
         half_a, half_b = batch.target[0].numpy()
         images.append(image)
         errors.append(clean_error(image, half_a, half_b))
@@ -227,7 +227,7 @@ def bias(seeds: int, steps: int) -> list[Trained]:
             commit(scene, job, contents)
         found = []
         for seed in range(seeds):
-            settings = preset("small", seed=seed, max_steps=steps, hold_out=0.25, device="cpu")
+            settings = make_preset("small", seed=seed, max_steps=steps, hold_out=0.25, device="cpu")
             resident = ResidentSamples(torch.device("cpu"), 1.0)
             with Feed(SceneReader(folder, scene.scene_id), settings, resident=resident) as feed:
                 arrived = feed.arrivals()[0]
@@ -307,7 +307,7 @@ def main() -> int:
     parser.add_argument("--turns", type=int, default=9, help="of the small steps; of the paper's a third (9)")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    small, paper = preset("small", device="cpu"), preset("paper-dynamic", device="cpu", batch=1)
+    small, paper = make_preset("small", device="cpu"), make_preset("paper-dynamic", device="cpu", batch=1)
     measured = [times("small", 64, small, options.turns), times("paper-dynamic", 256, paper, -(-options.turns // 3))]
     found = bias(options.seeds, options.steps)
     values = {"times": [asdict(each) for each in measured], "bias": [asdict(each) for each in found]}

@@ -28,7 +28,7 @@ from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics import mssim
 from photonfarm.trainer.metrics.image_metrics import metric_space
-from photonfarm.trainer.predict.evaluation import by_turns
+from photonfarm.trainer.predict.evaluation import time_by_turns
 from photonfarm.trainer.runs import settings
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.learner import Learner
@@ -171,7 +171,7 @@ def _errors(runs: Sequence[room_study.Run], references: room_study.ReferenceView
 def settings_of(changes: PresetChanges, seed: int, steps: int) -> TrainSettings:
     """The preset `small` with these changes."""
     run = {"seed": seed, "max_steps": steps, "hold_out": HOLD_OUT, "validate_every": max(1, steps // 4)}
-    return settings.settings_of("small", {**changes, **run, "validation_samples": 24})
+    return settings.make_settings("small", {**changes, **run, "validation_samples": 24})
 
 
 def step_seconds(source: Callable[[], SceneReader], candidates: Mapping[str, PresetChanges]) -> dict[str, float]:
@@ -217,4 +217,4 @@ def frame_seconds(runs: Mapping[str, room_study.Run], rows: Sequence[int]) -> di
             predict = trained.predictor(feed.spec, (feed.geometry, feed.cloud), "cpu")
             feed.ask(rows[:1])
             calls.append((predict, predict.of_its_own(feed.take().inputs)))
-    return {name: seconds.median for name, seconds in zip(runs, by_turns(calls), strict=True)}
+    return {name: seconds.median for name, seconds in zip(runs, time_by_turns(calls), strict=True)}

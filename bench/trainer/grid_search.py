@@ -37,13 +37,13 @@ from photonfarm.core.statistics import Estimate, group_means, stated
 from photonfarm.plan.hold_out import rows_held_out, units_of
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, Store
-from photonfarm.trainer.cli.train_verb import by_key
+from photonfarm.trainer.cli.train_verb import collect_settings
 from photonfarm.trainer.cli.train_verb import train as train_verb
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.predict.evaluation import HeldOutErrors, batches, measure
+from photonfarm.trainer.predict.evaluation import HeldOutErrors, measure, read_batches
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.runs.run_folder import held
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings, settings_of
+from photonfarm.trainer.runs.run_folder import lock_run
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings, make_settings
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import Hooks, stop_on_signals, train
 
@@ -109,7 +109,7 @@ def run_grid(
     wanted = _cells(settings, axes)
     equal = {key: value for key, value in settings.model_dump(mode="json").items() if key not in axes}
     about = {**_about(make_source(), settings), "settings": equal}
-    with held(folder):
+    with lock_run(folder):
         known = _read(folder / JSON, about)
         finished = [cell for cell in known if any(cell.changes == changes for changes, _ in wanted)]
         for changes, changed in wanted:
@@ -203,7 +203,7 @@ def _held_out(source: SampleSource, settings: TrainSettings, run: Path) -> HeldO
         arrived, _ = feed.arrivals()
         rows = [row for row, is_held_out in arrived if is_held_out][:MOST_HELD_OUT]
         predict = TrainedRun.load(run).predictor(feed.spec, (feed.geometry, feed.cloud), settings.device)
-        return measure(predict, batches(feed, rows, settings.batch))
+        return measure(predict, read_batches(feed, rows, settings.batch))
 
 
 def _halves(found: HeldOutErrors) -> tuple[tuple[float, ...], tuple[float, ...]]:
@@ -268,7 +268,7 @@ def search(
     Raises SpecError without a spec, unless the store has one scene; StoreError without that store or scene; and the
     errors of `run_grid`.
     """
-    settings = settings_of(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
+    settings = make_settings(preset_name, {"max_steps": STEPS, "recover": False, **changes})  # each rate as it is
     scenes = Store(store).scenes(load_spec(spec).scene_id if spec else None)
     if len(scenes) != 1:
         raise SpecError(f"{store}: holds {len(scenes)} scenes; name the spec of the one to train on")
@@ -288,7 +288,7 @@ def search(
 
 @click.command(help=__doc__, params=[option for option in train_verb.params if option.name not in NOT_SET])
 def main(spec: str | None, store: str | Path, run: Path, preset: str, pairs: tuple[str, ...], **options: Any) -> None:
-    changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
+    changes = {**collect_settings(pairs), **{key: value for key, value in options.items() if value is not None}}
     try:
         click.echo(search(spec, store, run, preset, changes, lambda sentence: click.echo(sentence, err=True)))
     except PhotonfarmError as error:

@@ -46,7 +46,7 @@ from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.metrics import metric_space
 from photonfarm.trainer.networks import ARCHITECTURES
-from photonfarm.trainer.networks.inputs import Needs, given
+from photonfarm.trainer.networks.inputs import Needs, require
 from photonfarm.trainer.predict.evaluation import Predictor
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint
@@ -161,7 +161,7 @@ def _shown(exposed: F32) -> F64:
 
 def known_light(batch: TrainingBatch) -> F32:
     """Emission, direct light and gloss of a batch's guides: an image of which nothing is learned."""
-    guides = given(batch.inputs.guides)
+    guides = require(batch.inputs.guides)
     light: F32 = (guides.emission + guides.direct + guides.gloss).numpy()
     return light
 
@@ -228,7 +228,7 @@ class Stage:
         key = view_key(modification.key(self.spec.radiance_id), view.vector)
         halves = self.scene.render_halves(view, [seed_of(key, f"{NAME}, half {half}") for half in "AB"])
         known = frames.buffers(0), frames.visibility(0), frames.guides_of(0)
-        shared = (lambda: self.base[1]), (lambda: given(frames.photons))
+        shared = (lambda: self.base[1]), (lambda: require(frames.photons))
         return Sample(0, b"", modification, view, 0, halves, *known, 1.0, *shared)
 
     def views(self, source: SceneReader, rows: Sequence[int]) -> Views:

@@ -39,7 +39,7 @@ from photonfarm.trainer.networks.paper_networks import LightTransportPhotons
 from photonfarm.trainer.runs import run_folder
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import METRICS
-from photonfarm.trainer.runs.settings import TrainSettings, preset
+from photonfarm.trainer.runs.settings import TrainSettings, make_preset
 from photonfarm.trainer.training.learner import Learner
 from photonfarm.trainer.training.loop import train
 
@@ -214,7 +214,7 @@ def wait_share(where: tuple[Path, str], settings: TrainSettings, steps: int) -> 
     with tempfile.TemporaryDirectory() as folder:
         changes = {"max_steps": steps, "validate_every": 10 * steps, "validation_samples": 1}
         train(SceneReader(*where), settings.model_copy(update=changes), Path(folder))
-        seconds = run_folder.read(Path(folder) / METRICS)[-1]["seconds"]
+        seconds = run_folder.read_log(Path(folder) / METRICS)[-1]["seconds"]
     waited = seconds["wait_data"] + seconds["wait_read"]
     return waited / (waited + seconds["train"])
 
@@ -317,8 +317,8 @@ def main() -> int:
     parser.add_argument("--paper-batch", type=int, default=1, help="at the supplement's sizes (1)")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    small = preset("small", device=options.device)
-    paper = preset("paper-dynamic", device=options.device, batch=options.paper_batch)
+    small = make_preset("small", device=options.device)
+    paper = make_preset("paper-dynamic", device=options.device, batch=options.paper_batch)
     fewer = WorkTimer(options.device, -(-options.repetitions // 5))
     presets = [
         measure_preset("small", 64, small, WorkTimer(options.device, options.repetitions), options.steps),

@@ -204,9 +204,9 @@ def test_up_with_a_run_of_another_scene_plans_nothing(beside: Path, left: str) -
 
 
 def test_two_trainers_in_one_folder(beside: Path) -> None:
-    from photonfarm.trainer.runs.run_folder import held
+    from photonfarm.trainer.runs.run_folder import lock_run
 
-    with held(beside / "run"):
+    with lock_run(beside / "run"):
         refused(f"train den.toml --architecture cnn {TRAIN}", 4, "run: another trainer is at work on this run")
 
 
@@ -221,11 +221,11 @@ def test_a_terminal_that_lacks_letters_gets_others(beside: Path, monkeypatch: py
 
 
 def test_a_verb_says_where_the_scene_of_a_run_lies(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from photonfarm.trainer.runs.run_folder import note_scene_folder, with_scenes
+    from photonfarm.trainer.runs.run_folder import make_environment, note_scene_folder
 
     monkeypatch.setenv("PHOTONFARM_SCENES", "/first")
     note_scene_folder(here, here / "scenes")
-    assert with_scenes(here)["PHOTONFARM_SCENES"] == f"/first{os.pathsep}{here / 'scenes'}"
+    assert make_environment(here)["PHOTONFARM_SCENES"] == f"/first{os.pathsep}{here / 'scenes'}"
 
 
 def test_a_preview_takes_a_scene_by_its_spec_its_name_or_its_id(beside: Path) -> None:

@@ -21,7 +21,7 @@ import torch
 
 from photonfarm.plan.request import Request
 from photonfarm.store import Store
-from photonfarm.trainer.training.losses import judged
+from photonfarm.trainer.training.losses import judge
 
 ROOT = Path(__file__).parents[2]
 
@@ -88,7 +88,7 @@ def test_the_network_and_the_loss_of_the_training_page_do_what_it_says() -> None
     assert network(inputs).shape == image.shape
     assert network.needs.guides
     assert not network.needs.points
-    assert judged(mine["weighted"]).is_unbiased
+    assert judge(mine["weighted"]).is_unbiased
 
 
 # ------------------------------------------------------------------------------------------------------------- commands

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments import equal_time
-from experiments.equal_time import Placed, at, ratio
+from experiments.equal_time import Placed, interpolate, measure_ratio
 
 
 def placed(milliseconds: float, mse: float) -> Placed:
@@ -17,37 +17,37 @@ FAMILY = [placed(100, 0.04), placed(400, 0.01)]
 
 
 def test_between_two_of_a_family_the_error_follows_a_power_of_the_time() -> None:
-    assert ratio(placed(200, 0.02), at(FAMILY, 200))[0] == pytest.approx(1)  # type: ignore[arg-type]
+    assert measure_ratio(placed(200, 0.02), interpolate(FAMILY, 200))[0] == pytest.approx(1)  # type: ignore[arg-type]
 
 
 def test_beyond_its_slowest_a_family_has_the_least_error_that_it_reaches() -> None:
-    found = at([*FAMILY, placed(500, 0.03)], 900)
+    found = interpolate([*FAMILY, placed(500, 0.03)], 900)
     assert found is not None
     assert found.first.milliseconds == 400
-    assert ratio(placed(900, 0.005), found)[0] == pytest.approx(0.5)
+    assert measure_ratio(placed(900, 0.005), found)[0] == pytest.approx(0.5)
 
 
 def test_a_ratio_to_a_family_that_could_use_more_samples_in_that_time_is_marked_as_a_bound() -> None:
-    assert equal_time._against(placed(900, 0.005), FAMILY).startswith("≥ 0.50 (")
-    assert equal_time._against(placed(400, 0.005), FAMILY).startswith("0.50 (")
-    assert equal_time._against(placed(200, 0.01), FAMILY).startswith("0.50 (")
+    assert equal_time._format_ratio(placed(900, 0.005), FAMILY).startswith("≥ 0.50 (")
+    assert equal_time._format_ratio(placed(400, 0.005), FAMILY).startswith("0.50 (")
+    assert equal_time._format_ratio(placed(200, 0.01), FAMILY).startswith("0.50 (")
 
 
 def test_a_family_that_takes_longer_has_no_error_at_that_time() -> None:
-    assert at(FAMILY, 99) is None
-    assert at([], 99) is None
-    assert equal_time._against(placed(50, 0.1), FAMILY) == "all take longer, from 100 ms"
+    assert interpolate(FAMILY, 99) is None
+    assert interpolate([], 99) is None
+    assert equal_time._format_ratio(placed(50, 0.1), FAMILY) == "all take longer, from 100 ms"
 
 
 def test_one_that_takes_longer_and_is_worse_changes_nothing() -> None:
-    found = at([placed(100, 0.01), placed(200, 0.09)], 150)
+    found = interpolate([placed(100, 0.01), placed(200, 0.09)], 150)
     assert found is not None
     assert found.first is found.second
 
 
 def test_what_views_share_is_not_in_the_interval() -> None:
-    _, low, high = ratio(placed(100, 0.03), at(FAMILY, 100))  # type: ignore[arg-type]
+    _, low, high = measure_ratio(placed(100, 0.03), interpolate(FAMILY, 100))  # type: ignore[arg-type]
     assert low == pytest.approx(high)
     differing = Placed("other", 100, np.array([0.06, 0.01, 0.02, 0.03]))
-    value, low, high = ratio(differing, at(FAMILY, 100))  # type: ignore[arg-type]
+    value, low, high = measure_ratio(differing, interpolate(FAMILY, 100))  # type: ignore[arg-type]
     assert low < value < high

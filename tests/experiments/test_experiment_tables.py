@@ -109,8 +109,8 @@ def cells(page: str, first: str) -> list[str]:
 def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> None:
     told: dict[str, str] = {}
     for page in (
-        room_tables.room_table([room("night-living-room-2")]),
-        room_tables.cost_table([room("night-living-room-2")]),
+        room_tables.format_rooms([room("night-living-room-2")]),
+        room_tables.format_costs([room("night-living-room-2")]),
     ):
         told |= dict(zip(cells(page, "experiment"), cells(page, "night-living-room-2"), strict=True))
     assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
@@ -122,27 +122,29 @@ def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> Non
 
 def test_a_room_is_described_with_what_moves_its_title_and_the_commits_of_training() -> None:
     found = room("night-living-room-2")
-    told = " ".join(room_tables.descriptions([found]).split())
+    told = " ".join(room_tables.format_descriptions([found]).split())
     assert told.startswith("- **night-living-room-2** (At night: The White Room): The windows of movable-living-room-2")
     assert "`photonfarm scene plan` chose them" in told
     assert told.endswith("Trained at commit 1111111, 2222222; its report was read at commit 1234567.")
     del found.document["trained_at"], found.document["dataset"]["guides"]  # as an earlier version kept it
-    assert "At which commit it was trained was not recorded" in " ".join(room_tables.descriptions([found]).split())
-    assert cells(room_tables.room_table([found]), "night-living-room-2")[-1] == "n/a"
+    assert "At which commit it was trained was not recorded" in " ".join(
+        room_tables.format_descriptions([found]).split()
+    )
+    assert cells(room_tables.format_rooms([found]), "night-living-room-2")[-1] == "n/a"
 
 
 def test_lines_of_prose_are_at_most_as_wide_as_the_page_and_break_neither_code_nor_links() -> None:
-    text = room_tables.wrapped("word " * 23 + "`a command` " + "word " * 21 + "[a link](page.md)", "- ", "  ")
+    text = room_tables.wrap("word " * 23 + "`a command` " + "word " * 21 + "[a link](page.md)", "- ", "  ")
     assert [len(line) <= 120 for line in text.splitlines()] == [True] * 3
     assert [line[:11] for line in text.splitlines()] == ["- word word", "  `a comman", "  [a link]("]
 
 
 def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named() -> None:
     rooms = [room("night-living-room"), room("movable-veach-ajar", report((*NETWORKS, "denoise_4")))]
-    assert paper_tables.lacking(rooms) == (
+    assert paper_tables.describe_lacking(rooms) == (
         " Rows that a room lacks are means over the others: denoise_4 without night-living-room."
     )
-    page = paper_tables.error_table(rooms, tables.MOVABLE_LIGHTS)
+    page = paper_tables.format_errors(rooms, tables.MOVABLE_LIGHTS)
     assert cells(page, "architecture") == [
         "architecture",
         "ms a frame",
@@ -153,14 +155,14 @@ def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named(
     ]
     assert cells(page, "denoise_4")[1] == "500.0"
     assert cells(page, "cnn")[1] == "400.0"
-    page = paper_tables.further_table(rooms, tables.MOVABLE_LIGHTS)
+    page = paper_tables.format_further_metrics(rooms, tables.MOVABLE_LIGHTS)
     assert cells(page, "cnn")[:4] == ["cnn", "20.0 (19.0 … 23.0)", "2.00", "0.78"]
 
 
 def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
     own = (*NETWORKS, "light_transport_without_descriptor")
     found = [room("static-ablation", report(own, steps=1200, film=128)), room("static-kitchen")]
-    page = tables.page(found, "small")
+    page = tables.format_page(found, "small")
     static, ablation = page.split("## Static rooms")[1].split("## The supplement's static ablation")
     assert "| light_transport_without_descriptor |" in ablation
     assert "Means over: static-ablation.\n" in ablation
@@ -172,7 +174,7 @@ def test_the_ablation_is_a_part_of_its_own_and_keeps_its_networks() -> None:
 @pytest.mark.parametrize("size", ["small", "paper"])
 def test_the_page_begins_with_what_was_found_and_says_whose_recipe_it_is(size: SizeName) -> None:
     experiment = Experiment.load("night-living-room", size)
-    page = tables.page([Room.of(experiment, report(), "1234567")], size)
+    page = tables.format_page([Room.of(experiment, report(), "1234567")], size)
     heads = [line for line in page.splitlines() if line.startswith("## ")]
     findings = ["## What agrees with the paper, and what does not"] if size == "small" else []
     assert heads[: len(findings) + 1] == [*findings, "## How to read the tables"]
@@ -194,7 +196,7 @@ def test_each_room_has_a_panel_with_its_name_and_what_is_left_of_the_grid_stays_
     monkeypatch.setattr(Figure, "subplots", lambda self, *a, **k: (drawn.append(self), subplots(self, *a, **k))[1])
     rows = (*NETWORKS, "denoise_4", "denoise_16", "oidn 1/1")
     names = ("night-living-room", "movable-veach-ajar")[:count]
-    assert equal_time.picture([room(name, report(rows)) for name in names]).startswith(b"\x89PNG")
+    assert equal_time.draw_picture([room(name, report(rows)) for name in names]).startswith(b"\x89PNG")
     panels = drawn[0].axes
     assert [panel.get_title() for panel in panels if panel.axison] == list(names)
     assert [text.get_text() for text in panels[0].texts] == ["4", "16", "1"]
@@ -203,7 +205,7 @@ def test_each_room_has_a_panel_with_its_name_and_what_is_left_of_the_grid_stays_
 def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
     large = report(film=256)
     large["evaluation"]["device"] = "cuda"
-    page = tables.page([room("fixed-living-room", large), room("fixed-dining-room")], "small").replace("\n", " ")
+    page = tables.format_page([room("fixed-living-room", large), room("fixed-dining-room")], "small").replace("\n", " ")
     assert "A GPU took part: networks ran on cuda (fixed-dining-room: cpu); of the rooms" in page
     assert "only fixed-living-room is at the paper's resolution" in page
     assert "images are 256 × 256 (fixed-dining-room: 64 × 64)." in page
@@ -212,7 +214,7 @@ def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
 def test_rooms_of_several_machines_are_named_with_theirs() -> None:
     other = {**report(), "machine": {**MACHINE, "cpu": "Another"}}
     found = [room("fixed-living-room"), room("fixed-dining-room", other)]
-    assert room_tables.said(found, Room.machine) == (
+    assert room_tables.summarise(found, Room.machine) == (
         "Some CPU, 2 cores, x86_64 (fixed-dining-room: Another, 2 cores, x86_64)"
     )
 
@@ -229,7 +231,7 @@ def test_what_could_not_be_measured_is_not_available() -> None:
     bare["evaluation"]["rows"][1]["frame_seconds"] = None
     bare |= {"machine": {**MACHINE, "cpu": None}, "edit_seconds": None}
     found = room("night-living-room", bare)
-    page = tables.page([found], "small")
+    page = tables.format_page([found], "small")
     assert cells(page, "cnn")[1:] == ["100.0", "0.01000", "0.0100", "0.700 (0.477 … 0.923)", "0.827"]
     assert cells(page.split("### Further")[1], "cnn")[1:] == [
         "20.0 (19.0 … 23.0)",
@@ -254,9 +256,9 @@ def test_gaps_are_of_the_mean_of_all_seeds_and_told_apart_only_where_these_agree
     assert gap is not None
     assert gap.of_seeds == pytest.approx([0.02 / 0.04, 0.02 / 0.04])
     assert gap.unit == pytest.approx(0.04)
-    assert cells(paper_tables.order_table([found], {}), "`cnn` − `feature_projection`")[1].startswith("+25% (+")
+    assert cells(paper_tables.format_orders([found], {}), "`cnn` − `feature_projection`")[1].startswith("+25% (+")
     found.document["further_seeds"]["cnn"] = [[0.005] * 4]
-    said = paper_tables.gap(found, "cnn", "light_transport")
+    said = paper_tables.format_gap(found, "cnn", "light_transport")
     assert said.endswith("not told apart")
 
 
@@ -299,7 +301,7 @@ def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_he
         arguments = ["--size", size, "--work", str(tmp_path / place), "--out", str(tmp_path / "out")]
         monkeypatch.setattr(sys, "argv", ["tables.py", *arguments])
         assert tables.main() == 0
-        return json.loads((tmp_path / "out" / f"{tables.page_of(size)}.json").read_text())["rooms"]
+        return json.loads((tmp_path / "out" / f"{tables.name_page(size)}.json").read_text())["rooms"]
 
     first = made("here", "fixed-living-room")
     page = (tmp_path / "out" / "tables.md").read_text()

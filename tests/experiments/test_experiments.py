@@ -13,9 +13,9 @@ import pytest
 
 from experiments import experiment, run
 from experiments.dry_run import Need
-from experiments.experiment import Experiment, SizeName, merged, names
-from experiments.paper_tables import error_table
-from experiments.room_tables import room_table
+from experiments.experiment import Experiment, SizeName, list_names, merge
+from experiments.paper_tables import format_errors
+from experiments.room_tables import format_rooms
 from experiments.rooms import Room
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
 from photonfarm.core.errors import SpecError
@@ -31,7 +31,7 @@ EXPECTED += ["static-ablation", "static-bathroom", "static-kitchen", "vanishing-
 
 
 def test_the_experiments_are_all_there() -> None:
-    assert names() == EXPECTED
+    assert list_names() == EXPECTED
 
 
 @pytest.mark.parametrize("size", get_args(SizeName))
@@ -58,7 +58,7 @@ def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
 
 def test_tables_are_merged_as_deep_as_they_go_and_lists_are_replaced() -> None:
     below: dict[str, Any] = {"a": {"b": 1, "c": {"d": 2}}, "lights": [1, 2], "e": 3}
-    assert merged(below, {"a": {"c": {"f": 4}}, "lights": []}) == {
+    assert merge(below, {"a": {"c": {"f": 4}}, "lights": []}) == {
         "a": {"b": 1, "c": {"d": 2, "f": 4}},
         "lights": [],
         "e": 3,
@@ -159,8 +159,8 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     room = Room.read(tiny, out / "report.json", "1234567")
     assert room.commits() == report["trained_at"]["light_transport"]
     assert (room.spent("samples")["rows"], room.spent("top-up")["rows"]) == (12, 2)
-    assert "| denoise_4 |" in error_table([room], MOVABLE_LIGHTS)
-    assert room_table([room]).splitlines()[-1].startswith("| tiny | ")
+    assert "| denoise_4 |" in format_errors([room], MOVABLE_LIGHTS)
+    assert format_rooms([room]).splitlines()[-1].startswith("| tiny | ")
     assert room.document["rows"]["light_transport"]["network_seconds_range"][0] > 0
     assert {name: len(errors) for name in room.rows if (errors := room.errors(name)) is not None} == {
         "light_transport": 2,
@@ -258,11 +258,11 @@ def test_training_that_ends_early_without_an_error_is_not_taken_for_done(
 def trained(experiment: Experiment, folder: Path, step: int) -> Stages:
     """The stages of an experiment of one network, of which a checkpoint of some step is there."""
     from photonfarm.trainer.runs import checkpoint
-    from photonfarm.trainer.runs.settings import preset
+    from photonfarm.trainer.runs.settings import make_preset
 
     told = {key: experiment.size.train[key] for key in ("max_steps", "loss")}
     network = {"architecture": "light_transport", "width": 4, "points": 128}
-    settings = preset("small", network=network, hold_out=experiment.size.hold_out, **told)
+    settings = make_preset("small", network=network, hold_out=experiment.size.hold_out, **told)
     state = {"scene_id": experiment.spec().scene_id, "settings": settings.model_dump(mode="json"), "step": step}
     (folder / "runs" / "light_transport").mkdir(parents=True)
     checkpoint.save(folder / "runs" / "light_transport" / "checkpoint.safetensors", state)
@@ -288,7 +288,7 @@ def test_a_run_of_other_settings_is_refused_with_its_folder(
     other = with_size(
         tiny,
         **{
-            key: merged(getattr(tiny.size, key), value) if isinstance(value, dict) else value
+            key: merge(getattr(tiny.size, key), value) if isinstance(value, dict) else value
             for key, value in changes.items()
         },
     )
@@ -340,6 +340,6 @@ def test_a_write_of_commits_or_report_that_is_cut_leaves_what_was_there(
 @pytest.mark.parametrize("workers", ["0", "-1", "two"])
 def test_a_number_of_workers_that_cannot_be_is_wrong_usage(workers: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
-        run.options().parse_args([f"--workers={workers}"])
+        run.make_parser().parse_args([f"--workers={workers}"])
     assert ended.value.code == 2
     assert f"{workers!r} is no number of processes" in capsys.readouterr().err

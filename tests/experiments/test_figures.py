@@ -12,7 +12,7 @@ import pytest
 from experiments import figures
 from experiments.figures import AFTER, BEFORE, REFERENCE, Report
 from photonfarm.core.errors import IncompleteError
-from photonfarm.trainer.compare.evaluation_page import COMPARISON, comparison
+from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparison
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.predict.animation import write_png
 
@@ -37,7 +37,7 @@ def folder(tmp_path: Path) -> Path:
         SimpleNamespace(name=name, shown={row: grey(row, column) for row in shown})
         for column, name in enumerate(PREDICTORS, start=1)
     ]
-    write_png(comparison(SimpleNamespace(shown=targets, rows=rows)), tmp_path / COMPARISON)  # type: ignore[arg-type]
+    write_png(draw_comparison(SimpleNamespace(shown=targets, rows=rows)), tmp_path / COMPARISON)  # type: ignore[arg-type]
     document = {
         "evaluation": {"rows": [{"name": name} for name in PREDICTORS], "shown": shown},
         "worst_cases": [{"kind": kind, "row": row} for kind, row in WORST.items()],
@@ -69,8 +69,8 @@ def test_the_worst_views_are_captioned_by_what_they_are_the_worst_of(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     laid = []
-    monkeypatch.setattr(figures, "sheet_of", lambda *told: laid.append(told))
-    figures.worst_cases(Report(folder))
+    monkeypatch.setattr(figures, "make_sheet", lambda *told: laid.append(told))
+    figures.draw_worst_cases(Report(folder))
     ((heads, rows, captions),) = laid
     assert heads == [REFERENCE, BEFORE, "its error", AFTER, "its error"]
     assert captions == [
@@ -82,7 +82,7 @@ def test_the_worst_views_are_captioned_by_what_they_are_the_worst_of(
 
 
 def test_a_sheet_has_a_row_of_errors_below_each_of_at_most_three_views(folder: Path) -> None:
-    sheet = figures.predictions(Report(folder))
+    sheet = figures.draw_predictions(Report(folder))
     tile = figures.SIZE + figures.GAP
     assert sheet.shape[1] == (1 + len(PREDICTORS)) * tile - figures.GAP
     assert sheet.shape[0] // tile == 2 * figures.VIEWS

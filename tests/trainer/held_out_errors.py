@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.predict.evaluation import batches, measure, network_predictor
+from photonfarm.trainer.predict.evaluation import make_network_predictor, measure, read_batches
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.trained_runs import Baselines
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT
@@ -26,5 +26,5 @@ def held_out_errors(make: Callable[[], SampleSource], folder: Path) -> Errors:
         rows = [row for row, held in feed.arrivals()[0] if held][:MOST_HELD_OUT]
         baselines = Baselines.of(make(), run, rows)
         network = run.network(feed.spec, (feed.geometry, feed.cloud))
-        last = measure(network_predictor(network), batches(feed, rows, run.settings.batch)).error
+        last = measure(make_network_predictor(network), read_batches(feed, rows, run.settings.batch)).error
     return Errors(baselines.untrained.error.mean, last.mean, baselines.mean_colour.error.mean, last.count)

@@ -25,7 +25,7 @@ from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.watch import FarmView, FarmWatch
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneStore, Store
-from photonfarm.web.images import Kept
+from photonfarm.web.images import Cached
 from photonfarm.web.metrics import MOST_ERRORS, OTHER, FarmMetrics
 
 ROOT = Path(__file__).parents[2]
@@ -145,7 +145,7 @@ def test_several_scrapers_within_seconds_cost_one_look(farm: FarmWatch) -> None:
         return looks[-1]
 
     now = [0.0]
-    metrics = FarmMetrics(Kept(look, clock=lambda: now[0], work=lambda: 0.0).get)
+    metrics = FarmMetrics(Cached(look, clock=lambda: now[0], work=lambda: 0.0).get)
     assert looks == []
     for _ in range(5):
         metrics.answer()

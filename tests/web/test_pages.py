@@ -33,9 +33,9 @@ from photonfarm.scene.modification import rebuild
 from photonfarm.store import SceneStore, Store
 from photonfarm.web import images
 from photonfarm.web.farm_pages import FarmPages
-from photonfarm.web.images import POINT, Kept
+from photonfarm.web.images import POINT, Cached
 from photonfarm.web.samples import SceneSamples
-from photonfarm.web.server import PageServer, page_routes
+from photonfarm.web.server import PageServer, make_page_routes
 
 EVIL = "<img src=x onerror=alert(1)>"
 """A name that a page must show as it is."""
@@ -85,7 +85,7 @@ def trained(scene: SceneStore, folder: Path) -> Path:
 @contextmanager
 def served(store: Store, runs: list[Path]) -> Iterator[PageServer]:
     watch = FarmWatch(store, "unix:///none", runs)
-    with PageServer(page_routes(FarmPages(store.root, watch)), "127.0.0.1", 0) as serving:
+    with PageServer(make_page_routes(FarmPages(store.root, watch)), "127.0.0.1", 0) as serving:
         thread = threading.Thread(target=serving.serve_forever, args=(0.02,))
         thread.start()
         try:
@@ -175,7 +175,7 @@ def test_pictures_are_the_stored_images_at_the_specs_exposure(server: PageServer
         assert np.array_equal(picture(server, f"{base}/{name}.png"), pictures.display(radiance, 0.7)), name
     assert np.array_equal(picture(server, f"{base}/albedo.png"), pictures.of_albedo(sample.buffers.albedo))
     assert np.array_equal(picture(server, f"{base}/normal.png"), pictures.of_normal(sample.buffers.normal))
-    assert np.array_equal(picture(server, f"{base}/noise.png"), images.of_noise(sample.radiance))
+    assert np.array_equal(picture(server, f"{base}/noise.png"), images.draw_noise(sample.radiance))
     assert picture(server, f"{base}/thumbnail.jpg").shape == (8, 16, 3)
 
 
@@ -332,7 +332,7 @@ def test_looks_take_at_most_their_share_of_a_core() -> None:
         made[0] += 1
         return made[0]
 
-    kept = Kept(make, clock=lambda: now[0], work=lambda: worked[0])
+    kept = Cached(make, clock=lambda: now[0], work=lambda: worked[0])
     assert [kept.get(), kept.get()] == [1, 1]
     now[0] = 307.0
     assert kept.get() == 1

@@ -52,7 +52,7 @@ class Scene:
         self._rows = self._reader.rows if rows is None else np.asarray(rows, np.int64)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _opened, (self._store, self._id, self._guides, self._rows.tolist() if self._frozen else None)
+        return _reopen, (self._store, self._id, self._guides, self._rows.tolist() if self._frozen else None)
 
     def __repr__(self) -> str:
         return f"<scene {self.name} ({self.id}), {len(self)} samples{', a snapshot' if self._frozen else ''}>"
@@ -186,6 +186,6 @@ class Scene:
         return type(self)(self._store, self._id, guides=self._guides, rows=rows.tolist())
 
 
-def _opened(store: str | Path, scene_id: str, guides: bool, rows: Sequence[int] | None) -> Scene:
+def _reopen(store: str | Path, scene_id: str, guides: bool, rows: Sequence[int] | None) -> Scene:
     """The scene that a pickled scene is restored to."""
     return Scene(store, scene_id, guides=guides, rows=rows)

@@ -65,10 +65,10 @@ def web(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any)
     """
     from photonfarm.core.processes import free_port
     from photonfarm.web.farm_pages import FarmPages
-    from photonfarm.web.server import page_routes
+    from photonfarm.web.server import make_page_routes
 
     pages = FarmPages(store, _watch(store, redis_url, runs))
-    _serve(page_routes(pages), "", **where | {"port": free_port(where["port"])})
+    _serve(make_page_routes(pages), "", **where | {"port": free_port(where["port"])})
 
 
 @click.command("serve-metrics")
@@ -79,10 +79,10 @@ def serve_metrics(store: str | Path, redis_url: str, runs: tuple[Path, ...], **w
 
     `web` serves the same beside its pages. Ends on Ctrl-C.
     """
-    from photonfarm.web.images import Kept
-    from photonfarm.web.server import metric_routes
+    from photonfarm.web.images import Cached
+    from photonfarm.web.server import make_metric_routes
 
-    _serve(metric_routes(Kept(_watch(store, redis_url, runs).look).get), "metrics", **where)
+    _serve(make_metric_routes(Cached(_watch(store, redis_url, runs).look).get), "metrics", **where)
 
 
 def _watch(store: str | Path, redis_url: str, runs: tuple[Path, ...]) -> FarmWatch:

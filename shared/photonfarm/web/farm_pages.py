@@ -14,7 +14,7 @@ from photonfarm.farm.training import VIEWS, RunFolder
 from photonfarm.farm.watch import FarmView, FarmWatch
 from photonfarm.store import Store
 from photonfarm.store.write.plans import plan_of
-from photonfarm.web.images import Kept
+from photonfarm.web.images import Cached
 from photonfarm.web.samples import SceneSamples
 from photonfarm.web.server import NotThereError
 
@@ -31,9 +31,9 @@ class FarmPages:
         """Take the store's place, and how the farm is looked at."""
         self._place, self._watch = place, watch
         self._store = Store(place)
-        self._view: Kept[FarmView] = Kept(watch.look)
+        self._view: Cached[FarmView] = Cached(watch.look)
         self._samples: dict[str, SceneSamples] = {}
-        self._walls: dict[str, Kept[list[int]]] = {}
+        self._walls: dict[str, Cached[list[int]]] = {}
         self._lock = threading.Lock()
 
     def view(self) -> FarmView:
@@ -64,7 +64,7 @@ class FarmPages:
                 if scene_id not in self._store.scene_ids():
                     raise NotThereError(f"the store has no scene {scene_id}")
                 self._samples[scene_id] = samples = SceneSamples(self._place, scene_id)
-                self._walls[scene_id] = Kept(samples.look)
+                self._walls[scene_id] = Cached(samples.look)
             return self._samples[scene_id]
 
     def wall(self, scene_id: str) -> dict[str, Any]:
@@ -93,7 +93,7 @@ class FarmPages:
     def curves(self) -> list[dict[str, Any]]:
         """The curves of all runs: held-out error and loss by step and by seconds."""
         self._view.get()
-        return [_curves(run) for run in self._watch.runs]
+        return [_read_curves(run) for run in self._watch.runs]
 
     def prediction(self, run: int, step: int) -> bytes:
         """The picture of a run's predictions at a validation; raises NotThereError."""
@@ -106,25 +106,25 @@ class FarmPages:
             raise NotThereError(f"run {run} has no picture of step {step}") from error
 
 
-def _curves(run: RunFolder) -> dict[str, Any]:
-    records, steps = list(run.records), _steps(run.folder)  # a copy, as another thread may add some
+def _read_curves(run: RunFolder) -> dict[str, Any]:
+    records, steps = list(run.records), _list_steps(run.folder)  # a copy, as another thread may add some
     validations = [
-        [r["step"], _seconds(r), r["error"], r["standard_error"], r["samples"], r["held_out"]]
+        [r["step"], _sum_seconds(r), r["error"], r["standard_error"], r["samples"], r["held_out"]]
         for r in records
         if r.get("kind") == "validation"
     ]
     trained = [r for r in records if r.get("kind") == "train" and isinstance(r.get("loss"), float)]
-    losses = [[r["step"], _seconds(r), r["loss"]] for r in trained]
+    losses = [[r["step"], _sum_seconds(r), r["loss"]] for r in trained]
     return {
         "run": run.folder.name,
-        "validations": _thinned(validations),
-        "losses": _thinned(losses),
+        "validations": _thin_out(validations),
+        "losses": _thin_out(losses),
         "steps": steps,
-        **_shown(run.folder, steps),
+        **_read_shown(run.folder, steps),
     }
 
 
-def _steps(folder: Path) -> list[int]:
+def _list_steps(folder: Path) -> list[int]:
     """The validations of a run that have pictures."""
     try:
         names = [file.name for file in (folder / VIEWS).iterdir()]
@@ -133,7 +133,7 @@ def _steps(folder: Path) -> list[int]:
     return sorted(int(match[1]) for name in names if (match := STEP.fullmatch(name)))
 
 
-def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:
+def _read_shown(folder: Path, steps: list[int]) -> dict[str, Any]:
     """The scene and the rows that a run's pictures show, as the last of them says."""
     from PIL import Image
 
@@ -145,12 +145,12 @@ def _shown(folder: Path, steps: list[int]) -> dict[str, Any]:
         return {"scene_id": None, "rows": []}
 
 
-def _seconds(record: dict[str, Any]) -> float:
+def _sum_seconds(record: dict[str, Any]) -> float:
     """How long a run had been at it when it wrote a record."""
     return float(sum(record.get("seconds", {}).values()))
 
 
-def _thinned(points: list[list[Any]]) -> list[list[Any]]:
+def _thin_out(points: list[list[Any]]) -> list[list[Any]]:
     """Evenly spaced points, at most CURVE_POINTS, with the first and the last one."""
     if len(points) <= CURVE_POINTS:
         return points

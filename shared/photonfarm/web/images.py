@@ -35,7 +35,7 @@ NORMALS = ("normal", "mean_normal", "beyond_normal")
 REFLECTANCES = ("albedo", "specular", "throughput", "beyond_albedo")
 
 
-def encoded(picture: Picture, kind: Literal["PNG", "JPEG"] = "PNG") -> bytes:
+def encode(picture: Picture, kind: Literal["PNG", "JPEG"] = "PNG") -> bytes:
     """A picture as a file's bytes: PNG is exact, and JPEG takes a tenth of the time."""
     from PIL import Image
 
@@ -48,7 +48,7 @@ def encoded(picture: Picture, kind: Literal["PNG", "JPEG"] = "PNG") -> bytes:
     return stream.getvalue()
 
 
-def of_array(name: str, values: F32, exposure: float) -> Picture:
+def draw_array(name: str, values: F32, exposure: float) -> Picture:
     """A buffer or guide, (H, W) or (H, W, 3), by its name: normals, reflectances, distances, α, else radiance."""
     if name in NORMALS:
         return pictures.of_normal(values)
@@ -59,24 +59,24 @@ def of_array(name: str, values: F32, exposure: float) -> Picture:
     return pictures.of_depth(values) if values.ndim == 2 else pictures.display(values, exposure)
 
 
-def noise(halves: F32) -> F32:
+def estimate_noise(halves: F32) -> F32:
     """Relative noise of the mean of A and B at each pixel, (H, W): a standard deviation over local brightness.
 
     Both are means over 3 × 3 pixels; (A − B)²/4 is the variance of (A + B)/2 in expectation.
     """
     a, b = halves.astype(np.float64)
-    variance, bright = _smoothed(((a - b) ** 2 / 4).mean(axis=2)), _smoothed(((a + b) / 2).mean(axis=2))
+    variance, bright = _smooth(((a - b) ** 2 / 4).mean(axis=2)), _smooth(((a + b) / 2).mean(axis=2))
     return (np.sqrt(variance) / (bright + FLOOR * max(bright.mean(), 1e-12))).astype(np.float32)
 
 
-def of_noise(halves: F32) -> Picture:
+def draw_noise(halves: F32) -> Picture:
     """The noise map as a picture: dark without noise, bright where the noise is as large as the light."""
-    place = np.clip(noise(halves) / NOISY, 0, 1) * (len(_COLOURS) - 1)
+    place = np.clip(estimate_noise(halves) / NOISY, 0, 1) * (len(_COLOURS) - 1)
     stops = np.arange(len(_COLOURS))
     return np.stack([np.interp(place, stops, _COLOURS[:, i]) for i in range(3)], axis=2).round().astype(np.uint8)
 
 
-def packed(position: F32, normal: F32, colour: Picture, seen: NDArray[np.bool_]) -> bytes:
+def pack_points(position: F32, normal: F32, colour: Picture, seen: NDArray[np.bool_]) -> bytes:
     """Points (N, 3) with normals and colours (N, 3), and whether the view sees them (N,), as bytes."""
     points = np.zeros(len(position), POINT)
     points["position"], points["colour"], points["seen"] = position, colour, seen
@@ -84,18 +84,18 @@ def packed(position: F32, normal: F32, colour: Picture, seen: NDArray[np.bool_])
     return points.tobytes()
 
 
-def point_colours(albedo: F32, emission: F32) -> Picture:
+def colour_points(albedo: F32, emission: F32) -> Picture:
     """The colours (N, 3) of points: their reflectance, and white-hot where they emit."""
     return pictures.of_albedo(np.clip(albedo + emission, 0, 1)[None])[0]
 
 
-def photon_colours(power: F32) -> Picture:
+def colour_photons(power: F32) -> Picture:
     """The colours (N, 3) of photons: their power's, the brightest hundredth at full brightness."""
     bright = np.percentile(power.max(axis=1), 99) if len(power) else 1.0
     return pictures.display(power[None], 1 / max(float(bright), 1e-12))[0]
 
 
-def _smoothed(image: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth(image: NDArray[np.float64]) -> NDArray[np.float64]:
     """The mean over 3 × 3 pixels, edges repeated."""
     wide = np.pad(image, 1, mode="edge")
     rows = wide[:-2] + wide[1:-1] + wide[2:]
@@ -112,7 +112,7 @@ SHARE = 0.01
 T = TypeVar("T")
 
 
-class Kept(Generic[T]):
+class Cached(Generic[T]):
     """A value that is made anew now and then, so that making it takes at most SHARE of the time."""
 
     def __init__(

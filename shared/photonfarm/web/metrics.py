@@ -59,60 +59,64 @@ class FarmMetrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield the metrics of the farm as it is now."""
         view = self._look()
-        yield _gauge("look_timestamp_seconds", "When the farm was looked at, in seconds since 1970.", {(): view.at_s})
-        yield from _of_scenes([scene for scene in view.scenes if not scene.error])
+        yield _make_gauge(
+            "look_timestamp_seconds", "When the farm was looked at, in seconds since 1970.", {(): view.at_s}
+        )
+        yield from _measure_scenes([scene for scene in view.scenes if not scene.error])
         unreadable = sum(bool(scene.error) for scene in view.scenes)
-        yield _gauge("scenes_unreadable", "Scenes of the store that cannot be read.", {(): unreadable})
-        yield from _of_queue(view.queue)
-        yield from _of_trainings(_named(view.trainings))
+        yield _make_gauge("scenes_unreadable", "Scenes of the store that cannot be read.", {(): unreadable})
+        yield from _measure_queue(view.queue)
+        yield from _measure_trainings(_name_runs(view.trainings))
         waits = Counter({(kind,): 0 for kind in get_args(WaitKind)})
         for wait in view.waits:
             waits[(wait.kind,)] += wait.count
-        yield _gauge("waits", "What waits: scenes, workers, failed jobs, samples, trainers.", waits, "kind")
+        yield _make_gauge("waits", "What waits: scenes, workers, failed jobs, samples, trainers.", waits, "kind")
 
 
-def _of_scenes(scenes: Sequence[SceneView]) -> Iterator[Metric]:
+def _measure_scenes(scenes: Sequence[SceneView]) -> Iterator[Metric]:
     names = "scene", "scene_id"
-    of = {(_text(scene.name), scene.scene_id): scene for scene in scenes}
+    of = {(_escape_text(scene.name), scene.scene_id): scene for scene in scenes}
     by_pass = [
         ((*labels, which), counts)
         for labels, scene in of.items()
         for which, counts in (("first", scene.samples), ("further", scene.passes))
     ]
-    yield _counter(
+    yield _make_counter(
         "samples_committed",
         "Committed samples: first passes of views, and further ones.",
         {labels: counts[0] for labels, counts in by_pass},
         *names,
         "pass",
     )
-    yield _gauge(
+    yield _make_gauge(
         "samples_planned",
         "Planned samples: first passes of views, and further ones.",
         {labels: counts[1] for labels, counts in by_pass},
         *names,
         "pass",
     )
-    yield _gauge(
+    yield _make_gauge(
         "samples_in_hand",
         "Samples that are rendered, in jobs that are not committed yet.",
         {labels: scene.in_hand for labels, scene in of.items()},
         *names,
     )
     committed = {labels: scene.jobs[0] for labels, scene in of.items()}
-    yield _counter("jobs_committed", "Committed render jobs.", committed, *names)
+    yield _make_counter("jobs_committed", "Committed render jobs.", committed, *names)
     planned = {labels: scene.jobs[1] for labels, scene in of.items()}
-    yield _gauge("jobs_planned", "Planned render jobs.", planned, *names)
+    yield _make_gauge("jobs_planned", "Planned render jobs.", planned, *names)
     sizes = {labels: scene.size_bytes for labels, scene in of.items()}
-    yield _counter("committed_bytes", "Bytes of committed jobs.", sizes, *names)
+    yield _make_counter("committed_bytes", "Bytes of committed jobs.", sizes, *names)
     core_s = {labels: scene.core_s for labels, scene in of.items()}
-    yield _counter("render_core_seconds", "Processor time that committed jobs took.", core_s, *names)
+    yield _make_counter("render_core_seconds", "Processor time that committed jobs took.", core_s, *names)
 
 
-def _of_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:
-    yield _gauge("queue_up", "Whether the queue's Redis answers, 1 or 0.", {(): int(isinstance(queue, StoreQueue))})
-    failed = _failures(queue)
-    yield _gauge(
+def _measure_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:
+    yield _make_gauge(
+        "queue_up", "Whether the queue's Redis answers, 1 or 0.", {(): int(isinstance(queue, StoreQueue))}
+    )
+    failed = _count_failures(queue)
+    yield _make_gauge(
         "failed_jobs",
         "Failed jobs by the class of their error: set aside until a retry, or kept by the store alone.",
         failed,
@@ -124,21 +128,21 @@ def _of_queue(queue: StoreQueue | NoQueue) -> Iterator[Metric]:
     status = queue.status
     jobs: dict[Labels, float] = {("waiting",): status.queued, ("started",): status.running}
     jobs[("failed",)] = sum(count for (_, state), count in failed.items() if state == "failed")
-    yield _gauge("queue_jobs", "Jobs of the queue by state.", jobs, "state")
+    yield _make_gauge("queue_jobs", "Jobs of the queue by state.", jobs, "state")
     paused = status.paused.keys()
     rendering = len(status.activities.keys() - paused)
     idle = max(status.workers - rendering - len(paused), 0)
     workers: dict[Labels, float] = {("rendering",): rendering, ("paused",): len(paused), ("idle",): idle}
-    yield _gauge("workers", "Live workers: with a job, taking none, or without one.", workers, "state")
+    yield _make_gauge("workers", "Live workers: with a job, taking none, or without one.", workers, "state")
 
 
-def _failures(queue: StoreQueue | NoQueue) -> dict[Labels, int]:
+def _count_failures(queue: StoreQueue | NoQueue) -> dict[Labels, int]:
     """The numbers of failed jobs by error and state; few errors, each the class before a cause's first colon."""
     counts: Counter[Labels] = Counter()
     for cause in () if isinstance(queue, NoQueue) else queue.causes:
-        counts[_error(cause.cause), "failed"] += len(cause.jobs)
+        counts[_name_error(cause.cause), "failed"] += len(cause.jobs)
     for cause in queue.kept:
-        counts[_error(cause.cause), "kept"] += len(cause.jobs)
+        counts[_name_error(cause.cause), "kept"] += len(cause.jobs)
     by_error: Counter[str] = Counter()
     for (error, _), count in counts.items():
         by_error[error] += count
@@ -149,19 +153,19 @@ def _failures(queue: StoreQueue | NoQueue) -> dict[Labels, int]:
     return dict(grouped)
 
 
-def _error(cause: str) -> str:
+def _name_error(cause: str) -> str:
     """The class of an error, by a failure's cause."""
     match = _ERROR.match(cause)
     return match[1] if match else OTHER
 
 
-def _of_trainings(of: dict[Labels, TrainingProgress]) -> Iterator[Metric]:
+def _measure_trainings(of: dict[Labels, TrainingProgress]) -> Iterator[Metric]:
     steps = {run: each.step for run, each in of.items()}
-    yield _gauge("trainer_step", "The step that training is at.", steps, "run")
+    yield _make_gauge("trainer_step", "The step that training is at.", steps, "run")
     planned = {run: each.steps for run, each in of.items() if each.steps}
-    yield _gauge("trainer_steps_planned", "The steps after which training ends.", planned, "run")
+    yield _make_gauge("trainer_steps_planned", "The steps after which training ends.", planned, "run")
     losses = {run: each.loss for run, each in of.items() if each.loss is not None}
-    yield _gauge("trainer_loss", "The training loss that was logged last.", losses, "run")
+    yield _make_gauge("trainer_loss", "The training loss that was logged last.", losses, "run")
     for name, key, about in (
         ("error", "error", "The held-out error of the last validation."),
         ("standard_error", "standard_error", "The standard error of the held-out error."),
@@ -169,51 +173,53 @@ def _of_trainings(of: dict[Labels, TrainingProgress]) -> Iterator[Metric]:
     ):
         values = {run: each.validation.get(key) for run, each in of.items() if each.validation is not None}
         numbers = {run: value for run, value in values.items() if isinstance(value, int | float)}
-        yield _gauge(f"trainer_heldout_{name}", about, numbers, "run")
+        yield _make_gauge(f"trainer_heldout_{name}", about, numbers, "run")
     spent = {
-        (*run, _text(activity)): seconds
+        (*run, _escape_text(activity)): seconds
         for run, each in of.items()
         for activity, seconds in each.seconds.items()
         if isinstance(seconds, int | float) and math.isfinite(seconds)
     }
-    yield _counter(
+    yield _make_counter(
         "trainer_seconds", "Seconds of training so far, by what they were spent on.", spent, "run", "activity"
     )
-    states = {(*run, state): float(state == _state(each)) for run, each in of.items() for state in STATES}
-    yield _gauge("trainer_state", "1 for the state that the trainer is in, 0 for the others.", states, "run", "state")
+    states = {(*run, state): float(state == _number_state(each)) for run, each in of.items() for state in STATES}
+    yield _make_gauge(
+        "trainer_state", "1 for the state that the trainer is in, 0 for the others.", states, "run", "state"
+    )
 
 
-def _state(training: TrainingProgress) -> str:
+def _number_state(training: TrainingProgress) -> str:
     if training.phase is None:
         return "ended" if training.ended else "absent"
     return {TRAINS: "trains", WAITS: "waits"}.get(training.phase, "works")
 
 
-def _named(trainings: Sequence[TrainingProgress]) -> dict[Labels, TrainingProgress]:
+def _name_runs(trainings: Sequence[TrainingProgress]) -> dict[Labels, TrainingProgress]:
     """Runs by a label each: the name of the folder, with a number behind it where several are called so."""
     by_labels: dict[Labels, TrainingProgress] = {}
     for training in trainings:
-        name, number = _text(training.run), 1
+        name, number = _escape_text(training.run), 1
         while (label := name if number == 1 else f"{name} {number}",) in by_labels:
             number += 1
         by_labels[label,] = training
     return by_labels
 
 
-def _text(name: str) -> str:
+def _escape_text(name: str) -> str:
     """A name as UTF-8 holds it: names of folders may be other bytes."""
     return name.encode(errors="replace").decode()
 
 
-def _gauge(name: str, about: str, values: dict[Any, Any], *labels: str) -> Metric:
-    return _filled(GaugeMetricFamily(f"photonfarm_{name}", about, labels=labels), values)
+def _make_gauge(name: str, about: str, values: dict[Any, Any], *labels: str) -> Metric:
+    return _fill(GaugeMetricFamily(f"photonfarm_{name}", about, labels=labels), values)
 
 
-def _counter(name: str, about: str, values: dict[Any, Any], *labels: str) -> Metric:
-    return _filled(CounterMetricFamily(f"photonfarm_{name}", about, labels=labels), values)
+def _make_counter(name: str, about: str, values: dict[Any, Any], *labels: str) -> Metric:
+    return _fill(CounterMetricFamily(f"photonfarm_{name}", about, labels=labels), values)
 
 
-def _filled(family: GaugeMetricFamily | CounterMetricFamily, values: dict[Any, Any]) -> Metric:
+def _fill(family: GaugeMetricFamily | CounterMetricFamily, values: dict[Any, Any]) -> Metric:
     for labels, value in values.items():
         family.add_metric(labels, value)
     return family

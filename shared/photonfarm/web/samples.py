@@ -75,22 +75,22 @@ class SceneSamples:
     def thumbnail(self, row: int) -> bytes:
         """The mean of A and B as a JPEG, at the spec's exposure; its noise is noted for the map."""
         sample = self._read(row)
-        return images.encoded(pictures.display(sample.radiance.mean(axis=0), self._reader.spec.exposure), "JPEG")
+        return images.encode(pictures.display(sample.radiance.mean(axis=0), self._reader.spec.exposure), "JPEG")
 
     def picture(self, row: int, name: str) -> bytes:
         """A picture of a sample as a PNG: a, b, mean, noise, reference, or a buffer or guide by its name."""
         exposure = self._reader.spec.exposure
         if name == "reference":
-            return images.encoded(pictures.display(self._merged(row)[0], exposure))
+            return images.encode(pictures.display(self._merged(row)[0], exposure))
         sample = self._open(row)
         if name in (shown := {"a": sample.radiance[0], "b": sample.radiance[1], "mean": sample.radiance.mean(axis=0)}):
-            return images.encoded(pictures.display(shown[name], exposure))
+            return images.encode(pictures.display(shown[name], exposure))
         if name == "noise":
-            return images.encoded(images.of_noise(sample.radiance))
-        arrays = _images_of(sample)
+            return images.encode(images.draw_noise(sample.radiance))
+        arrays = _draw_images(sample)
         if name not in arrays:
             raise NotThereError(f"a sample has no picture {name!r}")
-        return images.encoded(images.of_array(name, arrays[name], exposure))
+        return images.encode(images.draw_array(name, arrays[name], exposure))
 
     def _merged(self, row: int) -> tuple[F32, int]:
         """The mean of the passes of a sample's view, and their number."""
@@ -105,8 +105,8 @@ class SceneSamples:
     def points(self, row: int) -> bytes:
         """The points of a sample's configuration, as `images.packed` has them."""
         cloud = self._open(row).point_cloud
-        colour, there = images.point_colours(cloud.albedo, cloud.emission), cloud.present
-        return images.packed(cloud.position[there], cloud.normal[there], colour[there], cloud.seen[there])
+        colour, there = images.colour_points(cloud.albedo, cloud.emission), cloud.present
+        return images.pack_points(cloud.position[there], cloud.normal[there], colour[there], cloud.seen[there])
 
     def photons(self, row: int) -> bytes:
         """The photons of a sample's configuration, as `images.packed` has them; none for a scene without photons."""
@@ -115,8 +115,10 @@ class SceneSamples:
         sample = self._open(row)
         photons = sample.photons
         there = photons.bounce >= 0
-        colour = images.photon_colours(photons.power[there])
-        return images.packed(photons.position[there], photons.normal[there], colour, sample.visibility.photons[there])
+        colour = images.colour_photons(photons.power[there])
+        return images.pack_points(
+            photons.position[there], photons.normal[there], colour, sample.visibility.photons[there]
+        )
 
     # ------------------------------------------------------------------------------------------------------- in figures
 
@@ -146,7 +148,7 @@ class SceneSamples:
                 {"name": group.name, "present": bool(there), "moved": moved.tolist()}
                 for group, there, moved in zip(spec.groups, modification.present, modification.translation, strict=True)
             ],
-            "images": ["mean", "a", "b", "noise", *_images_of(sample)],
+            "images": ["mean", "a", "b", "noise", *_draw_images(sample)],
         }
 
     def mapped(self, cost_of: Callable[[int], float | None]) -> dict[str, Any]:
@@ -205,6 +207,6 @@ class SceneSamples:
             return self._noise[sample.row]
 
 
-def _images_of(sample: Sample) -> dict[str, F32]:
+def _draw_images(sample: Sample) -> dict[str, F32]:
     """The buffers and guides of a sample that are images, by name."""
     return {name: array for name, array in sample.images.items() if array.shape[:2] == sample.radiance.shape[1:3]}

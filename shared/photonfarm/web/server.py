@@ -35,7 +35,7 @@ PNG, JPEG, BYTES = "image/png", "image/jpeg", "application/octet-stream"
 _SCENE, _ROW = "([0-9a-f]{32})", "([0-9]{1,12})"
 
 
-def page_routes(pages: FarmPages) -> Routes:
+def make_page_routes(pages: FarmPages) -> Routes:
     """The pages, what they show, and the metrics."""
 
     def document(make: Callable[..., Any]) -> Callable[..., Answer]:
@@ -67,10 +67,10 @@ def page_routes(pages: FarmPages) -> Routes:
         ("/run/([0-9]{1,3})/([0-9]{1,8}).png", True, lambda run, step: (PNG, pages.prediction(int(run), int(step)))),
     ]
     routes = [(re.compile(pattern.replace(".", r"\.")), stays, make) for pattern, stays, make in table]
-    return routes + metric_routes(pages.view)
+    return routes + make_metric_routes(pages.view)
 
 
-def metric_routes(look: Callable[[], FarmView]) -> Routes:
+def make_metric_routes(look: Callable[[], FarmView]) -> Routes:
     """The metrics of a farm, by a function that gives it as it is now."""
 
     @cache

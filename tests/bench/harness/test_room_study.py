@@ -26,7 +26,7 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.metrics.image_metrics import t_975
-from photonfarm.trainer.runs.settings import preset
+from photonfarm.trainer.runs.settings import make_preset
 
 SIZE, SLOTS = 8, 8
 Root = tuple[Path, str]
@@ -171,7 +171,7 @@ def test_a_run_of_a_users_own_network_is_another_once_its_module_changes(
     module.write_text("first = 1")
     monkeypatch.syspath_prepend(tmp_path)
     network = {"architecture": f"{module.stem}:Own"}
-    own, ours = (Run(lambda: None, preset("small", network=of), tmp_path, "few") for of in (network, {}))
+    own, ours = (Run(lambda: None, make_preset("small", network=of), tmp_path, "few") for of in (network, {}))
     before = own.folder, ours.folder
     module.write_text("second = 2")
     assert own.folder != before[0]

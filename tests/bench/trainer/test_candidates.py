@@ -11,7 +11,7 @@ from torch import Tensor
 
 from bench.trainer import candidates
 from bench.trainer.guided_networks import CANDIDATES, INSTEAD
-from photonfarm.trainer.networks import build, kind_of
+from photonfarm.trainer.networks import build, find_kind
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.network import Network
@@ -22,7 +22,7 @@ SOURCE = AnalyticSource(analytic_spec(16, 256), 2)
 
 def made(name: str) -> Network:
     """A network of some width whose residual blocks do something, unlike at the start."""
-    chosen = settings.settings_of("small", {**CANDIDATES[name], "width": 4}).network
+    chosen = settings.make_settings("small", {**CANDIDATES[name], "width": 4}).network
     network = build(chosen, SceneFrame.of(SOURCE.spec, *SOURCE.base(), chosen), 0)
     torch.manual_seed(0)
     for part, parameter in network.named_parameters():
@@ -64,7 +64,7 @@ def form_factors(points: LitPoints) -> Tensor:
 @pytest.mark.parametrize("name", INSTEAD)
 def test_a_candidate_makes_an_image_and_all_of_its_weights_learn(name: str) -> None:
     network = made(name)
-    shown = network(inputs(kind_of(CANDIDATES[name]["architecture"]).needs))
+    shown = network(inputs(find_kind(CANDIDATES[name]["architecture"]).needs))
     assert shown.shape == (2, 16, 16, 3)
     assert torch.isfinite(shown).all()
     shown.square().sum().backward()

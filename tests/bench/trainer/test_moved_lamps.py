@@ -32,9 +32,9 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.predict.evaluation import Predictor, constant_predictor
+from photonfarm.trainer.predict.evaluation import Predictor, make_constant_predictor
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.runs.settings import preset
+from photonfarm.trainer.runs.settings import make_preset
 from photonfarm.trainer.training.loop import Hooks, train
 
 HOLD_OUT = 0.5
@@ -68,7 +68,7 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "spec.json").write_text(spec.model_dump_json())
     network = {"architecture": "guided_transport_photons", "width": 2, "points": 128, "lit_points": 16}
     for name, seed in (("guided", 0), ("guided-1", 1), ("cut", 2)):
-        settings = preset("small", network=network, seed=seed, hold_out=HOLD_OUT, max_steps=2, minimum_samples=1)
+        settings = make_preset("small", network=network, seed=seed, hold_out=HOLD_OUT, max_steps=2, minimum_samples=1)
         stop = Stop()
         if name == "cut":
             stop.set()
@@ -99,7 +99,7 @@ def test_who_knows_the_reference_explains_all(views: Views) -> None:
 
 @pytest.mark.slow
 def test_a_prediction_that_does_not_change_explains_nothing(views: Views) -> None:
-    found = row(views, constant_predictor(np.full(3, 0.4, np.float32)))
+    found = row(views, make_constant_predictor(np.full(3, 0.4, np.float32)))
     for explained in (found.whole, found.stays):
         assert explained.share == pytest.approx(0, abs=1e-6)
         assert explained.interval() == pytest.approx((0, 0), abs=1e-6)

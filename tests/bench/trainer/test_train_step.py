@@ -4,13 +4,13 @@ import pytest
 
 from bench.trainer import train_step
 from bench.trainer.train_step import WHOLE, WorkTimer, filled, for_architecture, measure, resized, shown
-from photonfarm.trainer.runs.settings import preset
+from photonfarm.trainer.runs.settings import make_preset
 
 
 def test_every_network_takes_its_steps_and_its_parts_are_timed(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(train_step, "SAMPLES", 32)
     where = tmp_path, filled(resized(16, 64), tmp_path)
-    settings = preset("small", network={"width": 4, "points": 64})
+    settings = make_preset("small", network={"width": 4, "points": 64})
     timed = [measure(where, for_architecture(settings, name), WorkTimer("cpu", 1), 2) for name in shown()]
     assert {row.architecture for row in timed} >= {"cnn", "guided", "guided_transport_photons", "denoise_4"}
     for row in timed:

@@ -40,7 +40,7 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
                 time.sleep(0.01)
 
         connection.set(f"rq:photonfarm:consumed:{SCENE_ID}", 7)
-        with service._reported(server.url, made(tmp_path), SCENE_ID, print) as count:
+        with service._report_use(server.url, made(tmp_path), SCENE_ID, print) as count:
             time.sleep(0.3)
             wait_for(7)  # of the session before: this one knows nothing yet
             count(40, 100)
@@ -54,7 +54,7 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
 def test_what_is_used_by_the_end_is_told_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "REPORT_S", 3600)
     with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._reported(server.url, made(tmp_path), SCENE_ID, print) as count:
+        with service._report_use(server.url, made(tmp_path), SCENE_ID, print) as count:
             count(120, 48)
         assert consumed_samples(connect(server.url), [SCENE_ID]) == {SCENE_ID: 48}
 
@@ -79,7 +79,7 @@ def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once
     with EmbeddedRedis(tmp_path / "redis") as server:
         connection = connect(server.url)
         serve(connection, Store(tmp_path / "other", create=True))
-        with service._reported(server.url, made(tmp_path), SCENE_ID, said.append) as count:
+        with service._report_use(server.url, made(tmp_path), SCENE_ID, said.append) as count:
             count(40, 100)
             time.sleep(0.3)
         assert consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
@@ -90,7 +90,7 @@ def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once
 @pytest.mark.parametrize("url", [None, "redis://127.0.0.1:1/0", "nonsense"])
 def test_without_a_redis_training_goes_on(url: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "REPORT_S", 0.01)
-    with service._reported(url, made(tmp_path), SCENE_ID, print) as count:
+    with service._report_use(url, made(tmp_path), SCENE_ID, print) as count:
         count(1, 1)
         time.sleep(0.1)
 
@@ -136,7 +136,7 @@ def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene,
 def test_a_store_that_comes_later_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(service, "REPORT_S", 0.01)
     with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._reported(server.url, tmp_path / "store", SCENE_ID, print) as count:
+        with service._report_use(server.url, tmp_path / "store", SCENE_ID, print) as count:
             count(1, 1)
             time.sleep(0.1)
             made(tmp_path)

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from photonfarm.trainer.data import batch as resident
-from photonfarm.trainer.data.batch import FREE_SHARE, ResidentSamples, TrainingBatch, size_bytes
+from photonfarm.trainer.data.batch import FREE_SHARE, ResidentSamples, TrainingBatch, count_bytes
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Needs, map_tensors
 from photonfarm.trainer.runs import checkpoint
@@ -44,7 +44,7 @@ def test_batches_are_the_same_to_the_bit_however_many_samples_are_kept(
     """All, two of the five, none. Of a batch that shows a sample twice, one is read."""
     plain = batches(make_source(6, photons=16), tiny(), None)
     source = make_source(6, photons=16)
-    kept = ResidentSamples(CPU, samples * size_bytes(plain[2]) / 1e9)
+    kept = ResidentSamples(CPU, samples * count_bytes(plain[2]) / 1e9)
     found = batches(source, tiny(), kept)
     assert len(source.reads) == reads
     assert len(kept.rows) == min(int(samples), 5)
@@ -57,7 +57,7 @@ def test_batches_are_the_same_to_the_bit_however_many_samples_are_kept(
 
 def test_a_sample_of_which_only_a_copy_is_there_has_its_bytes_counted(make_source, tiny) -> None:
     (batch, *_) = batches(make_source(6, photons=16), tiny(), None)
-    assert size_bytes(batch) == sum(tensor.numpy().nbytes for tensor in tensors(batch))
+    assert count_bytes(batch) == sum(tensor.numpy().nbytes for tensor in tensors(batch))
 
 
 @pytest.mark.parametrize("architecture", ["light_transport_photons", "guided_transport", "denoise_4"])

@@ -14,10 +14,10 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.trainer.dry_run import dry_run
 from photonfarm.trainer.dry_run.dry_run import DryRun, describe, format_estimate, rehearse
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
-from photonfarm.trainer.networks import ARCHITECTURES, image_of
+from photonfarm.trainer.networks import ARCHITECTURES, predict_image
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.networks.summary import summary
-from photonfarm.trainer.runs.settings import TrainSettings, settings_of
+from photonfarm.trainer.networks.summary import summarise
+from photonfarm.trainer.runs.settings import TrainSettings, make_settings
 from photonfarm.trainer.training.learner import Learner
 
 
@@ -28,7 +28,7 @@ def spec_of(size: int) -> SceneSpec:
 
 
 def settings(**changes: object) -> TrainSettings:
-    return settings_of("small", {"width": 4, "points": 256, "device": "cpu", **changes})
+    return make_settings("small", {"width": 4, "points": 256, "device": "cpu", **changes})
 
 
 def found(size: int = 16, **changes: object) -> DryRun:
@@ -53,7 +53,7 @@ def test_points_of_the_made_up_scene_are_seen_in_its_views() -> None:
     covered = (channels.abs().sum(dim=-1) > 0).flatten(1).sum(dim=1)
     assert isinstance(network, Network)
     assert (covered > 0.05 * 256).all()
-    assert image_of(network, scene.batch(3, chosen).inputs).isfinite().all()
+    assert predict_image(network, scene.batch(3, chosen).inputs).isfinite().all()
 
 
 def test_a_step_has_three_times_the_work_of_an_image() -> None:
@@ -64,7 +64,7 @@ def test_a_step_has_three_times_the_work_of_an_image() -> None:
     for architecture, times in (("cnn", 1), ("denoise_4", 2)):
         run = found(architecture=architecture, batch=4, width=16)
         network = settings(architecture=architecture, width=16).network
-        image = 2e9 * sum(part.gmacs for part in summary(spec_of(16), network))
+        image = 2e9 * sum(part.gmacs for part in summarise(spec_of(16), network))
         assert 2.9 * times < run.work.flops / image < 3.0 * times
         assert run.step_flops == 4 * run.work.flops
 
@@ -99,7 +99,7 @@ def test_memory_grows_with_pixels_batch_and_precision_and_the_state_is_five_time
 def test_the_time_of_a_whole_batch_is_that_of_the_timed_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(dry_run, "SECONDS", 1e-6)
     took = iter([5.0, 2.0, 9.0, 4.0, 3.0])  # first and second of one, whose time is not theirs, and three that count
-    monkeypatch.setattr(dry_run, "_seconds", lambda *_: next(took))
+    monkeypatch.setattr(dry_run, "_time_step", lambda *_: next(took))
     run = found(batch=8, max_steps=100)
     assert (run.timed.samples, run.timed.steps, run.timed.step_s) == (1, 3, 8 * 4.0)
     assert run.seconds == 100 * 8 * 4.0
@@ -116,8 +116,8 @@ def test_a_batch_that_fits_is_timed_whole() -> None:
 def test_the_paper_takes_the_work_of_its_convolutions() -> None:
     """62.1 GMAC forward at 256² [method 2], three times that in a step: of 150 000 steps of 32 are 1.8 · 10¹⁸."""
     spec = load_spec("room").model_copy(update={"film": load_spec("room").film.model_copy(update={"width": 64})})
-    scene, paper = MadeUpScene.of(spec), settings_of("paper", {"device": "cpu"})
-    work = dry_run.counted(Learner(scene, paper), scene.batch(1, paper))
+    scene, paper = MadeUpScene.of(spec), make_settings("paper", {"device": "cpu"})
+    work = dry_run.count_work(Learner(scene, paper), scene.batch(1, paper))
     assert 16 * work.flops == pytest.approx(3 * 2 * 62.1e9, rel=0.03)
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from photonfarm.core.errors import StoreError
 from photonfarm.trainer.metrics import InceptionWeights, find_weights, load_inception
-from photonfarm.trainer.metrics.inception import network_input
+from photonfarm.trainer.metrics.inception import prepare_images
 
 SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
 
@@ -39,7 +39,7 @@ def test_pool3_is_that_of_the_published_network_and_does_not_depend_on_the_batch
         warnings.simplefilter("ignore", DeprecationWarning)
         original = torch.jit.load(file)
     with torch.no_grad():
-        expected = original(network_input(images)).numpy()
+        expected = original(prepare_images(images)).numpy()
     together, apart = inception.features(images), inception.features(images, batch=2)
     assert tuple(block.shape for block in together.blocks) == ((3, 64), (3, 192), (3, 768), (3, 2048))
     assert np.linalg.norm(together.pool3 - expected) < 1e-5 * np.linalg.norm(expected)
@@ -58,9 +58,9 @@ def test_the_packages_file_is_found_without_importing_the_package() -> None:
 
 def test_images_are_scaled_bilinearly_without_aligned_corners_to_minus_1_to_1() -> None:
     ramp = torch.linspace(0, 1, 4)[None, None, :, None].expand(1, 2, 4, 3)
-    row = network_input(ramp)[0, 0, 0]
+    row = prepare_images(ramp)[0, 0, 0]
     centre = ((np.arange(299) + 0.5) * 4 / 299 - 0.5).clip(0, 3)
-    assert network_input(ramp).shape == (1, 3, 299, 299)
+    assert prepare_images(ramp).shape == (1, 3, 299, 299)
     assert row.numpy() == pytest.approx(2 * np.interp(centre, range(4), np.linspace(0, 1, 4)) - 1, abs=1e-5)
 
 

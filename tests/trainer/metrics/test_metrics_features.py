@@ -16,9 +16,9 @@ from photonfarm.trainer.metrics import (
     InceptionWeights,
     feature_l1,
     fid,
-    image_metrics,
     kid,
     load_inception,
+    measure_images,
     metric_space,
 )
 from photonfarm.trainer.metrics.fid import ROWS
@@ -191,7 +191,7 @@ def test_feature_l1_is_the_mean_absolute_difference_of_each_image_and_block() ->
 
 def test_a_row_holds_every_metric_per_image_with_intervals_and_is_json() -> None:
     references = _rooms(4)
-    found = image_metrics(_noisy(references, 0.3, 1), torch.from_numpy(references), _random_inception())
+    found = measure_images(_noisy(references, 0.3, 1), torch.from_numpy(references), _random_inception())
     assert (found.images, len(found.mse.values), len(found.mssim.values), len(found.flip.values)) == (4, 4, 4, 4)
     assert found.feature_l1 is not None
     assert [len(block.values) for block in found.feature_l1] == [4] * 4
@@ -212,7 +212,7 @@ def test_a_row_holds_every_metric_per_image_with_intervals_and_is_json() -> None
 
 def test_more_noise_is_worse_in_every_column() -> None:
     references, inception = _rooms(3), _random_inception()
-    low, high = (image_metrics(_noisy(references, strength, 2), references, inception) for strength in (0.1, 0.6))
+    low, high = (measure_images(_noisy(references, strength, 2), references, inception) for strength in (0.1, 0.6))
     assert low.mse.estimate.mean < high.mse.estimate.mean
     assert low.mssim.estimate.mean > high.mssim.estimate.mean
     assert low.flip.estimate.mean < high.flip.estimate.mean
@@ -230,7 +230,7 @@ def test_more_noise_is_worse_in_every_column() -> None:
 
 def test_equal_images_have_no_error() -> None:
     references = _rooms(3)
-    columns = image_metrics(references, references, _random_inception()).columns()
+    columns = measure_images(references, references, _random_inception()).columns()
     assert {name: float(value) for name, value in columns.items()} == {
         "MSE": 0,
         "MSSIM": 1,
@@ -243,21 +243,21 @@ def test_equal_images_have_no_error() -> None:
 
 def test_without_weights_the_columns_of_inception_say_so() -> None:
     references = _rooms(4)
-    found = image_metrics(_noisy(references, 0.3, 3), references, None)
+    found = measure_images(_noisy(references, 0.3, 3), references, None)
     assert (found.feature_l1, found.fid, found.kid, found.inception) == (None, None, None, None)
     assert {name for name, value in found.columns().items() if value == "n/a"} == {"FID", "KID", "Feature L1"}
     assert json.loads(json.dumps(asdict(found), allow_nan=False))["fid"] is None
 
 
 def test_two_images_have_no_fid_but_all_else() -> None:
-    found = image_metrics(_rooms(2), _rooms(2, seed=1), _random_inception())
+    found = measure_images(_rooms(2), _rooms(2, seed=1), _random_inception())
     assert (found.fid, found.kid) == (None, None)
     assert found.feature_l1 is not None
 
 
 def test_intervals_are_over_groups_where_they_are_named() -> None:
     references = _rooms(4)
-    found = image_metrics(_noisy(references, 0.3, 4), references, None, groups=["a", "a", "b", "b"])
+    found = measure_images(_noisy(references, 0.3, 4), references, None, groups=["a", "a", "b", "b"])
     assert (found.mse.estimate.count, len(found.mse.values)) == (2, 4)
 
 
@@ -265,7 +265,7 @@ def test_a_row_of_images_that_are_not_numbers_is_refused() -> None:
     spoilt = _rooms(2)
     spoilt[1] = np.nan
     with pytest.raises(SpecError):
-        image_metrics(spoilt, _rooms(2), None)
+        measure_images(spoilt, _rooms(2), None)
 
 
 def test_with_the_published_weights_noise_shows_in_fid_and_feature_l1_as_it_grows() -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from photonfarm.core.errors import SpecError
-from photonfarm.trainer.metrics import confidence_interval, flip, image_metrics, metric_space, mse, mssim
+from photonfarm.trainer.metrics import confidence_interval, flip, measure_images, metric_space, mse, mssim
 from photonfarm.trainer.metrics.image_metrics import CHUNK, PerImage, t_975
 
 
@@ -85,7 +85,7 @@ def test_of_what_was_made_from_half_a_the_noise_is_taken_out_as_well() -> None:
 
 def test_images_are_taken_a_few_at_a_time_and_all_of_them() -> None:
     images, wanted, a, b = (_pictures(2 * CHUNK + 3, (16, 16), seed) for seed in range(4))
-    found = image_metrics(images, wanted, None, None, (a, b), having_seen_a=True)
+    found = measure_images(images, wanted, None, None, (a, b), having_seen_a=True)
     expected = mse(metric_space(images), metric_space(a), metric_space(b), having_seen_a=True)
     assert found.mse.values == pytest.approx(expected.tolist())
     assert len(found.mssim.values) == len(found.flip.values) == 2 * CHUNK + 3

@@ -6,11 +6,11 @@ import torch
 from read_batches import batch_of
 
 from photonfarm.core.statistics import Estimate, clean_error, clean_error_having_seen_a
-from photonfarm.trainer.data.batch import TrainingBatch, kept_pixels
+from photonfarm.trainer.data.batch import TrainingBatch, choose_kept_pixels
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.inputs import Needs, SceneFrame
-from photonfarm.trainer.predict.evaluation import batches, measure
+from photonfarm.trainer.predict.evaluation import measure, read_batches
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 DENOISERS = {"denoise_1": 1, "denoise_4": 4, "denoise_16": 16, "denoise_32": 32, "denoise_64": 64}
@@ -33,7 +33,7 @@ def test_a_denoiser_sees_the_kept_pixels_of_half_a_and_nothing_else_of_the_image
     settings = NetworkSettings(width=4, architecture=architecture)
     network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
     sample = source.read(0)
-    kept = kept_pixels(sample.key, source.spec, DENOISERS[architecture])
+    kept = choose_kept_pixels(sample.key, source.spec, DENOISERS[architecture])
 
     def image() -> torch.Tensor:
         with torch.no_grad():
@@ -50,17 +50,17 @@ def test_a_denoiser_sees_the_kept_pixels_of_half_a_and_nothing_else_of_the_image
 
 def test_the_pixels_kept_follow_from_what_the_sample_is(make_source) -> None:
     source, again = make_source(3), make_source(3)
-    kept = [kept_pixels(source.read(row).key, source.spec, 4) for row in range(3)]
-    assert all(np.array_equal(kept[row], kept_pixels(again.read(row).key, again.spec, 4)) for row in range(3))
+    kept = [choose_kept_pixels(source.read(row).key, source.spec, 4) for row in range(3)]
+    assert all(np.array_equal(kept[row], choose_kept_pixels(again.read(row).key, again.spec, 4)) for row in range(3))
     assert not np.array_equal(kept[0], kept[1])
-    fewer = kept_pixels(source.read(0).key, source.spec, 16)
+    fewer = choose_kept_pixels(source.read(0).key, source.spec, 16)
     assert not (fewer & ~kept[0]).any()
 
 
 def test_pixels_are_kept_uniformly(make_source) -> None:
     """Binomial over 400 samples, the largest of 256 pixels: |z| < 4.5 has a chance of 0.998."""
     source = make_source(400)
-    times = sum(kept_pixels(source.read(row).key, source.spec, 4).astype(int) for row in range(400))
+    times = sum(choose_kept_pixels(source.read(row).key, source.spec, 4).astype(int) for row in range(400))
     assert np.abs(times - 100).max() < 4.5 * np.sqrt(400 * 3 / 16)
 
 
@@ -105,7 +105,7 @@ def test_a_predictor_that_is_not_trained_is_fed_what_it_needs_and_measured_like_
 
     source = make_source(60)
     with Feed(source, tiny(), needs=Needs(points=False, kept=4)) as feed:
-        found = measure(predict, batches(feed, range(60), 3))
+        found = measure(predict, read_batches(feed, range(60), 3))
     constants = [source.clean(row).mean(axis=(0, 1)) for row in range(60)]
     least = np.mean([np.mean((source.clean(row) - constants[row]) ** 2) for row in range(60)])
     assert found.error.standard_error < 0.3 * least

@@ -4,7 +4,7 @@ import pytest
 
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
-from photonfarm.trainer.networks.summary import NetworkPart, summary, table
+from photonfarm.trainer.networks.summary import NetworkPart, format_summary, summarise
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 
@@ -15,7 +15,7 @@ def spec_of(size: int, points: int = 16384) -> SceneSpec:
 
 
 def parts(size: int = 64, points: int = 16384, **settings: object) -> dict[str, NetworkPart]:
-    return {part.name: part for part in summary(spec_of(size, points), NetworkSettings(**settings))}
+    return {part.name: part for part in summarise(spec_of(size, points), NetworkSettings(**settings))}
 
 
 def test_the_papers_network_has_its_published_size_and_work() -> None:
@@ -67,7 +67,7 @@ def test_the_points_set_are_those_counted() -> None:
 
 
 def test_the_table_ends_with_the_sum() -> None:
-    lines = table([NetworkPart("point branch", 1000, 0.25), NetworkPart("U-Net", 2_000_000, 1.0)]).splitlines()
+    lines = format_summary([NetworkPart("point branch", 1000, 0.25), NetworkPart("U-Net", 2_000_000, 1.0)]).splitlines()
     assert lines[0].split() == ["part", "parameters", "GMAC"]
     assert lines[2].split() == ["U-Net", "2,000,000", "1.000"]
     assert lines[3].split() == ["total", "2,001,000", "1.250"]

@@ -11,7 +11,7 @@ from read_batches import batch_of
 from photonfarm.scene.view import Camera
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.inputs import SceneFrame
-from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gathered, seen_area
+from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gather_light, seen_area
 from photonfarm.trainer.networks.projection import Footprint, Optics
 from photonfarm.trainer.runs.settings import NetworkSettings
 
@@ -47,7 +47,7 @@ def test_a_surface_seen_edge_on_is_left_out_with_what_lands_on_it() -> None:
     area = seen_area(optics, camera, depth, edge_on.expand(1, 8, 8, 3))
     assert torch.all(area[0, 3:5, 3:5] == 0)
     kept = Footprint(point=torch.tensor([0]), pixel=torch.tensor([3 * 8 + 3]))
-    assert all(torch.count_nonzero(found) == 0 for found in gathered(torch.ones(1, 1, 3), kept, area))
+    assert all(torch.count_nonzero(found) == 0 for found in gather_light(torch.ones(1, 1, 3), kept, area))
 
 
 def test_light_on_the_far_side_of_a_sheet_is_not_what_the_eye_sees() -> None:
@@ -92,7 +92,7 @@ def test_flux_and_area_are_summed_over_the_same_pixels() -> None:
     flux = flux.reshape(B, H, W, 3) * (area.numpy() > 0)[..., None]
     besides = [max(round(0.5 * (share * W - 1)), 1) for share in WINDOWS]
     assert besides == [1, 2]
-    for found, beside in zip(gathered(power, kept, area), besides, strict=True):
+    for found, beside in zip(gather_light(power, kept, area), besides, strict=True):
         along_v, along_u = (np.linalg.matrix_power(box(n, beside), 3) for n in (H, W))
         summed = np.einsum("vy,ux,byxc->bvuc", along_v, along_u, flux)
         seen = np.einsum("vy,ux,byx->bvu", along_v, along_u, area.numpy())[..., None]

@@ -190,10 +190,10 @@ def test_what_cannot_be_shown_is_refused(
             infer.show_frames(store, network, buffers, tmp_path / "out")
     monkeypatch.setattr(infer, "is_installed", lambda _: False)
     with pytest.raises(SpecError, match=r"buffers --scene .* --orbit 3"):
-        infer.rendered_frames(store, run, ["--orbit", "3"])
+        infer.render_frames(store, run, ["--orbit", "3"])
     monkeypatch.undo()
     with pytest.raises(PhotonfarmError) as error:
-        infer.rendered_frames(store, run, ["--orbit", "0"])
+        infer.render_frames(store, run, ["--orbit", "0"])
     assert error.value.exit_code == 2
     for show in (
         lambda: infer.show_sample(tmp_path, run, 7, tmp_path / "out"),

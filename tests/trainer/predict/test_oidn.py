@@ -11,7 +11,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predict.denoisers import Oidn, fill_in
-from photonfarm.trainer.predict.evaluation import batches, measure
+from photonfarm.trainer.predict.evaluation import measure, read_batches
 
 pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
 
@@ -39,7 +39,7 @@ def test_it_is_measured_on_a_store_like_any_predictor_and_better_than_what_it_is
             given_images.update(zip(batch.rows, images, strict=True))
             return images
 
-        before, after = (measure(p, batches(feed, range(count), 3)) for p in (filled, remembered))
+        before, after = (measure(p, read_batches(feed, range(count), 3)) for p in (filled, remembered))
     assert after.error.mean < 0.7 * before.error.mean if of == 1 else after.error.mean < before.error.mean
     truth = np.array([np.mean((given_images[row] - source.clean(row)) ** 2) for row in range(count)])
     difference = after.per_sample - truth

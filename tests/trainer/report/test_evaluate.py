@@ -21,13 +21,25 @@ from photonfarm.scene.modification import sample_modification
 from photonfarm.store import SceneReader, SceneStore
 from photonfarm.store.read.merge import MergedView, merge_view
 from photonfarm.trainer.compare.evaluate import compare
-from photonfarm.trainer.compare.evaluation_page import COMPARISON, EVALUATION, comparison, evaluation_text, notes
+from photonfarm.trainer.compare.evaluation_page import (
+    COMPARISON,
+    EVALUATION,
+    draw_comparison,
+    format_evaluation,
+    list_notes,
+)
 from photonfarm.trainer.compare.evaluation_samples import References
-from photonfarm.trainer.data.batch import kept_count, kept_pixels
+from photonfarm.trainer.data.batch import choose_kept_pixels, count_kept
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics import find_weights, metric_space, mse
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS, WARM_ROUNDS, DevicePredictor, batches, by_turns
+from photonfarm.trainer.predict.evaluation import (
+    TIMED_ROUNDS,
+    WARM_ROUNDS,
+    DevicePredictor,
+    read_batches,
+    time_by_turns,
+)
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.training.loop import train
 
@@ -151,7 +163,7 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     """One half A of a view of 2 passes is a quarter of its reference."""
     runs = [trained("run", network={"width": 4, "architecture": "denoise_4"})]
     found = compare(store, runs, references=references, most=4)
-    foot = evaluation_text(found).split("\n\n")[-1]
+    foot = format_evaluation(found).split("\n\n")[-1]
     assert f"references: of {found.references.views} views, of {found.references.spp} samples per pixel" in foot
     assert f"or more; intervals over their {found.units} configurations; of so few they are wide" in foot
     assert "not converged, which takes 4096" in foot
@@ -162,10 +174,10 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
         assert f"FID of {found.references.views} images: below 2048" in foot
         assert "the published ones" in foot
     bare = replace(found, rows=tuple(replace(row, metrics=replace(row.metrics, inception=None)) for row in found.rows))
-    assert "no weights of the Inception network are installed" in notes(bare)[-1]
+    assert "no weights of the Inception network are installed" in list_notes(bare)[-1]
     converged = replace(found, references=replace(found.references, spp=4096))
-    assert notes(converged)[1].endswith("; converged")
-    head = evaluation_text(found).split("\n\n")[0]
+    assert list_notes(converged)[1].endswith("; converged")
+    head = format_evaluation(found).split("\n\n")[0]
     assert head.startswith("analytic: 4 held-out views of 4 configurations, one sample of each; noise")
 
 
@@ -178,7 +190,7 @@ def test_the_pictures_stand_side_by_side_in_one_exposure(
     run = trained("run")
     for folder, first in ((None, "radiance"), (references, "reference")):
         found = compare(store, [run], [("none", 1)], references=folder, most=5)
-        sheet = comparison(found)
+        sheet = draw_comparison(found)
         assert sheet.shape[1] == 3 * 256 + 2 * 8
         assert len({reader.modification_key(target.row) for target in found.shown}) == len(found.shown) == 4
         for place, target in enumerate(reversed(found.shown)):
@@ -201,15 +213,18 @@ def test_a_chosen_row_is_shown_once_and_the_document_says_which_row_each_picture
     chosen = [first[1], other, first[0], other]
     found = compare(store, [run], references=references, without_inception=True, choose=lambda *_: chosen)
     assert found.document()["shown"] == [*first, other]
-    assert comparison(found).shape[0] == comparison(replace(found, shown=found.shown[:4])).shape[0] + 256 + 18 + 8
+    assert (
+        draw_comparison(found).shape[0]
+        == draw_comparison(replace(found, shown=found.shown[:4])).shape[0] + 256 + 18 + 8
+    )
 
 
 def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
     """One of 256 is one pixel of 256, and one of 257 is none."""
     source = make_source(3)
-    assert kept_pixels(source.read(0).key, source.spec, 256).sum() == kept_count(source.spec, 256) == 1
+    assert choose_kept_pixels(source.read(0).key, source.spec, 256).sum() == count_kept(source.spec, 256) == 1
     with pytest.raises(SpecError):
-        kept_pixels(source.read(0).key, source.spec, 257)
+        choose_kept_pixels(source.read(0).key, source.spec, 257)
 
 
 @pytest.mark.parametrize(
@@ -241,12 +256,12 @@ def test_predictors_are_timed_by_turns_after_rounds_that_do_not_count(make_sourc
 
     predictors = [predictor("a", 0.0), predictor("b", 0.05)]
     with Feed(make_source(3), tiny(), needs=Needs(points=False)) as feed:
-        batch = next(batches(feed, [0], 1))
+        batch = next(read_batches(feed, [0], 1))
         pairs = [(predict, predict.of_its_own(batch.inputs)) for predict in predictors]
         kept = pairs[0][1].albedo.clone()
         batch.inputs.albedo.zero_()
         assert torch.equal(pairs[0][1].albedo, kept), "the feed's memory is used again"
-    a, b = by_turns(pairs)
+    a, b = time_by_turns(pairs)
     assert calls == ["a", "b"] * (WARM_ROUNDS + TIMED_ROUNDS)
     assert 0.01 <= a.low <= a.median <= a.high < 0.3
     assert 0.06 <= b.low <= b.median <= b.high < 0.35
@@ -256,8 +271,8 @@ def test_without_references_only_the_linear_error_is_given(store: Path, trained)
     found = compare(store, [trained("run")], most=3)
     assert found.samples == 3
     assert found.references is found.rows[0].metrics is None
-    assert "MSSIM" not in evaluation_text(found)
-    assert "no references: the columns of the paper need them" in notes(found)[-1]
+    assert "MSSIM" not in format_evaluation(found)
+    assert "no references: the columns of the paper need them" in list_notes(found)[-1]
     assert found.document()["rows"][0]["metric_space"] is None
 
 

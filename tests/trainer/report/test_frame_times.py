@@ -8,7 +8,7 @@ import pytest
 from photonfarm.core.archives import PARTS, FrameCosts, Seconds
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.report import write_report as report_of
-from photonfarm.trainer.report.frame_times import frame_time, points_used
+from photonfarm.trainer.report.frame_times import assemble_frame_time, count_points
 
 
 def test_frames_are_timed_where_the_renderer_can_and_else_it_is_said_why(measured, tmp_path) -> None:
@@ -26,29 +26,31 @@ def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measur
     kept = np.array([1, 4])
     costs = FrameCosts("0" * 32, np.array([3]), surface, **parts, kept=kept, render_s=np.array([[5.0], [2.0]]))
     network = Seconds(1.0, 0.9, 1.1)
-    assert frame_time(TrainedRun.load(transport), network, costs).total == pytest.approx(1.0 + 0.1 + 0.2)
-    of_denoiser = frame_time(TrainedRun.load(denoiser), network, costs)
+    assert assemble_frame_time(TrainedRun.load(transport), network, costs).total == pytest.approx(1.0 + 0.1 + 0.2)
+    of_denoiser = assemble_frame_time(TrainedRun.load(denoiser), network, costs)
     assert of_denoiser.total == pytest.approx(1.0 + 0.1 + 2.0)
     assert of_denoiser.document()["ranges"] == {"render": [2.0, 2.0], "buffers": [0.1, 0.1], "network": [0.9, 1.1]}
     settings = TrainedRun.load(transport).settings
-    assert frame_time(ReadyPredictor("none", 1, settings), network, costs).total == pytest.approx(1.0 + 0.1 + 5.0)
+    assert assemble_frame_time(ReadyPredictor("none", 1, settings), network, costs).total == pytest.approx(
+        1.0 + 0.1 + 5.0
+    )
     with_photons = replace(
         TrainedRun.load(transport),
         settings=settings.model_copy(
             update={"network": settings.network.model_copy(update={"architecture": "light_transport_photons"})}
         ),
     )
-    assert frame_time(with_photons, network, costs).total == pytest.approx(1.0 + 0.1 + 0.2 + 0.4 + 0.8)
+    assert assemble_frame_time(with_photons, network, costs).total == pytest.approx(1.0 + 0.1 + 0.2 + 0.4 + 0.8)
 
 
 def test_points_are_charged_as_many_as_a_network_uses(measured) -> None:
     _, (transport, denoiser), _ = measured
     runs = [TrainedRun.load(transport), TrainedRun.load(denoiser)]
-    assert points_used(runs) is points_used(runs[1:]) is None, "it uses all, or there is none that uses any"
+    assert count_points(runs) is count_points(runs[1:]) is None, "it uses all, or there is none that uses any"
 
     def with_points(count: int) -> TrainedRun:
         settings = runs[0].settings
         network = settings.network.model_copy(update={"points": count})
         return replace(runs[0], settings=settings.model_copy(update={"network": network}))
 
-    assert points_used([with_points(64), with_points(128), runs[1]]) == 128
+    assert count_points([with_points(64), with_points(128), runs[1]]) == 128

@@ -30,13 +30,13 @@ from photonfarm.trainer.compare.evaluate import PredictorRow
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report as report_of
-from photonfarm.trainer.report.contents import MOVABLE_LIGHTS, gathered
+from photonfarm.trainer.report.contents import MOVABLE_LIGHTS, gather_contents
 from photonfarm.trainer.report.frame_times import FrameTime
-from photonfarm.trainer.report.plots import Plot, plots
+from photonfarm.trainer.report.plots import Plot, draw_plots
 from photonfarm.trainer.report.tables import Table
-from photonfarm.trainer.report.trained_runs import RunStory, short_names
+from photonfarm.trainer.report.trained_runs import RunStory, shorten_names
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.progress import bottleneck
+from photonfarm.trainer.runs.progress import find_bottleneck
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, SETTINGS
 from photonfarm.trainer.training.loop import Hooks, train
 
@@ -73,7 +73,7 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     waited_s, total_s = of_run["seconds"]["wait_data"], sum(of_run["seconds"].values())
     assert 0.35 < waited_s < total_s, "of the first job, at least, there was nothing but to wait"
     assert of_run["waits"]["samples"] == pytest.approx(waited_s / total_s, abs=1e-4)
-    assert of_run["bottleneck"] == bottleneck(of_run["waits"])
+    assert of_run["bottleneck"] == find_bottleneck(of_run["waits"])
     assert of_run["samples_per_used"] == 1.0
     assert of_run["trained_on"] == 40 - 2 * figures["evaluation"]["samples"]
     assert of_run["curve"][-1]["used"] == of_run["trained_on"], "120 draws of fewer than 40 samples"
@@ -163,7 +163,7 @@ def test_a_folder_that_cannot_be_written_is_found_before_anything_is_measured(
     make_source, tiny, run, tmp_path, monkeypatch
 ) -> None:
     train(make_source(24), tiny(max_steps=1), run)
-    monkeypatch.setattr("photonfarm.trainer.report.gathered", lambda *_, **__: pytest.fail("it was measured"))
+    monkeypatch.setattr("photonfarm.trainer.report.gather_contents", lambda *_, **__: pytest.fail("it was measured"))
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file/further"):
         with pytest.raises(StoreError):
@@ -225,7 +225,7 @@ def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_th
     """The table's order is not that of the times, by which points are drawn."""
     store, runs, references = measured
     loaded = [TrainedRun.load(run) for run in runs]
-    contents = gathered(store, loaded, [("fill-in", 4)], references=references, inception=None, timed=False)
+    contents = gather_contents(store, loaded, [("fill-in", 4)], references=references, inception=None, timed=False)
     second = Seconds(1.0, 1.0, 1.0)
     alike = [Seconds(buffers, buffers, buffers) for buffers in (3.0, 2.0, 1.0)]
     times = (FrameTime(None, buffers, None, None, None, second) for buffers in alike)
@@ -240,9 +240,9 @@ def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_th
         return Plot(name, about, b"")
 
     module = importlib.import_module("photonfarm.trainer.report.plots")
-    monkeypatch.setattr(module, "_drawn", kept)
+    monkeypatch.setattr(module, "_draw", kept)
     monkeypatch.setattr(module, "FEW", 1)
-    plots(replace(contents, entries=entries))
+    draw_plots(replace(contents, entries=entries))
     colours = {name: of_axes(axes) for name, axes in drawn.items()}
     assert list(colours["time-mse"]) == ["light_transport", "denoise_4", "fill-in 1/4"]
     assert len(set(colours["time-mse"].values())) == 3
@@ -326,11 +326,11 @@ def test_a_run_s_versions_are_those_it_was_trained_with_and_threads_count_as_cor
 def test_runs_are_called_by_what_tells_them_apart(measured) -> None:
     _, (transport, denoiser), _ = measured
     runs = [TrainedRun.load(transport), TrainedRun.load(denoiser)]
-    assert short_names(runs) == ["light_transport", "denoise_4"]
+    assert shorten_names(runs) == ["light_transport", "denoise_4"]
     again = replace(runs[0], folder=runs[0].folder.parent / "again")
-    assert short_names([runs[0], again]) == ["light_transport", "again"]
+    assert shorten_names([runs[0], again]) == ["light_transport", "again"]
     elsewhere = replace(runs[0], folder=Path("elsewhere/light_transport"))
-    assert short_names([runs[0], elsewhere]) == [str(runs[0].folder), "elsewhere/light_transport"]
+    assert shorten_names([runs[0], elsewhere]) == [str(runs[0].folder), "elsewhere/light_transport"]
 
 
 class _Balance(HTMLParser):

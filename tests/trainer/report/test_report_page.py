@@ -16,17 +16,17 @@ from photonfarm.store import SceneReader
 from photonfarm.trainer.predict.evaluation import HeldOutErrors
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report import write_report
-from photonfarm.trainer.report.contents import ReportContents, gathered
-from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, half_floats, light_data
-from photonfarm.trainer.report.tables import facts
-from photonfarm.trainer.report.views import Layer, ShownView, light, shown_views
+from photonfarm.trainer.report.contents import ReportContents, gather_contents
+from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, encode_half_floats, encode_light
+from photonfarm.trainer.report.tables import list_facts
+from photonfarm.trainer.report.views import Layer, ShownView, choose_views, make_light_layer
 
 
 @pytest.fixture
 def contents(measured) -> ReportContents:
     """Of one run, without references."""
     store, runs, _ = measured
-    return gathered(store, [TrainedRun.load(runs[0])], [], references=None, inception=None, timed=False)
+    return gather_contents(store, [TrainedRun.load(runs[0])], [], references=None, inception=None, timed=False)
 
 
 def errors(*per_sample: float) -> HeldOutErrors:
@@ -52,7 +52,7 @@ def judged(
 def test_a_report_on_joined_samples_names_the_store_that_they_are_from(contents) -> None:
     joined = {"kind": "join", "store": "5f3a"}
     of_both = replace(contents, card=replace(contents.card, requests=[*contents.card.requests, joined]))
-    assert "plan 1: samples of store 5f3a, joined" in dict(facts(of_both))["seeds"]
+    assert "plan 1: samples of store 5f3a, joined" in dict(list_facts(of_both))["seeds"]
 
 
 def test_the_verdict_follows_from_the_numbers(contents) -> None:
@@ -85,7 +85,7 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
 def test_without_references_the_verdict_says_so_and_with_them_what_they_show(contents, measured) -> None:
     store, runs, references = measured
     assert "no references" in Verdict.of(contents).further[-1]
-    more = gathered(store, [TrainedRun.load(runs[0])], [], references=references, inception=None, timed=False)
+    more = gather_contents(store, [TrainedRun.load(runs[0])], [], references=references, inception=None, timed=False)
     mssim = more.entries[0].row.metrics.mssim.estimate.mean
     assert f"{mssim:.3f}" in Verdict.of(more).further[-1]
     assert Verdict.of(more).sentence == Verdict.of(contents).sentence
@@ -111,7 +111,7 @@ def test_the_page_holds_the_light_of_the_store_to_the_bit(measured, scene, tmp_p
 
 
 def test_the_inputs_are_shown_with_guides_where_the_network_reads_them_and_these_show_something(contents) -> None:
-    assert [layer.name for layer in shown_views(contents)[0].inputs] == ["albedo", "normal", "depth"]
+    assert [layer.name for layer in choose_views(contents)[0].inputs] == ["albedo", "normal", "depth"]
     film = contents.card.spec.film
     ramp = np.linspace(0, 1, film.height * film.width, dtype=np.float32).reshape(film.height, film.width, 1)
     shapes = {field.name: (film.height, film.width, 3) for field in fields(Guides)}
@@ -120,7 +120,7 @@ def test_the_inputs_are_shown_with_guides_where_the_network_reads_them_and_these
     inputs = {row: (buffers, guides) for row, (buffers, _) in contents.inputs.items()}
     spec = contents.card.spec.model_copy(update={"exposure": 4.0})
     given = replace(contents, inputs=inputs, card=replace(contents.card, spec=spec))
-    layers = {layer.name: layer for layer in shown_views(given)[0].inputs}
+    layers = {layer.name: layer for layer in choose_views(given)[0].inputs}
     assert list(layers) == ["albedo", "normal", "depth", "direct light", "roughness"]
     np.testing.assert_array_equal(layers["direct light"].light, 4 * guides.direct)
     assert layers["roughness"].light is None
@@ -129,16 +129,16 @@ def test_the_inputs_are_shown_with_guides_where_the_network_reads_them_and_these
 def test_large_films_are_reduced_and_light_that_does_not_fit_is_left_out() -> None:
     rng = np.random.default_rng(0)
     image = rng.random((16, 512, 3), np.float32)
-    reduced = np.frombuffer(base64.b64decode(half_floats(image)), "<f2").reshape(8, 256, 3)
+    reduced = np.frombuffer(base64.b64decode(encode_half_floats(image)), "<f2").reshape(8, 256, 3)
     means = image.reshape(8, 2, 256, 2, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(reduced, means, rtol=1e-3)
-    bright = np.frombuffer(base64.b64decode(half_floats(np.full((1, 1, 3), 1e9, np.float32))), "<f2")
+    bright = np.frombuffer(base64.b64decode(encode_half_floats(np.full((1, 1, 3), 1e9, np.float32))), "<f2")
     assert bright.tolist() == [LARGEST_HALF] * 3
     square = rng.random((256, 256, 3), np.float32)
-    layers = tuple(light(name, name, square) for name in ("noisy half", "prediction", "reference"))
+    layers = tuple(make_light_layer(name, name, square) for name in ("noisy half", "prediction", "reference"))
     of_data = Layer("normal", "normal", layers[0].picture)
     views = [ShownView(row, "", "reference", (*layers, of_data), (), 0.0) for row in range(3)]
-    held = light_data(views)
+    held = encode_light(views)
     assert [list(each) for each in held] == [["noisy half"]] * 3, "of every view the same, and no more than fits"
     assert sum(len(text) for each in held for text in each.values()) <= MOST_LIGHT
 

@@ -7,7 +7,7 @@ import pytest
 
 from photonfarm.core.archives import Surface
 from photonfarm.core.records import ViewBuffers
-from photonfarm.trainer.report.views import caption as caption_of
+from photonfarm.trainer.report.views import write_caption as caption_of
 from photonfarm.trainer.report.worst_cases import (
     ALL,
     KINDS,
@@ -15,12 +15,12 @@ from photonfarm.trainer.report.worst_cases import (
     NEAR,
     HeldOutView,
     WorstCase,
-    caption,
-    kinds,
-    shadow_edges,
-    squared_error,
-    thin_objects,
-    worst_cases,
+    compute_squared_error,
+    find_shadow_edges,
+    find_thin_objects,
+    find_worst_cases,
+    list_kinds,
+    name_kinds,
 )
 
 SIZE = 16
@@ -53,7 +53,7 @@ def test_the_view_is_named_in_which_the_pixels_of_a_kind_cost_most_together() ->
         view(2, 0.20, (slice(0, 8), slice(None)), surface=mirror(8)),
         view(3, 0.70, (slice(4, 16), slice(None)), surface=mirror(2)),
     ]
-    found = {case.kind: case for case in worst_cases(views)}
+    found = {case.kind: case for case in find_worst_cases(views)}
     assert found["mirrors and clear glass"].row == 2
     assert found["mirrors and clear glass"].pixels == 0.5
     assert found["mirrors and clear glass"].mse == pytest.approx((0.45 ** (1 / 2.2) - 0.25 ** (1 / 2.2)) ** 2, rel=1e-4)
@@ -62,14 +62,14 @@ def test_the_view_is_named_in_which_the_pixels_of_a_kind_cost_most_together() ->
 
 def test_one_view_may_be_the_worst_of_several_kinds_and_a_kind_that_no_view_shows_is_not_named() -> None:
     views = [view(1, 0.5, surface=mirror(8)), view(2, 0.1, surface=mirror(8))]
-    found = worst_cases(views)
+    found = find_worst_cases(views)
     assert [(case.kind, case.row) for case in found] == [("mirrors and clear glass", 1), ("all pixels", 1)]
-    assert worst_cases([]) == []
+    assert find_worst_cases([]) == []
 
 
 def test_a_caption_names_all_kinds_that_a_view_is_the_worst_of() -> None:
-    assert caption(["near surfaces"]) == "worst view of near surfaces"
-    assert caption(KINDS) == (
+    assert name_kinds(["near surfaces"]) == "worst view of near surfaces"
+    assert name_kinds(KINDS) == (
         "worst view of mirrors and clear glass, specular surfaces, near surfaces, fine shadows, thin objects "
         "and all pixels"
     )
@@ -85,15 +85,15 @@ def test_the_view_of_median_error_is_not_called_the_worst_of_all_pixels() -> Non
 
 
 def test_without_the_renderer_s_surfaces_the_other_kinds_are_found() -> None:
-    assert "mirrors and clear glass" not in dict(kinds(view(1, surface=None), close=1.0))
-    assert [case.kind for case in worst_cases([view(1, 0.3, surface=None)])] == ["all pixels"]
+    assert "mirrors and clear glass" not in dict(list_kinds(view(1, surface=None), close=1.0))
+    assert [case.kind for case in find_worst_cases([view(1, 0.3, surface=None)])] == ["all pixels"]
 
 
 def test_what_is_nearer_than_most_that_is_seen_is_close_to_the_camera() -> None:
     near = view(1).buffers.depth.copy()
     near[:2] = 0.5
     near[15] = 0  # nothing is there
-    masks = dict(kinds(view(1, buffers=replace(view(1).buffers, depth=near)), close=1.0))
+    masks = dict(list_kinds(view(1, buffers=replace(view(1).buffers, depth=near)), close=1.0))
     assert masks["near surfaces"].sum() == 2 * SIZE
 
 
@@ -103,8 +103,8 @@ def test_the_noise_of_the_reference_is_no_error_on_average() -> None:
     noisy = [
         replace(clean, half_a=a, half_b=b) for a, b in rng.uniform(0.2, 0.3, (400, 2, SIZE, SIZE, 3)).astype(np.float32)
     ]
-    with_noise = np.mean([(squared_error(replace(v, half_b=v.half_a))).mean() for v in noisy])
-    without = np.array([squared_error(v).mean() for v in noisy])
+    with_noise = np.mean([(compute_squared_error(replace(v, half_b=v.half_a))).mean() for v in noisy])
+    without = np.array([compute_squared_error(v).mean() for v in noisy])
     assert with_noise > 1e-4
     assert abs(without.mean()) < 4 * without.std() / 20 + 2e-6  # what is left is the display's curve
 
@@ -129,14 +129,14 @@ def test_a_step_of_light_is_a_shadow_s_edge_unless_something_else_steps_there(wh
         buffers["albedo"][:] = 0
     image = wall.half_a if what == "nothing" else shadow
     stepped = replace(wall, half_a=image, half_b=image, buffers=ViewBuffers(**buffers))
-    assert shadow_edges(stepped).sum() == expected
+    assert find_shadow_edges(stepped).sum() == expected
 
 
 def test_a_step_in_one_half_of_the_reference_or_in_opposite_ways_is_noise() -> None:
     wall, shadow = view(1), np.full((SIZE, SIZE, 3), 0.4, np.float32)
     shadow[:, 8:] = 0.1
-    assert shadow_edges(replace(wall, half_a=shadow)).sum() == 0
-    assert shadow_edges(replace(wall, half_a=shadow, half_b=shadow[:, ::-1])).sum() == 0
+    assert find_shadow_edges(replace(wall, half_a=shadow)).sum() == 0
+    assert find_shadow_edges(replace(wall, half_a=shadow, half_b=shadow[:, ::-1])).sum() == 0
 
 
 def test_thin_objects_are_a_few_pixels_wide_and_nearer_than_both_sides() -> None:
@@ -146,4 +146,4 @@ def test_thin_objects_are_a_few_pixels_wide_and_nearer_than_both_sides() -> None
     depth[12:14, :4] = 0  # a hole
     wanted = np.zeros((SIZE, SIZE), np.bool_)
     wanted[:, 4:6] = True
-    np.testing.assert_array_equal(thin_objects(depth), wanted)
+    np.testing.assert_array_equal(find_thin_objects(depth), wanted)

@@ -7,7 +7,7 @@ from held_out_errors import held_out_errors
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.devices import described, round_convolutions, usable_device
+from photonfarm.trainer.runs.devices import describe_device, round_convolutions, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.loop import train
@@ -18,7 +18,7 @@ HAS_CUDA = torch.cuda.is_available()
 def test_without_a_name_it_is_cuda_where_there_is_one() -> None:
     assert TrainSettings().device == "auto"
     assert usable_device("auto").type == ("cuda" if HAS_CUDA else "cpu")
-    assert described(usable_device("cpu")) == "cpu"
+    assert describe_device(usable_device("cpu")) == "cpu"
 
 
 def test_a_name_that_is_no_device_of_ours_is_refused_with_those_that_are() -> None:
@@ -29,13 +29,13 @@ def test_a_name_that_is_no_device_of_ours_is_refused_with_those_that_are() -> No
 @pytest.mark.parametrize("has", [True, False])
 def test_a_cpu_without_bfloat16_is_said_to_be_slow_at_it(has: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.ops.mkldnn, "_is_mkldnn_bf16_supported", lambda: has)
-    said = described(torch.device("cpu"), "bfloat16")
+    said = describe_device(torch.device("cpu"), "bfloat16")
     assert ("precision = float32" in said) is not has
-    assert described(torch.device("cpu"), "float32") == "cpu"
+    assert describe_device(torch.device("cpu"), "float32") == "cpu"
 
 
 def test_a_cpu_is_said_to_have_no_tf32_and_its_setting_stays_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "in float32 instead" in described(torch.device("cpu"), "tf32")
+    assert "in float32 instead" in describe_device(torch.device("cpu"), "tf32")
     for before in (True, False):
         monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", before)
         round_convolutions(torch.device("cpu"), "tf32")
@@ -74,4 +74,4 @@ def test_on_cuda_a_run_steps_goes_on_and_is_the_cpus_but_for_rounding(
     assert ends[0]["last_error"] == pytest.approx(ends[1]["last_error"], rel=1e-3)
     assert np.isfinite(held_out_errors(lambda: make_source(24, photons=16), run).last)
     assert not torch.backends.cudnn.allow_tf32
-    assert described(usable_device("auto")).startswith("cuda (")
+    assert describe_device(usable_device("auto")).startswith("cuda (")

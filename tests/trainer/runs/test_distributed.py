@@ -23,7 +23,7 @@ from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, 
 from photonfarm.plan.request import Request
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs import devices as processes
-from photonfarm.trainer.runs.devices import Ranks, leading, ranks
+from photonfarm.trainer.runs.devices import Ranks, join_ranks, lead
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import Learner
@@ -45,7 +45,7 @@ def in_both(target: Callable[[Ranks], Any], batch: int = 4) -> list[int | None]:
         told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": SIZE, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": port}
         os.environ.update({name: str(value) for name, value in told.items()})
         try:
-            with ranks("cpu", batch) as group:
+            with join_ranks("cpu", batch) as group:
                 assert group is not None
                 target(group)
         except PhotonfarmError as error:
@@ -66,7 +66,7 @@ def together(make: Callable[[], Any], settings: TrainSettings, run: Path, **how:
         if group.rank:
             assist(lambda *_: make(), settings, run, group)
             return
-        with leading(group):
+        with lead(group):
             train(make(), settings, run, Hooks(group=group, **how))
 
     return in_both(target, settings.batch)
@@ -105,7 +105,7 @@ def test_each_process_reads_its_own_part_and_only_rank_0_what_is_held_out(make_s
         if group.rank:
             assist(lambda *_: source, tiny(batch=4), run, group)
         else:
-            with leading(group):
+            with lead(group):
                 train(source, tiny(batch=4), run, Hooks(group=group))
         (tmp_path / f"{group.rank}.json").write_text(json.dumps(source.reads))
 
@@ -296,7 +296,7 @@ def test_a_run_that_ends_before_there_is_a_scene_ends_for_both(make_source, tiny
 
 def test_a_batch_smaller_than_the_group_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WORLD_SIZE", "4")
-    with pytest.raises(SpecError), ranks("cpu", 3):
+    with pytest.raises(SpecError), join_ranks("cpu", 3):
         pass
 
 

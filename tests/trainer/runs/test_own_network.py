@@ -14,7 +14,7 @@ from photonfarm.store import SceneStore, Store
 from photonfarm.trainer import train
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
-from photonfarm.trainer.training.losses import LOSSES, judged, loss_of
+from photonfarm.trainer.training.losses import LOSSES, find_loss, judge
 
 MODULE = '''
 import torch
@@ -115,16 +115,16 @@ def test_running_means_and_shared_weights_are_kept_and_validated_with(mine: str,
 
 
 def test_every_loss_of_ours_is_found_unbiased_and_a_biased_one_is_refused(mine: str) -> None:
-    verdicts = {name: judged(loss) for name, loss in LOSSES.items()}
+    verdicts = {name: judge(loss) for name, loss in LOSSES.items()}
     assert all(verdict.is_unbiased for verdict in verdicts.values()), verdicts
     assert verdicts["linear"].elsewhere < 5
     assert verdicts["paired"].elsewhere > 10, "its weights are of the noise: its minimum alone is the clean image"
-    loss, verdict = loss_of(f"{mine}:squared")
+    loss, verdict = find_loss(f"{mine}:squared")
     assert verdict is not None
     assert verdict.is_unbiased
     assert loss(torch.ones(1, 1, 1, 3), torch.zeros(1, 2, 1, 1, 3)) == 6
     with pytest.raises(SpecError, match="bias"):
-        loss_of(f"{mine}:absolute")
+        find_loss(f"{mine}:absolute")
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_every_loss_of_ours_is_found_unbiased_and_a_biased_one_is_refused(mine: 
     ],
 )
 def test_losses_that_bias_are_found_out(loss) -> None:
-    assert not judged(loss).is_unbiased
+    assert not judge(loss).is_unbiased
 
 
 @pytest.mark.parametrize(

@@ -12,12 +12,12 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer import service
 from photonfarm.trainer.cli.train_verb import train
-from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, preset, settings_of, small
+from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, make_preset, make_settings, small
 from photonfarm.trainer.training.losses import paired_loss
 
 
 def test_the_papers_presets_are_what_the_supplement_states() -> None:
-    static, dynamic = preset("paper-static"), preset("paper-dynamic")
+    static, dynamic = make_preset("paper-static"), make_preset("paper-dynamic")
     assert (static.batch, dynamic.batch) == (128, 32)
     for settings in (static, dynamic):
         assert (settings.network.width, settings.network.points) == (64, 16384)
@@ -27,7 +27,7 @@ def test_the_papers_presets_are_what_the_supplement_states() -> None:
 
 
 def test_the_preset_paper_is_the_supplement_to_the_letter() -> None:
-    settings = preset("paper")
+    settings = make_preset("paper")
     network = {"architecture": "light_transport", "width": 64, "maxima": "absolute", "octaves": 0, "demodulation": None}
     projection = {"occlusion": "window", "occlusion_tolerance": 1e-3}
     assert settings.network.model_dump(include={*network, *projection}) == network | projection
@@ -38,10 +38,10 @@ def test_the_preset_paper_is_the_supplement_to_the_letter() -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_what_is_asked_for_comes_before_what_a_preset_says(name: str) -> None:
-    found = preset(name, network={"architecture": "cnn"}, batch=5)
+    found = make_preset(name, network={"architecture": "cnn"}, batch=5)
     assert (found.network.architecture, found.batch) == ("cnn", 5)
-    assert found.network.width == preset(name).network.width
-    assert found.max_steps == preset(name).max_steps
+    assert found.network.width == make_preset(name).network.width
+    assert found.max_steps == make_preset(name).max_steps
 
 
 def test_values_that_are_not_allowed_are_refused() -> None:
@@ -51,13 +51,13 @@ def test_values_that_are_not_allowed_are_refused() -> None:
         ("photons = 'transport'", {"photons": "transport"}),
     ):
         with pytest.raises(ValidationError, match=named):
-            preset("small", network=network)
+            make_preset("small", network=network)
 
 
 def test_the_paired_loss_needs_the_half_that_a_denoiser_is_given() -> None:
-    assert preset("small", loss="paired").loss == "paired"
+    assert make_preset("small", loss="paired").loss == "paired"
     with pytest.raises(ValidationError):
-        preset("small", network={"architecture": "denoise_16"}, loss="paired")
+        make_preset("small", network={"architecture": "denoise_16"}, loss="paired")
     image = torch.zeros(1, 2, 2, 3)
     with pytest.raises(ValueError, match="1 half"):
         paired_loss(image, image[:, None])
@@ -69,7 +69,7 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> list[TrainSettings]:
     found: list[TrainSettings] = []
 
     def run(spec, store, run, preset_name, changes, redis_url, **_) -> None:
-        found.append(settings_of(preset_name, changes))
+        found.append(make_settings(preset_name, changes))
 
     monkeypatch.setattr(service, "run", run)
     return found
@@ -90,7 +90,7 @@ def test_the_configuration_file_chooses_them_as_well(chosen: list[TrainSettings]
     file.write_text('[train]\npreset = "paper-dynamic"\narchitecture = "light_transport_photons"\n')
     found = CliRunner().invoke(umbrella, ["--config", str(file), "train"])
     assert found.exit_code == 0, found.output
-    assert chosen == [preset("paper-dynamic", network={"architecture": "light_transport_photons"})]
+    assert chosen == [make_preset("paper-dynamic", network={"architecture": "light_transport_photons"})]
 
 
 def test_any_setting_is_set_by_its_key_and_its_own_option_comes_first(
@@ -116,7 +116,7 @@ def test_any_setting_is_set_by_its_key_and_its_own_option_comes_first(
     file = tmp_path / "photonfarm.toml"
     file.write_text('[train]\nbatch = 7\n[train.set]\nwidth = 8\nocclusion = "window"\nprefetch = 3\n')
     assert CliRunner().invoke(umbrella, ["--config", str(file), "train"]).exit_code == 0
-    assert chosen[1] == preset("small", network={"width": 8, "occlusion": "window"}, batch=7, prefetch=3)
+    assert chosen[1] == make_preset("small", network={"width": 8, "occlusion": "window"}, batch=7, prefetch=3)
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_a_default_that_the_help_states_as_a_number_is_that_of_every_preset() ->
     stated = 0
     for option in train.params:
         if found := re.search(r"\[default: ([\d.]+)\]", getattr(option, "help", None) or ""):
-            for settings in map(preset, PRESETS):
+            for settings in map(make_preset, PRESETS):
                 value = getattr(settings, str(option.name), None)
                 assert value == float(found[1]), option.name
                 assert option.name != "decay" or settings.schedule == "epochs"

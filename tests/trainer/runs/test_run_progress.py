@@ -12,7 +12,7 @@ from photonfarm.core.pictures import display
 from photonfarm.farm.training import PROGRESS, VIEWS, RunFolder
 from photonfarm.trainer.runs import progress as progress_module
 from photonfarm.trainer.runs import run_folder
-from photonfarm.trainer.runs.progress import RunProgress, followed
+from photonfarm.trainer.runs.progress import RunProgress, follow_progress
 from photonfarm.trainer.runs.run_folder import MOST, write_views
 from photonfarm.trainer.training.loop import Hooks, train
 
@@ -40,7 +40,7 @@ def test_the_last_line_is_of_the_last_step(run: Path) -> None:
     run.mkdir()
     for samples in (0, 24):
         progress = RunProgress(20, batch=4)
-        with followed(progress, run, said.append):
+        with follow_progress(progress, run, said.append):
             progress.drawn(4 * samples, samples)
     assert said == ["step 24 (20 wanted), 24 samples have arrived"], "and none where nothing has arrived"
 
@@ -53,7 +53,7 @@ def test_a_line_comes_every_five_seconds_and_others_read_the_file_meanwhile(
     said: list[str] = []
     run.mkdir()
     progress = RunProgress(100, batch=1)
-    with followed(progress, run, said.append):
+    with follow_progress(progress, run, said.append):
         progress.drawn(30, 50)
         end = time.monotonic() + 10
         while len(said) < 2 and time.monotonic() < end:

@@ -13,7 +13,7 @@ from photonfarm.trainer.cli import train_verb as cli
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.checkpoint import read_settings
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, held
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, lock_run
 from photonfarm.trainer.runs.settings import NetworkSettings
 from photonfarm.trainer.training.loop import train
 
@@ -49,7 +49,7 @@ def test_a_log_that_holds_something_else_is_named(make_source, tiny, run, line: 
     with (run / METRICS).open("a") as file:
         file.write(f"{line}\n")
     with pytest.raises(StoreError):
-        run_folder.read(run / METRICS)
+        run_folder.read_log(run / METRICS)
     with pytest.raises(StoreError, match="remove that line"):
         train(make_source(24), tiny(max_steps=3), run)
     assert checkpoint.load(run / CHECKPOINT)["step"] == 2
@@ -63,11 +63,11 @@ def test_weights_alone_are_no_checkpoint_to_go_on_from(make_source, tiny, run) -
 
 
 def test_a_trainer_that_is_refused_leaves_the_sign_of_life_of_the_one_at_work(run) -> None:
-    with service._sign_of_life(run), held(run):
-        with service._sign_of_life(run):
+    with service._give_sign_of_life(run), lock_run(run):
+        with service._give_sign_of_life(run):
             pass
         service.check(run)
-    with service._sign_of_life(run):
+    with service._give_sign_of_life(run):
         pass
     with pytest.raises(IncompleteError):
         service.check(run)
@@ -125,7 +125,7 @@ def test_a_single_configuration_needs_more(make_source, tiny, run) -> None:
 
 
 def test_a_run_has_one_trainer_at_a_time(make_source, tiny, run) -> None:
-    with held(run), pytest.raises(StoreError):
+    with lock_run(run), pytest.raises(StoreError):
         train(make_source(24), tiny(), run)
     assert train(make_source(24), tiny(max_steps=1), run).step == 1
 

@@ -27,7 +27,7 @@ def accumulated(run: Path) -> Any:
 
 
 def trained(source: Any, settings: Any, run: Path, then: Callable[[dict[str, Any]], None] = lambda _: None) -> None:
-    with boards.event_files(run) as board:
+    with boards.open_event_files(run) as board:
         train(
             source,
             settings,
@@ -44,7 +44,7 @@ def test_a_run_shows_its_records_and_pictures(make_source, tiny, run, monkeypatc
 
     monkeypatch.setattr(loop, "LOG_EVERY", 10)
     trained(make_source(24), tiny(), run)
-    events, records = accumulated(run), run_folder.read(run / METRICS)
+    events, records = accumulated(run), run_folder.read_log(run / METRICS)
     told = [r for r in records if r["kind"] == "validation"]
     found = events.Scalars("error/held out")
     assert [(e.step, e.value) for e in found] == [(r["step"], pytest.approx(r["error"])) for r in told]
@@ -80,13 +80,13 @@ def test_what_was_shown_up_to_an_end_stays_when_the_run_goes_on(make_source, tin
 
 def test_a_run_that_goes_back_shows_what_is_left_of_its_rate(make_source, tiny, run) -> None:
     trained(make_source(48), tiny(learning_rate=0.05, max_steps=30), run)
-    halved = [r for r in run_folder.read(run / METRICS) if r["kind"] == "recovered"]
+    halved = [r for r in run_folder.read_log(run / METRICS) if r["kind"] == "recovered"]
     found = accumulated(run).Scalars("optimiser/rate factor")
     assert [(e.step, e.value) for e in found] == [(r["step"], r["rate_factor"]) for r in halved] != []
 
 
 def test_without_tensorboard_nothing_is_written(run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(boards, "find_spec", lambda _: None)
-    with boards.event_files(run) as board:
+    with boards.open_event_files(run) as board:
         assert board is None
     assert not run.exists()

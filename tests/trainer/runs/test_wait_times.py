@@ -9,7 +9,7 @@ import pytest
 
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.runs import checkpoint, run_folder
-from photonfarm.trainer.runs.progress import Stopwatch, bottleneck, samples_per_used, stated, wait_shares
+from photonfarm.trainer.runs.progress import Stopwatch, divide_by_used, find_bottleneck, format_waits, share_waits
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.training.loop import Hooks, train
 
@@ -27,11 +27,11 @@ BEFORE = {"train": 10.0, "validate": 5.0, "wait_data": 100.0, "wait_read": 1.0}
 )
 def test_what_most_of_the_time_since_goes_to_is_the_bottleneck(spent: dict[str, float], slow: str) -> None:
     now = {name: value + spent.get(name, 0.0) for name, value in BEFORE.items()}
-    shares = wait_shares(now, BEFORE)
+    shares = share_waits(now, BEFORE)
     assert shares["samples"] == pytest.approx(spent.get("wait_data", 0) / sum(spent.values()), abs=1e-4)
     assert shares["reading"] == pytest.approx(spent.get("wait_read", 0) / sum(spent.values()), abs=1e-4)
-    assert bottleneck(shares) == slow
-    assert f"{slow} is the bottleneck" in stated(shares, 1.0)
+    assert find_bottleneck(shares) == slow
+    assert f"{slow} is the bottleneck" in format_waits(shares, 1.0)
 
 
 def test_at_any_moment_time_goes_to_one_kind_and_all_kinds_together_are_the_wall_time() -> None:
@@ -54,12 +54,12 @@ def test_at_any_moment_time_goes_to_one_kind_and_all_kinds_together_are_the_wall
 
 
 def test_before_any_time_has_gone_by_nothing_has_been_waited_for() -> None:
-    assert bottleneck(wait_shares(BEFORE, BEFORE)) == "training"
+    assert find_bottleneck(share_waits(BEFORE, BEFORE)) == "training"
 
 
 @pytest.mark.parametrize(("samples", "draws", "each"), [(100, 0, 100.0), (100, 40, 2.5), (100, 4000, 1.0), (0, 0, 0)])
 def test_samples_for_each_used_are_what_ahead_is_compared_with(samples: int, draws: int, each: float) -> None:
-    assert samples_per_used(samples, draws) == each
+    assert divide_by_used(samples, draws) == each
 
 
 def test_a_run_that_waits_for_rendering_says_so_with_each_validation(
@@ -69,8 +69,8 @@ def test_a_run_that_waits_for_rendering_says_so_with_each_validation(
     train(make_source(24), tiny(max_steps=1), tmp_path / "before")  # a process' first run takes as long to begin
     source = make_scarce(60, lot=12, patience=30)
     scarce = tiny(max_steps=10, replay_ratio=1.0, replay_buffer=0, poll_seconds=0.02)
-    train(source, scarce, run, Hooks(on_record=show.record, on_draws=source.count))
-    records = run_folder.read(run / METRICS)
+    train(source, scarce, run, Hooks(on_record=show.print_record, on_draws=source.count))
+    records = run_folder.read_log(run / METRICS)
     told = [r for r in records if r["kind"] == "validation"]
     waited = [r["seconds"]["wait_data"] for r in told if r["step"] % 5 == 0]
     assert min(np.diff([0, *waited])) > 0.4
@@ -78,7 +78,7 @@ def test_a_run_that_waits_for_rendering_says_so_with_each_validation(
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == len(told)
     for line, record in zip(lines, told, strict=True):
-        assert f"{bottleneck(record['waits'])} is the bottleneck" in line
+        assert f"{find_bottleneck(record['waits'])} is the bottleneck" in line
         assert f"waited {record['waits']['samples']:.1%} of the time for samples" in line
     assert "samples there for each used (--ahead)" in lines[-1]
 
@@ -95,8 +95,8 @@ def test_a_run_that_waits_for_reading_says_so(make_source, tiny, run) -> None:
     source: Any = make_source(24)
     source.read_samples = slowed(source.read_samples, 0.3)
     train(source, tiny(validate_every=100), run)
-    last = run_folder.read(run / METRICS)[-1]
-    assert bottleneck(wait_shares(last["seconds"])) == "reading"
+    last = run_folder.read_log(run / METRICS)[-1]
+    assert find_bottleneck(share_waits(last["seconds"])) == "reading"
 
 
 def test_what_is_no_training_is_counted_as_what_it_is_and_not_as_waiting(
@@ -109,7 +109,7 @@ def test_what_is_no_training_is_counted_as_what_it_is_and_not_as_waiting(
     began = time.monotonic()
     train(source, tiny(), run, Hooks(on_record=slowed(lambda _: None, 0.2)))
     wall_s = time.monotonic() - began
-    seconds = run_folder.read(run / METRICS)[-1]["seconds"]
+    seconds = run_folder.read_log(run / METRICS)[-1]["seconds"]
     assert seconds["start"] >= 0.5 + 0.3, "the weights at the beginning are saved as well"
     assert seconds["save"] >= 3 * 0.3
     assert seconds["other"] >= 4 * 0.2

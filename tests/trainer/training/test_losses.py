@@ -17,10 +17,10 @@ from read_batches import batch_of
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.inputs import Needs, SceneFrame
-from photonfarm.trainer.predict.evaluation import network_predictor
+from photonfarm.trainer.predict.evaluation import make_network_predictor
 from photonfarm.trainer.runs import settings
-from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, settings_of
-from photonfarm.trainer.training.learner import build_optimiser, rate_at
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, make_settings
+from photonfarm.trainer.training.learner import build_optimiser, compute_rate
 from photonfarm.trainer.training.loop import train
 
 BENCH = Path(__file__).parents[3] / "bench"
@@ -59,7 +59,7 @@ def test_what_biases_under_noisy_targets_is_refused_with_the_reason(
     key: str, value: object, reason: settings.BiasReason
 ) -> None:
     with pytest.raises(SpecError, match=f"{key} = {value!r}: .*{re.escape(reason.why)}"):
-        settings_of("small", {key: value})
+        make_settings("small", {key: value})
 
 
 @pytest.mark.parametrize(
@@ -75,13 +75,13 @@ def test_what_biases_under_noisy_targets_is_refused_with_the_reason(
 )
 def test_other_values_get_the_ordinary_message(changes: dict[str, object], named: str) -> None:
     with pytest.raises(SpecError, match=named) as error:
-        settings_of("small", changes)
+        make_settings("small", changes)
     assert "bias" not in str(error.value)
 
 
 def test_every_fault_is_named_at_once() -> None:
     with pytest.raises(SpecError, match=r"max_grad_norm = 1.*loss = 'l1'"):
-        settings_of("small", {"loss": "l1", "max_grad_norm": 1})
+        make_settings("small", {"loss": "l1", "max_grad_norm": 1})
 
 
 def test_the_figures_of_the_messages_are_those_that_the_benchmark_measures(firefly: ModuleType) -> None:
@@ -129,7 +129,7 @@ def test_both_optimisers_take_their_settings() -> None:
 def test_the_rate_falls_with_every_epoch_of_samples_whatever_the_batch() -> None:
     for batch in (1, 5, 10):
         settings = TrainSettings(batch=batch, epoch_samples=100, learning_rate=1e-3, decay=0.5)
-        assert [rate_at(samples // batch, settings) for samples in (0, 90, 100, 250)] == [1e-3, 1e-3, 5e-4, 2.5e-4]
+        assert [compute_rate(samples // batch, settings) for samples in (0, 90, 100, 250)] == [1e-3, 1e-3, 5e-4, 2.5e-4]
 
 
 # --------------------------------------------------------------------------------------------------------- demodulation
@@ -145,7 +145,9 @@ def test_a_demodulated_network_is_the_same_network_times_the_albedo(make_source,
     )
     assert list(plain.state_dict()) == list(demodulated.state_dict())
     factor = batch.inputs.albedo.numpy() + np.float32(0.05)
-    np.testing.assert_array_equal(network_predictor(demodulated)(batch), network_predictor(plain)(batch) * factor)
+    np.testing.assert_array_equal(
+        make_network_predictor(demodulated)(batch), make_network_predictor(plain)(batch) * factor
+    )
 
 
 def test_a_demodulated_network_is_trained_and_evaluated_on_its_images(make_source, tiny, run) -> None:

@@ -20,7 +20,7 @@ from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.write.lease import lease
 from photonfarm.store.write.withdrawal import forget
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.devices import leading, ranks
+from photonfarm.trainer.runs.devices import join_ranks, lead
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training import other_ranks
@@ -61,7 +61,7 @@ class Trainer:
         told = {"RANK": rank, "LOCAL_RANK": rank, "WORLD_SIZE": size, "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": 29641}
         os.environ.update({name: str(value) for name, value in told.items()})
         source = SceneReader(self._scene.storage.root, self._scene.scene_id)
-        with ranks("cpu", self._settings.batch) as group, stop_on_signals() as stop:
+        with join_ranks("cpu", self._settings.batch) as group, stop_on_signals() as stop:
             how = {} if group is None else {"group": group}
             hooks = Hooks(stop=stop, on_wait=self._note, on_draws=lambda *_: time.sleep(0.05), **how)
             if group is None:
@@ -69,7 +69,7 @@ class Trainer:
             elif group.rank:
                 assist(lambda *_: source, self._settings, self._run, group)
             else:
-                with leading(group):
+                with lead(group):
                     train(source, self._settings, self._run, hooks)
 
     def _note(self, sentence: str) -> None:

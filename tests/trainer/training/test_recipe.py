@@ -9,13 +9,13 @@ import torch
 from held_out_errors import held_out_errors
 
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.predict.evaluation import batches
+from photonfarm.trainer.predict.evaluation import read_batches
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
 from photonfarm.trainer.runs.settings import PRESETS, TrainSettings
 from photonfarm.trainer.training import loop
-from photonfarm.trainer.training.learner import rate_at
+from photonfarm.trainer.training.learner import compute_rate
 from photonfarm.trainer.training.loop import train
 
 Weights = dict[str, torch.Tensor]
@@ -39,7 +39,7 @@ def test_presets_have_the_supplements_schedule_and_no_average(name: str) -> None
 
 def test_the_cosine_rises_in_equal_parts_and_falls_to_nothing_at_the_last_step() -> None:
     settings = TrainSettings(schedule="cosine", warm_up=0.1, max_steps=100, learning_rate=2.0, decay=0.1)
-    rates = [rate_at(step, settings) for step in range(101)]
+    rates = [compute_rate(step, settings) for step in range(101)]
     assert rates[:10] == pytest.approx([0.2 * step for step in range(1, 11)])
     assert rates[10] == 2.0
     assert rates[55] == pytest.approx(1.0), "half of it in the middle of the 90 steps"
@@ -52,15 +52,15 @@ def test_the_cosine_rises_in_equal_parts_and_falls_to_nothing_at_the_last_step()
 @pytest.mark.parametrize(("warm_up", "first"), [(0.0, 1.0), (0.03, 1.0), (0.5, 0.2), (0.99, 1 / 9)])
 def test_the_first_step_is_never_of_rate_zero(warm_up: float, first: float) -> None:
     settings = TrainSettings(schedule="cosine", warm_up=warm_up, max_steps=10, learning_rate=1.0)
-    assert rate_at(0, settings) == pytest.approx(first)
-    assert rate_at(9, settings) > 0
+    assert compute_rate(0, settings) == pytest.approx(first)
+    assert compute_rate(9, settings) > 0
 
 
 def test_a_run_that_goes_on_with_more_steps_follows_the_schedule_of_these(make_source, tiny, run, monkeypatch) -> None:
     monkeypatch.setattr(loop, "LOG_EVERY", 1)
     for steps in (4, 8):
         train(make_source(24), tiny(schedule="cosine", warm_up=0.25, max_steps=steps, learning_rate=1e-3), run)
-    rates = [record["rate"] for record in run_folder.read(run / METRICS) if record["kind"] == "train"]
+    rates = [record["rate"] for record in run_folder.read_log(run / METRICS) if record["kind"] == "train"]
     shares = [1, 1, 0.75, 0.25]  # of 4 steps, of which one is the rise
     shares += [(1 + np.cos(np.pi * part / 6)) / 2 for part in (2, 3, 4, 5)]  # of 8, of which two are
     assert rates == pytest.approx([1e-3 * share for share in shares])
@@ -89,7 +89,7 @@ def test_whatever_predicts_from_a_run_has_its_averaged_weights(make_source, tiny
     assert held_out_errors(lambda: make_source(24), run).last == pytest.approx(outcome.last_error, rel=1e-6)
     with Feed(make_source(24), trained.settings) as feed:
         base, rows = (feed.geometry, feed.cloud), [row for row, held in feed.arrivals()[0] if held]
-        batch = next(batches(feed, rows, 3))
+        batch = next(read_batches(feed, rows, 3))
         network = trained.network(feed.spec, base)
         network.load_state_dict(found["raw"])
         images = trained.predictor(feed.spec, base, "cpu")(batch)

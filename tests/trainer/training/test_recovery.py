@@ -22,14 +22,14 @@ from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, METRICS
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.validation import NEXT, UP_TO_WHITE, BestValidation, Validation, compared, validate
+from photonfarm.trainer.training.validation import NEXT, UP_TO_WHITE, BestValidation, Validation, compare, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
 
 
 def records(run: Path, kind: str) -> list[dict[str, Any]]:
-    return [record for record in run_folder.read(run / METRICS) if record["kind"] == kind]
+    return [record for record in run_folder.read_log(run / METRICS) if record["kind"] == kind]
 
 
 def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Validation:
@@ -72,7 +72,7 @@ def as_if(monkeypatch: pytest.MonkeyPatch, errors: dict[int, Sequence[float]]) -
 
 def test_a_validation_is_held_against_the_best_over_the_rows_of_both() -> None:
     """The mean over all rows has doubled, and on those that were there before it has fallen."""
-    found = compared(validation({0: 0.9, 1: 1.9, 2: 9.0, 3: 9.0}), best({0: 1.0, 1: 2.0, 7: 0.0}))
+    found = compare(validation({0: 0.9, 1: 1.9, 2: 9.0, 3: 9.0}), best({0: 1.0, 1: 2.0, 7: 0.0}))
     assert (found.error, found.best) == pytest.approx((1.4, 1.5))
     assert found.is_best
     assert not found.is_worse
@@ -81,7 +81,7 @@ def test_a_validation_is_held_against_the_best_over_the_rows_of_both() -> None:
 def test_views_of_a_configuration_are_averaged_first() -> None:
     """Rows 0, 1 | 2, 3 | 4: the mean over configurations, and its standard error over three pairs."""
     before = dict.fromkeys(range(5), 1.0)
-    found = compared(validation({0: 2.0, 1: 4.0, 2: 2.0, 3: 2.0, 4: 1.0}, views=2), best(before))
+    found = compare(validation({0: 2.0, 1: 4.0, 2: 2.0, 3: 2.0, 4: 1.0}, views=2), best(before))
     assert (found.error, found.best) == (2.0, 1.0)
     assert found.difference == Estimate.of(np.array([2.0, 1.0, 0.0]))
 
@@ -101,22 +101,22 @@ def test_worse_is_by_more_than_a_tenth_and_clearly_so_beyond_two_standard_errors
     now: list[float], worse: bool, clearly: bool
 ) -> None:
     with np.errstate(invalid="ignore"):
-        found = compared(validation(dict(enumerate(now))), best(dict.fromkeys(range(4), 1.0)))
+        found = compare(validation(dict(enumerate(now))), best(dict.fromkeys(range(4), 1.0)))
     assert (found.is_worse, found.is_clearly_worse) == (worse, clearly)
 
 
 def test_of_a_single_configuration_nothing_is_clear_but_what_is_not_finite() -> None:
-    found = compared(validation({0: 50.0, 1: 70.0}, views=2), best({0: 1.0, 1: 1.0}))
+    found = compare(validation({0: 50.0, 1: 70.0}, views=2), best({0: 1.0, 1: 1.0}))
     assert found.is_worse
     assert not found.is_clearly_worse
-    assert compared(validation({0: math.nan}), best({0: 1.0})).is_clearly_worse
+    assert compare(validation({0: math.nan}), best({0: 1.0})).is_clearly_worse
 
 
 def test_where_no_row_of_the_best_was_measured_again_the_best_begins_anew() -> None:
-    found = compared(validation({5: 50.0, 6: 70.0}), best({0: 1.0, 1: 1.0}))
+    found = compare(validation({5: 50.0, 6: 70.0}), best({0: 1.0, 1: 1.0}))
     assert found.is_best
     assert not found.is_worse
-    assert not compared(validation({5: math.nan}), None).is_best
+    assert not compare(validation({5: math.nan}), None).is_best
 
 
 def test_lamps_that_got_worse_are_not_held_against_a_run_whose_loss_cares_little_for_them() -> None:
@@ -128,7 +128,7 @@ def test_lamps_that_got_worse_are_not_held_against_a_run_whose_loss_cares_little
 
     for loss, worse in [("linear", True), ("relative", False), ("paired", False)]:
         was = at(batch, before, loss)
-        assert compared(at(batch, learned, loss), BestValidation(0, was.errors, was.judge)).is_worse is worse
+        assert compare(at(batch, learned, loss), BestValidation(0, was.errors, was.judge)).is_worse is worse
     assert at(batch, learned, "relative").held_out.shown == pytest.approx(0.0)
     assert at(batch, before, "relative").held_out.shown == pytest.approx(0.01 * 15 / 16)
 
@@ -140,7 +140,7 @@ def test_noise_does_not_make_a_dark_network_look_better_than_the_right_one() -> 
     right, dark = (np.full((1, 64, 64, 3), value, np.float32) for value in (0.3, 0.15))
     batch = batch_of(halves[:1], halves[1:])
     was = at(batch, dark, "relative")
-    found = compared(at(batch, right, "relative"), BestValidation(0, was.errors, was.judge))
+    found = compare(at(batch, right, "relative"), BestValidation(0, was.errors, was.judge))
     assert found.is_best
     assert found.best == pytest.approx(0.15**2, rel=0.2)
 
@@ -163,8 +163,8 @@ def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_whi
     older = {"step": 4, "rows": torch.tensor([0]), "errors": torch.tensor([0.5], dtype=torch.float64)}
     now = replace(validation({0: 50.0}), judge=UP_TO_WHITE)
     for by_pixels in ({}, {"by_shown": True}):  # as older versions wrote it
-        assert compared(now, BestValidation.of({**older, **by_pixels})).is_best
-    assert compared(now, BestValidation.of(BestValidation(4, {0: 0.5}, judge=UP_TO_WHITE).state())).is_worse
+        assert compare(now, BestValidation.of({**older, **by_pixels})).is_best
+    assert compare(now, BestValidation.of(BestValidation(4, {0: 0.5}, judge=UP_TO_WHITE).state())).is_worse
 
 
 # ----------------------------------------------------------------------------------------------------------------- runs
@@ -173,7 +173,7 @@ def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_whi
 def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
     make_source, tiny, run, tmp_path, capsys
 ) -> None:
-    outcome = train(make_source(48), tiny(**TOO_HIGH), run, Hooks(on_record=show.record))
+    outcome = train(make_source(48), tiny(**TOO_HIGH), run, Hooks(on_record=show.print_record))
     without = train(make_source(48), tiny(**TOO_HIGH, recover=False), tmp_path / "without")
     assert outcome.step == 30
     assert outcome.last_error < 1e-3 * without.last_error
@@ -279,8 +279,8 @@ def test_a_run_that_ends_worse_than_it_was_ends_with_the_last_good_weights_and_s
     train(make_source(24), tiny(max_steps=5), tmp_path / "five")
     noisy = [1.5, 0.1, 0.5]
     as_if(monkeypatch, {0: [1.0] * 3, 5: [0.5] * 3, 10: noisy, 12: noisy})
-    train(make_source(24), tiny(), run, Hooks(on_record=show.record))
-    told = [(r["kind"], r["step"]) for r in run_folder.read(run / METRICS)]
+    train(make_source(24), tiny(), run, Hooks(on_record=show.print_record))
+    told = [(r["kind"], r["step"]) for r in run_folder.read_log(run / METRICS)]
     assert told[2:] == [("validation", 10), ("validation", 12), ("recovered", 12), ("validation", 12), ("end", 12)]
     (found,) = records(run, "recovered")
     assert (found["cause"], found["back_to"], found["rate_factor"], found["recoveries"]) == ("end", 5, 1.0, 0)

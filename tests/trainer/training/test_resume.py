@@ -93,7 +93,7 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
         assert ended_by(lambda how=how: train(make_source(24), settings, killed, Hooks(**how))) == -signal.SIGKILL
     train(make_source(24), settings, killed)
     assert_same(run, killed)
-    logs = [[(r["kind"], r["step"]) for r in run_folder.read(folder / METRICS)] for folder in (run, killed)]
+    logs = [[(r["kind"], r["step"]) for r in run_folder.read_log(folder / METRICS)] for folder in (run, killed)]
     assert logs[0] == logs[1]
     assert ("recovered" in [kind for kind, _ in logs[0]]) == ("learning_rate" in recipe)
     assert not (killed / NEXT).exists()
@@ -170,7 +170,7 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_repeats_from_its_log_howev
     growing.join()
     train(SceneReader(root, scene_id), tiny(**how), killed)
 
-    first = run_folder.read(killed / METRICS)[0]
+    first = run_folder.read_log(killed / METRICS)[0]
     state = checkpoint.load(killed / CHECKPOINT)
     assert first["samples"] < 40 == state["store"]["samples"]
     assert len(state["store"]["plans"]) == 2

@@ -19,7 +19,7 @@ from photonfarm.trainer import service
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.data.batch_stream import Growth
 from photonfarm.trainer.runs import checkpoint, run_folder
-from photonfarm.trainer.runs.devices import described, usable_device
+from photonfarm.trainer.runs.devices import describe_device, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, small
 from photonfarm.trainer.training import loop
@@ -93,7 +93,7 @@ def test_a_store_that_is_empty_at_first_is_trained_on_as_it_grows(make_source, t
     source.refresh = refresh
     settings = tiny(replay_ratio=1.0, replay_buffer=0)
     outcome = train(source, settings, run, Hooks(on_draws=lambda *_: begun.set()))
-    records = run_folder.read(run / METRICS)
+    records = run_folder.read_log(run / METRICS)
     assert outcome.step == 12
     assert records[0]["kind"] == "validation"
     assert records[0]["step"] == 0
@@ -125,7 +125,7 @@ def test_draws_come_up_to_the_replay_ratio_and_no_further_while_more_is_to_come(
 
 def test_validation_comes_first_then_regularly_and_at_the_end(make_source, tiny, run) -> None:
     outcome = train(make_source(24), tiny(), run)
-    found = [r for r in run_folder.read(run / METRICS) if r["kind"] == "validation"]
+    found = [r for r in run_folder.read_log(run / METRICS) if r["kind"] == "validation"]
     assert [r["step"] for r in found] == [0, 5, 10, 12]
     assert outcome.last_error == found[-1]["error"]
     assert all(r["noise_floor"] > 0 and r["standard_error"] > 0 for r in found)
@@ -188,15 +188,15 @@ def test_a_loss_that_is_not_finite_ends_a_run_with_nothing_to_go_back_to_and_kee
 def test_what_a_run_logged_up_to_its_end_stays_where_it_goes_on(make_source, tiny, run) -> None:
     """A last validation stays too: one that is due at no other step, and one where nothing is left to do."""
     train(make_source(24), tiny(), run)
-    ended = run_folder.read(run / METRICS)
+    ended = run_folder.read_log(run / METRICS)
     assert [(r["kind"], r["step"]) for r in ended[-2:]] == [("validation", 12), ("end", 12)]
     train(make_source(24), tiny(max_steps=15), run)
-    longer = run_folder.read(run / METRICS)
+    longer = run_folder.read_log(run / METRICS)
     assert longer[: len(ended)] == ended
     told = [(r["kind"], r["step"]) for r in longer[len(ended) :]]
     assert told == [("changes", 12), ("validation", 15), ("end", 15)]
     train(make_source(24), tiny(max_steps=15), run)
-    assert [(r["kind"], r["step"]) for r in run_folder.read(run / METRICS)[len(longer) :]] == [("end", 15)]
+    assert [(r["kind"], r["step"]) for r in run_folder.read_log(run / METRICS)[len(longer) :]] == [("end", 15)]
 
 
 def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny, run) -> None:
@@ -206,20 +206,20 @@ def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny,
     train(make_source(24), tiny(max_steps=1), run)
     (run / CHECKPOINT).unlink()
     train(make_source(24), tiny(max_steps=1, seed=1), run)
-    told = [(r["kind"], r["step"]) for r in run_folder.read(run / METRICS)]
+    told = [(r["kind"], r["step"]) for r in run_folder.read_log(run / METRICS)]
     assert told == [("validation", 0), ("validation", 1), ("end", 1)]
 
 
 def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tiny, run, capsys) -> None:
-    train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=show.record))
-    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=show.record))
-    changed = [record for record in run_folder.read(run / METRICS) if record["kind"] == "changes"]
+    train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=show.print_record))
+    train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=show.print_record))
+    changed = [record for record in run_folder.read_log(run / METRICS) if record["kind"] == "changes"]
     wanted = {"learning_rate": [5e-4, 1e-3], "max_steps": [5, 7]}
     assert changed == [{"kind": "changes", "step": 5, "changes": wanted}]
     said = "settings changed at step 5: learning_rate = 0.001 (before 0.0005), max_steps = 7 (before 5)"
     assert capsys.readouterr().err.splitlines().count(said) == 1
     train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run)
-    assert [r["kind"] for r in run_folder.read(run / METRICS)].count("changes") == 1
+    assert [r["kind"] for r in run_folder.read_log(run / METRICS)].count("changes") == 1
 
 
 def test_time_that_is_up_before_anything_is_held_out_leaves_a_checkpoint(make_source, tiny, run) -> None:
@@ -237,7 +237,7 @@ def test_who_reads_the_log_while_it_is_cut_has_it_whole(tmp_path) -> None:
         log.cut(2)
         log.write("train", step=4)
         assert [json.loads(line)["step"] for line in reader] == [1, 2, 3]
-    assert [record["step"] for record in run_folder.read(path)] == [1, 2, 4]
+    assert [record["step"] for record in run_folder.read_log(path)] == [1, 2, 4]
 
 
 def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path) -> None:
@@ -246,7 +246,7 @@ def test_the_service_waits_for_a_scene_no_longer_than_it_may(run, tmp_path) -> N
     with pytest.raises(IncompleteError, match=r"no scene .* in 0\.3 s; nothing was trained"):
         service.run(*asked, log=told.append, on_record=told.append)
     assert time.monotonic() - began < 5
-    assert told[0] == f"training on {described(usable_device('auto'))}"
+    assert told[0] == f"training on {describe_device(usable_device('auto'))}"
 
 
 def test_a_service_that_is_stopped_while_it_waits_for_a_scene_has_done_what_it_was_asked_for(
@@ -256,7 +256,7 @@ def test_a_service_that_is_stopped_while_it_waits_for_a_scene_has_done_what_it_w
         os.kill(os.getpid(), signal.SIGTERM)
 
     told = []
-    monkeypatch.setattr(service, "_only_scene", signalled)
+    monkeypatch.setattr(service, "_find_only_scene", signalled)
     service.run(None, tmp_path / "store", run, "small", {}, log=told.append, on_record=told.append)
     assert any("no scene" in line for line in told)
     with pytest.raises(IncompleteError):  # for whom "done" would mean that nobody need start it again
@@ -273,5 +273,5 @@ def test_the_service_says_which_scene_it_waits_for(scene, run) -> None:
 def test_the_rate_falls_by_one_percent_with_every_epoch_of_samples(make_source, tiny, run, monkeypatch) -> None:
     monkeypatch.setattr(loop, "LOG_EVERY", 10)
     train(make_source(24), tiny(max_steps=10, batch=2, epoch_samples=4), run)
-    (record,) = [r for r in run_folder.read(run / METRICS) if r["kind"] == "train"]
+    (record,) = [r for r in run_folder.read_log(run / METRICS) if r["kind"] == "train"]
     assert record["rate"] == pytest.approx(5e-4 * 0.99**4)  # steps 0…9 draw samples 0…19: at last epoch 4

@@ -20,10 +20,10 @@ from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.read.other_scenes import other_scenes
 from photonfarm.store.write.scene_store import held as scenes_held
-from photonfarm.trainer.runs.progress import RunProgress, followed
-from photonfarm.trainer.runs.run_folder import held, note_scene_folder, write_views
-from photonfarm.trainer.runs.settings import TrainSettings, settings_of
-from photonfarm.trainer.runs.user_code import named_in_errors
+from photonfarm.trainer.runs.progress import RunProgress, follow_progress
+from photonfarm.trainer.runs.run_folder import lock_run, note_scene_folder, write_views
+from photonfarm.trainer.runs.settings import TrainSettings, make_settings
+from photonfarm.trainer.runs.user_code import name_in_errors
 
 if TYPE_CHECKING:
     from photonfarm.core.records import F32
@@ -63,19 +63,19 @@ def run(
     signal stops it.
     """
     from photonfarm.store import SceneReader
-    from photonfarm.trainer.runs.devices import SINGLE_PROCESS, described, leading, ranks
+    from photonfarm.trainer.runs.devices import SINGLE_PROCESS, describe_device, join_ranks, lead
     from photonfarm.trainer.training.loop import stop_on_signals
     from photonfarm.trainer.training.other_ranks import assist
 
-    settings = settings_of(preset_name, changes)
-    with ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
+    settings = make_settings(preset_name, changes)
+    with join_ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
         group = ours or SINGLE_PROCESS
         device = group.device(settings.device)
         if ours is not None and ours.rank:
             assist(lambda scene_id, exposure: SceneReader(store, scene_id, exposure=exposure), settings, folder, ours)
             return
-        with leading(group):
-            log(f"training on {described(device, settings.network.precision)}")
+        with lead(group):
+            log(f"training on {describe_device(device, settings.network.precision)}")
             loaded = load_spec(spec) if spec else None
             scene_id = loaded.scene_id if loaded else scene_id
             beside = scene_folder(spec, loaded) if spec and loaded else None
@@ -99,21 +99,21 @@ def _lead(
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
     from photonfarm.store import SceneReader
-    from photonfarm.trainer.runs.tensorboard import event_files
+    from photonfarm.trainer.runs.tensorboard import open_event_files
     from photonfarm.trainer.training.loop import Hooks, train
 
-    begun_on, exposure = _begun_on(folder)
+    begun_on, exposure = _read_beginning(folder)
     if scene_id and begun_on and scene_id != begun_on:
         raise SpecError(
             f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
         )
     scene_id = scene_id or begun_on
-    with _sign_of_life(folder), event_files(folder) as board:
+    with _give_sign_of_life(folder), open_event_files(folder) as board:
         note_scene_folder(folder, beside)
         began = time.monotonic()
         if is_vacant(store):
             log(f"waiting for a store and a scene in {store} (--store): `photonfarm submit` makes them")
-        scene_id = scene_id or _wait(lambda: _only_scene(store), stop, settings.max_seconds or math.inf)
+        scene_id = scene_id or _wait_for(lambda: _find_only_scene(store), stop, settings.max_seconds or math.inf)
         if scene_id is None and not stop.is_set():
             raise IncompleteError(
                 f"{store}: no scene to train on has come in {settings.max_seconds:g} s; nothing was trained"
@@ -123,7 +123,7 @@ def _lead(
             return
         source, waited = SceneReader(store, scene_id, exposure=exposure), time.monotonic() - began
         if not is_vacant(store) and not source.ready():
-            log(f"waiting for scene {scene_id}, {_lacks(Store(store), scene_id, spec)}")
+            log(f"waiting for scene {scene_id}, {_describe_lack(Store(store), scene_id, spec)}")
         elif spec is not None and source.ready() and spec.exposure != source.spec.exposure:
             of = "the run began with" if exposure else "the store has"
             log(f"exposure is {source.spec.exposure:g}, which {of}, and not {spec.exposure:g} as the spec says")
@@ -142,7 +142,7 @@ def _lead(
             if board:
                 board.pictures(step, targets, predictions)
 
-        with _reported(redis_url, store, scene_id, log) as on_draws, followed(progress, folder, log):
+        with _report_use(redis_url, store, scene_id, log) as on_draws, follow_progress(progress, folder, log):
             followers = [follow for follow in (on_record, board and board.record) if follow]
             outcome = train(
                 source,
@@ -166,7 +166,7 @@ def _lead(
         )
 
 
-def _lacks(store: Store, scene_id: str, spec: SceneSpec | None) -> str:
+def _describe_lack(store: Store, scene_id: str, spec: SceneSpec | None) -> str:
     """What of a scene is waited for, in words."""
     if store.has_scene(scene_id):
         return "of which nothing is rendered yet"
@@ -191,18 +191,18 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
 
     Raises SpecError without a spec, unless the store has one scene.
     """
-    from photonfarm.trainer.networks import kind_of
-    from photonfarm.trainer.networks.summary import summary, table
+    from photonfarm.trainer.networks import find_kind
+    from photonfarm.trainer.networks.summary import format_summary, summarise
 
-    network = settings_of(preset_name, changes).network
-    scene = _spec_of(spec, store)
+    network = make_settings(preset_name, changes).network
+    scene = _find_spec(spec, store)
     points = min(network.points or scene.points, scene.points)
     head = (
         f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
-        f"width {network.width}" + (f", {points} points" if kind_of(network.architecture).needs.points else "")
+        f"width {network.width}" + (f", {points} points" if find_kind(network.architecture).needs.points else "")
     )
-    with named_in_errors(architecture=network.architecture):
-        return f"{head}\n{table(summary(scene, network))}"
+    with name_in_errors(architecture=network.architecture):
+        return f"{head}\n{format_summary(summarise(scene, network))}"
 
 
 def rehearse(
@@ -215,35 +215,35 @@ def rehearse(
     """
     from photonfarm.core.models import sentences
     from photonfarm.trainer.dry_run.dry_run import rehearse
-    from photonfarm.trainer.runs.devices import processes
+    from photonfarm.trainer.runs.devices import count_processes
 
-    if (size := processes()) > 1:
+    if (size := count_processes()) > 1:
         raise SpecError(
             f"torchrun has started {size} processes, and a dry run is one's work; start it without torchrun"
         )
-    settings = settings_of(preset_name, changes)
-    scene = _spec_of(spec, store)
+    settings = make_settings(preset_name, changes)
+    scene = _find_spec(spec, store)
     if film is not None:
         try:
             square = Film(width=film, height=film)
         except ValidationError as error:
             raise SpecError(f"the film of the dry run: {'; '.join(sentences(error))}") from error
         scene = scene.model_copy(update={"film": square})
-    with named_in_errors(architecture=settings.network.architecture, loss=settings.loss):
+    with name_in_errors(architecture=settings.network.architecture, loss=settings.loss):
         return rehearse(scene, settings)
 
 
-def _spec_of(spec: str | None, store: str | Path) -> SceneSpec:
+def _find_spec(spec: str | None, store: str | Path) -> SceneSpec:
     """The spec of a name, or of a store's only scene; SpecError without one."""
     if spec:
         return load_spec(spec)
-    scene_id = _only_scene(store)
+    scene_id = _find_only_scene(store)
     if scene_id is None:
         raise SpecError(f"{store}: holds no scene; name the spec of the one to build a network for")
     return Store(store).scene(scene_id).spec
 
 
-def _begun_on(folder: Path) -> tuple[str | None, float | None]:
+def _read_beginning(folder: Path) -> tuple[str | None, float | None]:
     """The scene that a run was begun on, and its exposure then; None for a new run."""
     from photonfarm.trainer.runs import checkpoint
     from photonfarm.trainer.runs.run_folder import INITIAL
@@ -255,7 +255,7 @@ def _begun_on(folder: Path) -> tuple[str | None, float | None]:
     return str(state["scene_id"]), float(state["exposure"])
 
 
-def _only_scene(store: str | Path) -> str | None:
+def _find_only_scene(store: str | Path) -> str | None:
     """The scene of a store that has one; None while there is no store or no scene; SpecError if there are several."""
     try:
         ids = Store(store).scene_ids()
@@ -269,7 +269,7 @@ def _only_scene(store: str | Path) -> str | None:
     return ids[0] if ids else None
 
 
-def _wait(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
+def _wait_for(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
     """Wait until `look` finds something, and return it; None once asked to stop, or after so many seconds."""
     end = time.monotonic() + seconds
     while (value := look()) is None:
@@ -279,7 +279,7 @@ def _wait(look: Callable[[], T | None], stop: Stop, seconds: float) -> T | None:
 
 
 @contextmanager
-def _sign_of_life(folder: Path) -> Iterator[None]:
+def _give_sign_of_life(folder: Path) -> Iterator[None]:
     """Touch a file regularly, from a thread of its own, for `check`."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -291,12 +291,12 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
             yield
     finally:
         if folder.is_dir():
-            with suppress(StoreError), held(folder):  # unless a trainer is at work there, which keeps the file
+            with suppress(StoreError), lock_run(folder):  # unless a trainer is at work there, which keeps the file
                 (folder / ALIVE_FILE).unlink(missing_ok=True)
 
 
 @contextmanager
-def _reported(
+def _report_use(
     redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], object]
 ) -> Iterator[Callable[[int, int], None]]:
     """A callback for draws and samples of training; a thread reports the used ones to Redis regularly, and at the end.

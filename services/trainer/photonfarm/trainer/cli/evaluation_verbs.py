@@ -77,7 +77,7 @@ inception_option = click.option(
 )
 
 
-def measuring(command: Callable[..., None]) -> Callable[..., None]:
+def add_measuring_options(command: Callable[..., None]) -> Callable[..., None]:
     """The options for what is measured, against what and on which device; `_how` takes all but the runs."""
     options = (
         store_option,
@@ -94,7 +94,7 @@ def measuring(command: Callable[..., None]) -> Callable[..., None]:
     return command
 
 
-def _how(
+def _collect_arguments(
     denoisers: tuple[ReadyDenoiser, ...],
     kept: tuple[int, ...],
     references: Path | None,
@@ -113,7 +113,7 @@ def _how(
 
 
 @click.command()
-@measuring
+@add_measuring_options
 @click.option(
     "--without-inception", is_flag=True, help="Leave out FID, KID and Feature L1, which take most of the time."
 )
@@ -125,23 +125,23 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
     With references there are the columns of the paper too: of clip(exposure · I, 0, 1)^(1/2.2). In each run's folder
     this leaves evaluation.json, with every figure, and comparison.png, a few of the images side by side.
     """
-    how = _how(**asked)
+    how = _collect_arguments(**asked)
     from photonfarm.trainer.compare.evaluate import compare
-    from photonfarm.trainer.compare.evaluation_page import evaluation_text, write_evaluation
+    from photonfarm.trainer.compare.evaluation_page import format_evaluation, write_evaluation
     from photonfarm.trainer.predict.trained import TrainedRun
 
     loaded = [TrainedRun.load(run) for run in dict.fromkeys(runs)]
-    from photonfarm.trainer.cli.show import measuring_progress
+    from photonfarm.trainer.cli.show import show_progress
 
-    with measuring_progress() as on_progress:
+    with show_progress() as on_progress:
         evaluation = compare(store, loaded, on_progress=on_progress, **how)
     pictures = write_evaluation(evaluation, loaded)
-    click.echo(json.dumps(evaluation.document(), indent=2) if as_json else evaluation_text(evaluation))
+    click.echo(json.dumps(evaluation.document(), indent=2) if as_json else format_evaluation(evaluation))
     click.echo(f"side by side: {', '.join(map(str, pictures))}", err=True)
 
 
 @click.command()
-@measuring
+@add_measuring_options
 @click.option("--untimed", is_flag=True, help="Leave out the time of a frame, which asks for a quiet machine.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @json_option
@@ -151,11 +151,11 @@ def report(store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, 
     Runs and denoisers are measured as by `evaluate`. Where the renderer is installed, the time of a frame is measured
     from the scene to the image; with references, the worst cases of the first run are found and shown.
     """
-    how = _how(**asked)
-    from photonfarm.trainer.cli.show import measuring_progress
+    how = _collect_arguments(**asked)
+    from photonfarm.trainer.cli.show import show_progress
     from photonfarm.trainer.report import write_report
 
-    with measuring_progress() as on_progress:
+    with show_progress() as on_progress:
         figures = write_report(store, list(dict.fromkeys(runs)), out, on_progress=on_progress, timed=not untimed, **how)
     click.echo(figures["verdict"], err=True)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
@@ -224,7 +224,7 @@ def infer(
         asked = ["--orbit", str(orbit)] if orbit else ["--camera-path", str(path)]
         asked += ["--modification", modification] if modification else []
         result = shows.show_frames(
-            store, trained, shows.rendered_frames(store, trained, asked), out, fps=fps, device=device
+            store, trained, shows.render_frames(store, trained, asked), out, fps=fps, device=device
         )
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)

@@ -25,7 +25,7 @@ from photonfarm.core.processes import repeating
 from photonfarm.core.waiting import SILENCE_S, Steps
 
 
-def record(of: dict[str, Any]) -> None:
+def print_record(of: dict[str, Any]) -> None:
     """Print what people want to know of a record of a run's log, if anything."""
     if of["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in of["changes"].items())
@@ -33,25 +33,25 @@ def record(of: dict[str, Any]) -> None:
     if of["kind"] == "loss":
         click.echo(f"loss {of['loss']} is unbiased: {of['verdict']}", err=True)
     if of["kind"] == "recovered":
-        click.echo(f"step {of['step']}: {_recovered(of)}", err=True)
+        click.echo(f"step {of['step']}: {_format_recovery(of)}", err=True)
     if of["kind"] == "validation":
         there = f"on {of['held_out']} of {of['samples']} samples; "
         click.echo(
             f"step {of['step']}: held-out error {stated(of['error'], of['standard_error'])} "
             f"({stated(of['shown_error'], None)} up to white) {there}"
-            + progress.stated(of["waits"], of["samples_per_used"]),
+            + progress.format_waits(of["waits"], of["samples_per_used"]),
             err=True,
         )
 
 
-def dry_run(estimate: DryRun, as_json: bool) -> None:
+def print_dry_run(estimate: DryRun, as_json: bool) -> None:
     """Print the estimate of a training."""
     from photonfarm.trainer.dry_run.dry_run import describe, format_estimate
 
     click.echo(json.dumps(describe(estimate), indent=2) if as_json else format_estimate(estimate))
 
 
-def _recovered(log_record: dict[str, Any]) -> str:
+def _format_recovery(log_record: dict[str, Any]) -> str:
     """Why a run went back, and to which step."""
     errors, back_to = log_record["errors"], f"the weights of step {log_record['back_to']}"
     if errors is None:
@@ -69,15 +69,15 @@ OnProgress = Callable[[str, int, int], None]
 
 
 @contextmanager
-def measuring_progress() -> Iterator[OnProgress]:
+def show_progress() -> Iterator[OnProgress]:
     """Yield a callback with what is done, how many of its samples are done, and of how many; 0: it has no parts."""
     console = Console(stderr=True)
-    with _bars(console) if console.is_terminal else _lines() as show:
+    with _show_bars(console) if console.is_terminal else _print_lines() as show:
         yield show
 
 
 @contextmanager
-def _bars(console: Console) -> Iterator[OnProgress]:
+def _show_bars(console: Console) -> Iterator[OnProgress]:
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
     with Progress(*columns, console=console, transient=True) as bars:
         tasks: dict[str, Any] = {}
@@ -96,7 +96,7 @@ def _bars(console: Console) -> Iterator[OnProgress]:
 
 
 @contextmanager
-def _lines() -> Iterator[OnProgress]:
+def _print_lines() -> Iterator[OnProgress]:
     name, since_s, samples = "starts", time.monotonic(), Steps(0)
 
     def show(what: str, done: int, total: int) -> None:

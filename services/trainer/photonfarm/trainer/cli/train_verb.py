@@ -41,7 +41,7 @@ class KeyValueOption(click.Option):
         return super().type_cast_value(ctx, pairs)
 
 
-def by_key(pairs: tuple[str, ...]) -> dict[str, Any]:
+def collect_settings(pairs: tuple[str, ...]) -> dict[str, Any]:
     """The values of `KeyValueOption` by their keys, each parsed as JSON, or kept as text."""
     changes: dict[str, Any] = {}
     for pair in pairs:
@@ -171,14 +171,22 @@ def train(
     if (as_json or film is not None) and not dry_run:
         raise click.UsageError(f"{'--json' if as_json else '--film'} goes with --dry-run alone")
     log = partial(click.echo, err=True)
-    changes = {**by_key(pairs), **{key: value for key, value in options.items() if value is not None}}
+    changes = {**collect_settings(pairs), **{key: value for key, value in options.items() if value is not None}}
     if check:
         service.check(run)
     elif summary:
         click.echo(service.summarise(spec, store, preset, changes))
     elif dry_run:
-        show.dry_run(service.rehearse(spec, store, preset, changes, film), as_json)
+        show.print_dry_run(service.rehearse(spec, store, preset, changes, film), as_json)
     else:
         service.run(
-            spec, store, run, preset, changes, redis_url, until_complete=until_complete, log=log, on_record=show.record
+            spec,
+            store,
+            run,
+            preset,
+            changes,
+            redis_url,
+            until_complete=until_complete,
+            log=log,
+            on_record=show.print_record,
         )

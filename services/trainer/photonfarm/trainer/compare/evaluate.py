@@ -21,16 +21,16 @@ from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.store import SceneReader
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
-from photonfarm.trainer.data.batch import TrainingBatch, kept_count
+from photonfarm.trainer.data.batch import TrainingBatch, count_kept
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics import (
     Features,
     ImageMetrics,
     Inception,
+    compute_features,
     confidence_interval,
-    image_metrics,
     load_inception,
-    reference_features,
+    measure_images,
 )
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.predict.evaluation import (
@@ -38,12 +38,12 @@ from photonfarm.trainer.predict.evaluation import (
     DevicePredictor,
     HeldOutErrors,
     Predictor,
-    batches,
-    by_turns,
     measure,
+    read_batches,
+    time_by_turns,
 )
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
-from photonfarm.trainer.runs.devices import described, usable_device
+from photonfarm.trainer.runs.devices import describe_device, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
@@ -170,7 +170,7 @@ def compare(
     samples = HeldOutSamples.of(first.source(store), min(run.settings.hold_out for run in runs), most)
     spec = samples.source.spec
     for _, kept in denoisers:
-        kept_count(spec, kept)
+        count_kept(spec, kept)
     references_by_row = {} if references is None else read_references(references, samples)
     shown = samples.to_show(references_by_row)
     network = load_inception(inception, str(place)) if references_by_row and not without_inception else None
@@ -187,7 +187,7 @@ def compare(
         scene_id=first.scene_id,
         unit="configuration" if spec.groups else "view",
         measured=tuple(samples.rows),
-        device=described(place),
+        device=describe_device(place),
         threads=first.settings.threads,
         references=References.of(references_by_row, spec.transport.half_spp),
         rows=tuple(rows),
@@ -275,13 +275,13 @@ class _Test:
     def timed(self, predictors: Sequence[TrainedRun | ReadyPredictor]) -> list[_Timed]:
         """Load all predictors, and time them by turns on the first sample."""
         calls = [self._call(predictor) for predictor in predictors]
-        ready = zip(predictors, calls, by_turns(calls), strict=True)
+        ready = zip(predictors, calls, time_by_turns(calls), strict=True)
         return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
 
     def _call(self, predictor: TrainedRun | ReadyPredictor) -> tuple[DevicePredictor, Inputs]:
         with self._feed(predictor, batch=1) as feed:
             predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
-            for batch in batches(feed, self.samples.rows, 1):
+            for batch in read_batches(feed, self.samples.rows, 1):
                 return predict, predict.of_its_own(batch.inputs)
         raise IncompleteError(NONE_COMPLETE)
 
@@ -294,7 +294,7 @@ class _Test:
                 {*self.references, *self.shown},
                 lambda done: self.on_progress(predictor.name, done, len(rows)),
             )
-            held_out = measure(watched, batches(feed, rows, size))
+            held_out = measure(watched, read_batches(feed, rows, size))
         if self.references:
             self.on_progress(f"{predictor.name} is compared with the references", 0, 0)
         metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
@@ -315,7 +315,7 @@ class _Test:
         )
         images, units = np.stack([watched.images[row] for row in rows]), [watched.units[row] for row in rows]
         known = None if self.inception is None else self._features(tuple(rows), mean, self.inception)
-        return image_metrics(
+        return measure_images(
             images,
             mean,
             self.inception,
@@ -328,5 +328,5 @@ class _Test:
     def _features(self, rows: tuple[int, ...], references: F32, inception: Inception) -> Features:
         """The features of the references of some rows, which are the same for almost all predictors."""
         if rows not in self.known:
-            self.known[rows] = reference_features(references, inception)
+            self.known[rows] = compute_features(references, inception)
         return self.known[rows]

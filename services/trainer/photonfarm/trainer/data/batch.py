@@ -66,7 +66,7 @@ class TrainingBatch:
         return TrainingBatch(2 * self.rows, 2 * self.units, inputs, target)
 
 
-def empty_memory(tensors: SampleTensors, size: int, *, pinned: bool = False) -> dict[str, Tensor]:
+def allocate_memory(tensors: SampleTensors, size: int, *, pinned: bool = False) -> dict[str, Tensor]:
     """Memory for `size` samples, by field, which is reused for every batch; SpecError where there is not so much."""
     try:
         return tensors.empty(size, pinned=pinned)
@@ -74,7 +74,7 @@ def empty_memory(tensors: SampleTensors, size: int, *, pinned: bool = False) -> 
         raise SpecError(f"batch = {size}: no memory for so many samples") from error
 
 
-def kept_count(spec: SceneSpec, of: int) -> int:
+def count_kept(spec: SceneSpec, of: int) -> int:
     """The number of pixels that one of `of` makes; SpecError if the film has fewer than `of` pixels."""
     pixels = spec.film.height * spec.film.width
     if of > pixels:
@@ -85,7 +85,7 @@ def kept_count(spec: SceneSpec, of: int) -> int:
     return pixels // of
 
 
-def kept_pixels(key: Key, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
+def choose_kept_pixels(key: Key, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     """One of `of` pixels, (H, W), H·W / `of` in all: a random choice derived from a sample's content key.
 
     So each pass of a view keeps pixels of its own, and a resumed run gets the same pixels. A smaller share of the
@@ -93,7 +93,7 @@ def kept_pixels(key: Key, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     """
     film = spec.film.height, spec.film.width
     chance = Stream(key, "kept pixels").uniform(*film)
-    last = kept_count(spec, of) - 1
+    last = count_kept(spec, of) - 1
     kept: NDArray[np.bool_] = chance <= np.partition(chance, last, axis=None)[last]
     return kept
 
@@ -131,11 +131,11 @@ class ResidentSamples:
         Its tensors are its own. Values are those of the store's samples, to the bit, wherever they were kept.
         """
         moved = fresh.to(self._device)
-        parts = {row: _one(moved, place) for place, row in enumerate(fresh.rows)}
+        parts = {row: _take_one(moved, place) for place, row in enumerate(fresh.rows)}
         for row, part in parts.items():
-            if self._has_room(needed := size_bytes(part)):
-                self._kept[row], self._bytes = _changed(torch.clone, part), self._bytes + needed
-        return _joined([parts[row] if row in parts else self._kept[row] for row in rows]) if rows else moved
+            if self._has_room(needed := count_bytes(part)):
+                self._kept[row], self._bytes = _map_sample(torch.clone, part), self._bytes + needed
+        return _join_samples([parts[row] if row in parts else self._kept[row] for row in rows]) if rows else moved
 
     def _has_room(self, needed: int) -> bool:
         if self._limit_bytes is not None:
@@ -144,25 +144,25 @@ class ResidentSamples:
         return free - needed >= FREE_SHARE * total
 
 
-def size_bytes(record: Any) -> int:
+def count_bytes(record: Any) -> int:
     """The bytes of all tensors of a batch, or of its inputs."""
     if isinstance(record, Tensor):
         return record.numel() * record.element_size()
-    return sum(size_bytes(getattr(record, f.name)) for f in fields(record)) if is_dataclass(record) else 0
+    return sum(count_bytes(getattr(record, f.name)) for f in fields(record)) if is_dataclass(record) else 0
 
 
-def _one(batch: TrainingBatch, place: int) -> TrainingBatch:
+def _take_one(batch: TrainingBatch, place: int) -> TrainingBatch:
     """One sample of a batch, in the batch's memory."""
     inputs = map_tensors(lambda tensor: tensor[place : place + 1], batch.inputs)
     return TrainingBatch((batch.rows[place],), (batch.units[place],), inputs, batch.target[place : place + 1])
 
 
-def _changed(change: Callable[[Tensor], Tensor], sample: TrainingBatch) -> TrainingBatch:
+def _map_sample(change: Callable[[Tensor], Tensor], sample: TrainingBatch) -> TrainingBatch:
     """The sample with `change` applied to its tensors."""
     return TrainingBatch(sample.rows, sample.units, map_tensors(change, sample.inputs), change(sample.target))
 
 
-def _joined(samples: Sequence[TrainingBatch]) -> TrainingBatch:
+def _join_samples(samples: Sequence[TrainingBatch]) -> TrainingBatch:
     """Samples as a batch in memory of its own."""
     rows, units = (tuple(getattr(sample, name)[0] for sample in samples) for name in ("rows", "units"))
     first, *others = (sample.inputs for sample in samples)

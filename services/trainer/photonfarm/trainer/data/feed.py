@@ -20,8 +20,8 @@ from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import Samples, SceneDataset
 from photonfarm.plan.hold_out import Keyed, are_held_out, enough, units_of
-from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, empty_memory, kept_pixels
-from photonfarm.trainer.networks import kind_of
+from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, allocate_memory, choose_kept_pixels
+from photonfarm.trainer.networks import find_kind
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -91,7 +91,7 @@ class Feed:
         self.geometry: Geometry
         self.cloud: BasePointCloud
         self._source, self._settings, self._clock = source, settings, clock
-        self._needs = needs or kind_of(settings.network.architecture).needs
+        self._needs = needs or find_kind(settings.network.architecture).needs
         self._resident = resident if resident is not None and resident.keeps_any else None
         self.geometry, self.cloud = source.base()
         self.spec = source.spec
@@ -111,7 +111,7 @@ class Feed:
         self._ready: queue.SimpleQueue[tuple[TrainingBatch, dict[str, Tensor]] | None] = queue.SimpleQueue()
         self._free: queue.SimpleQueue[dict[str, Tensor] | None] = queue.SimpleQueue()
         for _ in range(settings.prefetch + 1):
-            self._free.put(empty_memory(self._dataset.tensors, settings.batch, pinned=pinned))
+            self._free.put(allocate_memory(self._dataset.tensors, settings.batch, pinned=pinned))
         self._lent: dict[str, Tensor] | None = None
         self._polled = threading.Event()
         self._thread = threading.Thread(target=self._run, name="feed", daemon=True)
@@ -274,6 +274,6 @@ def read_batch(
     film = dataset.spec.film.height, dataset.spec.film.width
     pixels = None
     if kept:
-        chosen = [kept_pixels(key, dataset.spec, kept) for key in source.sample_keys(rows)]
+        chosen = [choose_kept_pixels(key, dataset.spec, kept) for key in source.sample_keys(rows)]
         pixels = torch.from_numpy(np.array(chosen, np.bool_).reshape(-1, *film))
     return TrainingBatch.of(rows, units_of(source, rows), dataset.read(rows, memory), pixels)

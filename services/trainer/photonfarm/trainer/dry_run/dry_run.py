@@ -16,11 +16,11 @@ from torch.utils.flop_counter import FlopCounterMode
 from photonfarm.core.formatting import format_bytes
 from photonfarm.core.waiting import in_words
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.trainer.data.batch import TrainingBatch, size_bytes
+from photonfarm.trainer.data.batch import TrainingBatch, count_bytes
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
-from photonfarm.trainer.runs.devices import described, usable_device
+from photonfarm.trainer.runs.devices import describe_device, usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.learner import Learner, compiling
+from photonfarm.trainer.training.learner import Learner, name_compile_errors
 
 TIMED_STEPS = 3
 SECONDS = 20.0
@@ -90,12 +90,12 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
     torch.set_num_threads(settings.threads)
     scene = MadeUpScene.of(spec)
     learner = Learner(scene, settings.model_copy(update={"compile": "off"}))
-    work = counted(learner, scene.batch(1, settings))
-    state = state_bytes(learner)
+    work = count_work(learner, scene.batch(1, settings))
+    state = count_state_bytes(learner)
     if settings.compile != "off":
         learner = Learner(scene, settings)
-    with compiling(settings.compile):
-        took = timed(learner, scene, settings, work)
+    with name_compile_errors(settings.compile):
+        took = time_steps(learner, scene, settings, work)
     parameters = sum(weight.numel() for weight in learner.network.parameters())
     return DryRun(
         scene=spec.name,
@@ -112,7 +112,7 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
     )
 
 
-def counted(learner: Learner, one: TrainingBatch) -> Work:
+def count_work(learner: Learner, one: TrainingBatch) -> Work:
     """The work of a step on one sample: counted while it is taken.
 
     What has the shape of weights, such as their gradients and their copies in bfloat16, is there once a batch.
@@ -120,39 +120,39 @@ def counted(learner: Learner, one: TrainingBatch) -> Work:
     weights = {weight.shape for weight in learner.network.parameters()}
     with LiveMemory(but_for=weights) as memory, FlopCounterMode(display=False) as counter:
         learner.step(0, one)
-    return Work(counter.get_total_flops(), memory.peak_bytes, size_bytes(one))
+    return Work(counter.get_total_flops(), memory.peak_bytes, count_bytes(one))
 
 
-def state_bytes(learner: Learner) -> int:
+def count_state_bytes(learner: Learner) -> int:
     """The bytes that last from step to step, after one: weights, gradients, the optimiser's memory, the average."""
     weights = list(learner.network.parameters())
     gradients = [weight.grad for weight in weights if weight.grad is not None]
     memory = [value for values in learner.optimiser.state.values() for value in values.values()]
     average = [] if learner.average is None else list(learner.average.network.parameters())
-    return sum(size_bytes(tensor) for tensor in (*weights, *gradients, *memory, *average))
+    return sum(count_bytes(tensor) for tensor in (*weights, *gradients, *memory, *average))
 
 
-def timed(learner: Learner, scene: MadeUpScene, settings: TrainSettings, work: Work) -> Timed:
+def time_steps(learner: Learner, scene: MadeUpScene, settings: TrainSettings, work: Work) -> Timed:
     """A few steps, on the whole batch if that takes no longer than `SECONDS` and no more than `TIMED_BYTES`."""
     device = usable_device(settings.device)
     on_card = device.type == "cuda"
     one = scene.batch(1, settings)
-    first = _seconds(learner, one, device)  # kernels are made and memory is taken
-    single = _seconds(learner, one, device) if first * (TIMED_STEPS + 2) < SECONDS else first
+    first = _time_step(learner, one, device)  # kernels are made and memory is taken
+    single = _time_step(learner, one, device) if first * (TIMED_STEPS + 2) < SECONDS else first
     by_time = int(SECONDS / (TIMED_STEPS + 1) / single)
     by_memory = settings.batch if on_card else int(TIMED_BYTES / work.activation_bytes)
     samples = max(1, min(settings.batch, by_time, by_memory))
     batch = scene.batch(samples, settings)
-    _seconds(learner, batch, device)
+    _time_step(learner, batch, device)
     if on_card:
         torch.cuda.reset_peak_memory_stats(device)
-    step_s = statistics.median(_seconds(learner, batch, device) for _ in range(TIMED_STEPS))
+    step_s = statistics.median(_time_step(learner, batch, device) for _ in range(TIMED_STEPS))
     peak = torch.cuda.max_memory_allocated(device) if on_card else None
-    said = described(device, settings.network.precision)
+    said = describe_device(device, settings.network.precision)
     return Timed(said, samples, TIMED_STEPS, step_s * settings.batch / samples, peak)
 
 
-def _seconds(learner: Learner, batch: TrainingBatch, device: torch.device) -> float:
+def _time_step(learner: Learner, batch: TrainingBatch, device: torch.device) -> float:
     """The seconds of a step; on a card until it is done, as its loss is read."""
     began = time.perf_counter()
     learner.step(1, batch)

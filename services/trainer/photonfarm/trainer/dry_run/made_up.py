@@ -23,8 +23,8 @@ from photonfarm.core.records import F32, STATIC, BasePointCloud, Geometry
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
-from photonfarm.trainer.data.batch import TrainingBatch, empty_memory
-from photonfarm.trainer.networks import kind_of
+from photonfarm.trainer.data.batch import TrainingBatch, allocate_memory
+from photonfarm.trainer.networks import find_kind
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.runs.settings import TrainSettings
 
@@ -57,8 +57,8 @@ class MadeUpScene:
 
     def batch(self, size: int, settings: TrainSettings) -> TrainingBatch:
         """A batch of so many samples, with all that the settings' network reads; half of the points are seen."""
-        spec, needs = self.spec, kind_of(settings.network.architecture).needs
-        tensors = empty_memory(SampleTensors(spec, needs.fields, points=settings.network.points), size)
+        spec, needs = self.spec, find_kind(settings.network.architecture).needs
+        tensors = allocate_memory(SampleTensors(spec, needs.fields, points=settings.network.points), size)
         generator = torch.Generator().manual_seed(0)
         for tensor in tensors.values():
             _fill(tensor, generator)
@@ -79,8 +79,8 @@ class MadeUpScene:
             inputs.points.position[:] = torch.from_numpy(self.cloud.position[: inputs.points.position.shape[1]])
             inputs.points.present.fill_(True)
         if (photons := inputs.photons) is not None:
-            photons.position[:] = torch.from_numpy(_again(self.cloud.position, photons.position.shape[1]))
-            photons.normal[:] = torch.from_numpy(_again(self.cloud.normal, photons.normal.shape[1]))
+            photons.position[:] = torch.from_numpy(_repeat_rows(self.cloud.position, photons.position.shape[1]))
+            photons.normal[:] = torch.from_numpy(_repeat_rows(self.cloud.normal, photons.normal.shape[1]))
             photons.direction[:] = -photons.normal
             photons.bounce.mul_(self.spec.photons.depth).floor_()
             photons.present.fill_(True)
@@ -100,7 +100,7 @@ def _to_unit(vectors: Tensor) -> None:
     vectors.sub_(0.5).div_(torch.linalg.vector_norm(vectors, dim=-1, keepdim=True))
 
 
-def _again(values: F32, count: int) -> F32:
+def _repeat_rows(values: F32, count: int) -> F32:
     """The first `count` rows, from the beginning again if there are fewer."""
     return np.resize(values, (count, *values.shape[1:]))
 
@@ -124,16 +124,16 @@ class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
     ) -> Any:
         """Compute an operation, and count what it made."""
-        given = {_place(tensor) for tensor in tree_leaves((args, kwargs)) if isinstance(tensor, Tensor)}
+        given = {_find_place(tensor) for tensor in tree_leaves((args, kwargs)) if isinstance(tensor, Tensor)}
         made = func(*args, **(kwargs or {}))
         for tensor in tree_leaves(made):
-            if isinstance(tensor, Tensor) and tensor.shape not in self._but_for and _place(tensor) not in given:
+            if isinstance(tensor, Tensor) and tensor.shape not in self._but_for and _find_place(tensor) not in given:
                 self._add(tensor)
         self.peak_bytes = max(self.peak_bytes, self._bytes)
         return made
 
     def _add(self, tensor: Tensor) -> None:
-        storage, place = tensor.untyped_storage(), _place(tensor)
+        storage, place = tensor.untyped_storage(), _find_place(tensor)
         if place in self._live:
             return
         self._live[place] = storage.nbytes()
@@ -144,5 +144,5 @@ class LiveMemory(TorchDispatchMode):  # type: ignore[no-untyped-call]
         self._bytes -= self._live.pop(place, 0)
 
 
-def _place(tensor: Tensor) -> int:
+def _find_place(tensor: Tensor) -> int:
     return tensor.untyped_storage().data_ptr()

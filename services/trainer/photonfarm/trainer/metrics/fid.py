@@ -38,15 +38,15 @@ def fid(predictions: NDArray[np.floating], references: NDArray[np.floating]) -> 
     and T = GᵀG the square roots of ΣT's eigenvalues are the singular values of FGᵀ: so no root of a singular matrix is
     ever taken. Raises ValueError below two images.
     """
-    (mean_a, factor_a), (mean_b, factor_b) = _normal(predictions), _normal(references)
+    (mean_a, factor_a), (mean_b, factor_b) = _fit_normal(predictions), _fit_normal(references)
     overlap = np.linalg.svd(factor_a @ factor_b.T, compute_uv=False).sum()
     spread = np.sum(factor_a**2) + np.sum(factor_b**2)
     distance = float(np.sum((mean_a - mean_b) ** 2) + spread - 2 * overlap)
     counts = len(predictions), len(references)
-    return Fid(max(distance, 0.0), *counts, _warning(min(counts)))  # below 0 only by rounding
+    return Fid(max(distance, 0.0), *counts, _warn_of_few(min(counts)))  # below 0 only by rounding
 
 
-def _normal(features: NDArray[np.floating]) -> tuple[_F64, _F64]:
+def _fit_normal(features: NDArray[np.floating]) -> tuple[_F64, _F64]:
     """Mean (D,) and a factor F (R, D) of the unbiased covariance FᵀF, R = min(N, D)."""
     count, width = features.shape
     if count < 2:
@@ -59,7 +59,7 @@ def _normal(features: NDArray[np.floating]) -> tuple[_F64, _F64]:
     return mean, factor
 
 
-def _warning(count: int) -> str | None:
+def _warn_of_few(count: int) -> str | None:
     if count >= FULL_RANK:
         return None
     return (
@@ -81,14 +81,14 @@ def kid(predictions: NDArray[np.floating], references: NDArray[np.floating]) -> 
         shapes = f"{predictions.shape} and {references.shape}"
         raise ValueError(f"features have the shapes {shapes}; KID needs two equal ones, of at least {FEWEST} images")
     x, y = predictions.astype(np.float64), references.astype(np.float64)
-    sums = np.concatenate([_pair_sums(x, y, start) for start in range(0, count, ROWS)])
+    sums = np.concatenate([_sum_pairs(x, y, start) for start in range(0, count, ROWS)])
     value = sums.sum() / (count * (count - 1))
     without = (sums.sum() - 2 * sums) / ((count - 1) * (count - 2))
     variance = (count - 1) / count * np.sum((without - without.mean()) ** 2)
     return Estimate(float(value), float(np.sqrt(variance)), count)
 
 
-def _pair_sums(x: _F64, y: _F64, start: int) -> _F64:
+def _sum_pairs(x: _F64, y: _F64, start: int) -> _F64:
     """The sum over j ≠ i of the U-statistic's kernel for each image i from `start` on, (≤ ROWS,)."""
     row = slice(start, start + ROWS)
     pairs = _kernel(x[row], x) + _kernel(y[row], y) - _kernel(x[row], y) - _kernel(y[row], x)

@@ -146,7 +146,7 @@ def mssim(predictions: Tensor, references: Tensor) -> NDArray[np.float64]:
         size = "×".join(map(str, predictions.shape[1:3]))
         raise ValueError(f"images are {size} pixels; MSSIM needs at least {WINDOW}×{WINDOW}, the size of its window")
     x, y = (images.movedim(-1, 1).double() for images in (predictions, references))
-    mean_x, mean_y, square_x, square_y, product = (_blurred(image) for image in (x, y, x * x, y * y, x * y))
+    mean_x, mean_y, square_x, square_y, product = (_blur(image) for image in (x, y, x * x, y * y, x * y))
     variance_x, variance_y, covariance = square_x - mean_x**2, square_y - mean_y**2, product - mean_x * mean_y
     luminance = (2 * mean_x * mean_y + C1) / (mean_x**2 + mean_y**2 + C1)
     structure = (2 * covariance + C2) / (variance_x + variance_y + C2)  # and contrast: C3 = C2 / 2
@@ -154,7 +154,7 @@ def mssim(predictions: Tensor, references: Tensor) -> NDArray[np.float64]:
     return similarity
 
 
-def _blurred(images: Tensor) -> Tensor:
+def _blur(images: Tensor) -> Tensor:
     """Gaussian means over whole windows: (N, C, H, W) → (N, C, H − 10, W − 10).
 
     Rows, then columns, as sums of shifted images: a seventh of the time of float64 convolutions on a CPU.
@@ -233,7 +233,7 @@ class ImageMetrics:
         }
 
 
-def image_metrics(
+def measure_images(
     predictions: F32 | Tensor,
     references: F32 | Tensor,
     inception: Inception | None,
@@ -266,16 +266,16 @@ def image_metrics(
     of_shown = inception.features(shown, CHUNK)
     of_wanted = inception.features(wanted, CHUNK) if wanted_features is None else wanted_features
     blocks = tuple(PerImage.of(values, groups) for values in feature_l1(of_shown, of_wanted))
-    sets = _set_metrics(of_shown, of_wanted)
+    sets = _measure_sets(of_shown, of_wanted)
     return ImageMetrics(len(shown), *of_images, blocks, *sets, inception.weights)
 
 
-def reference_features(references: F32 | Tensor, inception: Inception) -> Features:
+def compute_features(references: F32 | Tensor, inception: Inception) -> Features:
     """The features that `image_metrics` needs of references (N, H, W, 3), whatever they are compared with."""
     return inception.features(metric_space(references), CHUNK)
 
 
-def _set_metrics(predictions: Features, references: Features) -> tuple[Fid | None, Estimate | None]:
+def _measure_sets(predictions: Features, references: Features) -> tuple[Fid | None, Estimate | None]:
     if len(predictions.pool3) < FEWEST:
         return None, None
     return fid(predictions.pool3, references.pool3), kid(predictions.pool3, references.pool3)

@@ -60,9 +60,9 @@ class Inception:
     def features(self, images: Tensor, batch: int = 8) -> Features:
         """Features of display images, (N, H, W, 3) in [0, 1], `batch` at a time, on all cores; N ≥ 1."""
         device = next(self.network.parameters()).device
-        with _all_cores():
+        with _use_all_cores():
             starts = range(0, len(images), batch)
-            parts = [self._block_means(network_input(images[at : at + batch].to(device))) for at in starts]
+            parts = [self._block_means(prepare_images(images[at : at + batch].to(device))) for at in starts]
         return Features(tuple(np.concatenate(block) for block in zip(*parts, strict=True)))
 
     def _block_means(self, x: Tensor) -> list[NDArray[np.float32]]:
@@ -79,7 +79,7 @@ class Inception:
 
 
 @contextmanager
-def _all_cores() -> Iterator[None]:
+def _use_all_cores() -> Iterator[None]:
     """Let torch use all cores of this process, as nothing here is timed; then restore its number of threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(usable_cores())
@@ -89,7 +89,7 @@ def _all_cores() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def network_input(images: Tensor) -> Tensor:
+def prepare_images(images: Tensor) -> Tensor:
     """Display images (N, H, W, 3) as the network's input, (N, 3, 299, 299) in −1…1.
 
     Bilinear without aligned corners and without a low-pass, as in FID's common PyTorch form; 2x − 1. Channels last,
@@ -140,11 +140,11 @@ def find_weights(path: Path | None = None) -> tuple[Path, InceptionWeights] | No
             raise StoreError(
                 f"Inception weights: {path} is no file; name one, or leave the key away to search for them"
             )
-        sha256 = _sha256(path)
+        sha256 = _hash_file(path)
         return path, InceptionWeights(f"the given file {path.name}", sha256, sha256 == PACKAGE_SHA256)
-    if (packaged := _packaged()) is None:
+    if (packaged := _find_package_file()) is None:
         return None
-    source, sha256 = f"the package {PACKAGE} {version(PACKAGE)}", _sha256(packaged)
+    source, sha256 = f"the package {PACKAGE} {version(PACKAGE)}", _hash_file(packaged)
     if sha256 != PACKAGE_SHA256:
         raise StoreError(
             f"Inception weights: {packaged.name} in {source} has sha256 {sha256}, and the published file has "
@@ -153,7 +153,7 @@ def find_weights(path: Path | None = None) -> tuple[Path, InceptionWeights] | No
     return packaged, InceptionWeights(source, sha256, published=True)
 
 
-def _packaged() -> Path | None:
+def _find_package_file() -> Path | None:
     try:
         version(PACKAGE)
     except PackageNotFoundError:
@@ -164,6 +164,6 @@ def _packaged() -> Path | None:
     return next((file for file in files if file.is_file()), None)
 
 
-def _sha256(path: Path) -> str:
+def _hash_file(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

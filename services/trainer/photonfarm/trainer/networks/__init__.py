@@ -53,7 +53,7 @@ ARCHITECTURES: dict[str, NetworkKind] = {
 }
 
 
-def kind_of(architecture: str) -> NetworkKind:
+def find_kind(architecture: str) -> NetworkKind:
     """The architecture of a name. Raises SpecError for a user's own that cannot be loaded.
 
     Such a network is a subclass of `torch.nn.Module` with the arguments `NetworkSettings` and `SceneFrame`, whose
@@ -76,7 +76,7 @@ def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         try:
-            return kind_of(settings.architecture).make(settings, frame)
+            return find_kind(settings.architecture).make(settings, frame)
         except TypeError as error:
             if user_code.is_own(settings.architecture):
                 raise SpecError(
@@ -85,7 +85,7 @@ def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:
             raise
 
 
-def image_of(network: nn.Module, inputs: Inputs) -> Tensor:
+def predict_image(network: nn.Module, inputs: Inputs) -> Tensor:
     """A network's image, (B, H, W, 3); SpecError if a user's network makes one of another shape."""
     image: Tensor = network(inputs)
     if image.shape != inputs.albedo.shape:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, SceneFrame, given
+from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, SceneFrame, require
 from photonfarm.trainer.networks.lit_points import CHANNELS, DIFFUSE, LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
@@ -51,7 +51,7 @@ def guide_channels(inputs: Inputs, scale: float) -> list[Tensor]:
 
     Depths are divided by `scale`.
     """
-    guides = given(inputs.guides)
+    guides = require(inputs.guides)
     reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
     return [
         torch.log1p(guides.emission),
@@ -98,7 +98,7 @@ class Guided(Network):
 
     def factor(self, inputs: Inputs) -> Tensor:
         """Reflectance, with its least value, (B, H, W, 3)."""
-        guides = given(inputs.guides)
+        guides = require(inputs.guides)
         return reflectance(inputs.albedo, guides) + floor(inputs.albedo, guides)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
@@ -112,7 +112,7 @@ class Guided(Network):
 
         The further light is that of all lit points, or else that of photons in the widest window.
         """
-        guides = given(inputs.guides)
+        guides = require(inputs.guides)
         light = guides.emission + guides.direct + guides.gloss
         if self.lit_points is None and self.photon_light is None:
             return light

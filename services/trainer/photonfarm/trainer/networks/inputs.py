@@ -60,9 +60,9 @@ class SceneFrame:
         """
         low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
         used = slice(settings.points)
-        emission = _normalised(cloud.emission[used])
+        emission = _normalise(cloud.emission[used])
         if settings.emission == "log":
-            emission = _normalised(np.log1p(emission))
+            emission = _normalise(np.log1p(emission))
         appearance = np.concatenate([cloud.normal[used], cloud.albedo[used], emission], axis=1)
         scale = max(0.5 * float(np.linalg.norm(high - low)), 1e-30)
         return cls(
@@ -80,7 +80,7 @@ class SceneFrame:
         )
 
 
-def _normalised(emission: F32) -> F32:
+def _normalise(emission: F32) -> F32:
     """Emission (P, 3) over its root mean square."""
     return np.asarray(emission / max(float(np.sqrt(np.mean(emission**2))), 1e-30), np.float32)
 
@@ -181,7 +181,7 @@ class Inputs:
         return inputs
 
 
-def given(member: M | None) -> M:
+def require(member: M | None) -> M:
     """A member of the inputs that is needed; raises ValueError if it was not filled."""
     if member is None:
         raise ValueError("inputs: lack what the network needs; make them with the `Needs` of its architecture")

@@ -27,8 +27,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from photonfarm.core.records import LIT_POINTS
-from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, given
-from photonfarm.trainer.networks.network import with_octaves
+from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, require
+from photonfarm.trainer.networks.network import add_octaves
 
 COARSE = 4
 """The side, in pixels, of the squares for which diffuse light is summed: it changes little between neighbours."""
@@ -80,7 +80,7 @@ class LearnedVisibility(nn.Module):
 
     def surfaces(self, position: Tensor, normal: Tensor) -> Tensor:
         """The features of a surface: its place, in sines and cosines, and its normal, (N, C)."""
-        return torch.cat([with_octaves(position / self._scale, OCTAVES), normal], dim=-1)
+        return torch.cat([add_octaves(position / self._scale, OCTAVES), normal], dim=-1)
 
     def forward(self, receivers: Tensor, senders: Tensor) -> Tensor:
         """The visibility of each sender from each receiver, (N, C) and (L, C) → (N, L)."""
@@ -127,7 +127,7 @@ class LitPoints(nn.Module):
         return [torch.stack(parts) for parts in zip(*images, strict=True)]
 
     def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
-        points, guides = given(inputs.points), given(inputs.guides)
+        points, guides = require(inputs.points), require(inputs.guides)
         source, there = points.position[place, : self._count] - self.centre, points.present[place, : self._count, None]
         sent = self.albedo * there * guides.point_light[place, : self._count] / math.pi
         if 0 <= self._max_depth < PATH_EDGES:
@@ -143,7 +143,7 @@ class LitPoints(nn.Module):
 
     def _surfaces(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         """The ray, position and normal of each pixel's surface, (H, W, 3) each."""
-        guides, to_camera = given(inputs.guides), inputs.world_to_camera[place]
+        guides, to_camera = require(inputs.guides), inputs.world_to_camera[place]
         rays = self._optics.rays(to_camera[None])[0]
         eye = -to_camera[:, :3].T @ to_camera[:, 3] - self.centre
         distance = guides.mean_depth[place] / (rays @ to_camera[2, :3])
@@ -151,7 +151,7 @@ class LitPoints(nn.Module):
 
     def _diffuse(self, surface: Tensor, normal: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
         """The points' light without and with learned visibility, (H, W, 3) each."""
-        at, facing = (_pooled(image).reshape(-1, 3) for image in (surface, normal))
+        at, facing = (_pool(image).reshape(-1, 3) for image in (surface, normal))
         arriving = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, sent), dim=-1)
         height, width = surface.shape[0] // COARSE, surface.shape[1] // COARSE
         coarse = arriving.reshape(1, height, width, 6).permute(0, 3, 1, 2)
@@ -199,6 +199,6 @@ class LitPoints(nn.Module):
         return leaves, squared.clamp(min=self._area / math.pi)
 
 
-def _pooled(image: Tensor) -> Tensor:
+def _pool(image: Tensor) -> Tensor:
     """Means over squares of pixels, (H, W, 3) → (H/4, W/4, 3)."""
     return functional.avg_pool2d(image.permute(2, 0, 1)[None], COARSE)[0].permute(1, 2, 0)

@@ -28,8 +28,8 @@ class ConvBlock(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.first = _conv(width, width)
-        self.second = _conv(width, width)
+        self.first = _make_convolution(width, width)
+        self.second = _make_convolution(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) → (B, C, H, W)."""
@@ -48,11 +48,11 @@ class ImageSynthesisLayer(nn.Module):
         super().__init__()
         self.precision = precision
         widths = [width << level for level in range(HALVINGS + 1)]
-        self.enter = nn.ModuleList(_conv(a, b) for a, b in pairwise([channels_in, *widths]))
+        self.enter = nn.ModuleList(_make_convolution(a, b) for a, b in pairwise([channels_in, *widths]))
         self.encode = nn.ModuleList(ConvBlock(w) for w in widths)
-        self.join = nn.ModuleList(_conv(fine + coarse, fine) for fine, coarse in pairwise(widths))
+        self.join = nn.ModuleList(_make_convolution(fine + coarse, fine) for fine, coarse in pairwise(widths))
         self.decode = nn.ModuleList(ConvBlock(w) for w in widths[:-1])
-        self.out = _conv(width, 3)
+        self.out = _make_convolution(width, 3)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, channels_in, H, W) → (B, 3, H, W), exposed linear radiance."""
@@ -73,7 +73,7 @@ class ImageSynthesisLayer(nn.Module):
         return x
 
 
-def _conv(channels_in: int, channels_out: int) -> nn.Conv2d:
+def _make_convolution(channels_in: int, channels_out: int) -> nn.Conv2d:
     return nn.Conv2d(channels_in, channels_out, kernel_size=3, padding=1)
 
 
@@ -89,12 +89,12 @@ learn where lights are.
 """
 
 
-def descriptors(points: int, settings: NetworkSettings) -> nn.Parameter:
+def make_descriptors(points: int, settings: NetworkSettings) -> nn.Parameter:
     """The learnable numbers of each point, (P, descriptor), initialised."""
     return nn.Parameter(DESCRIPTOR_SIZE * torch.randn(points, settings.descriptor))
 
 
-def with_octaves(x: Tensor, octaves: int) -> Tensor:
+def add_octaves(x: Tensor, octaves: int) -> Tensor:
     """Coordinates near 1, (…, 3), with sin and cos of π/2 · 2ᵏ times each, k = 0 … octaves − 1: (…, 3 + 6 · octaves).
 
     From these, functions of the position are learned in far fewer steps (Tancik et al., Fourier Features, 2020).
@@ -161,7 +161,7 @@ class Network(nn.Module):
 
         (…, 3) → (…, 3 + 6 · octaves); see `with_octaves`.
         """
-        return with_octaves((position - self.centre) / self.scale, self.octaves)
+        return add_octaves((position - self.centre) / self.scale, self.octaves)
 
     def project(self, features: Tensor, position: Tensor, present: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
         """Features of points at world positions, (B, P, C), as the mean in each pixel, (B, H, W, C)."""

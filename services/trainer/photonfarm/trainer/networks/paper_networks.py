@@ -18,8 +18,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, SceneFrame, given
-from photonfarm.trainer.networks.network import Network, descriptors
+from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, SceneFrame, require
+from photonfarm.trainer.networks.network import Network, make_descriptors
 from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
 from photonfarm.trainer.runs.settings import NetworkSettings
 
@@ -32,11 +32,11 @@ class FeatureProjection(Network):
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
         super().__init__(settings, frame, further=settings.descriptor)
-        self.descriptor = descriptors(len(frame.appearance), settings)
+        self.descriptor = make_descriptors(len(frame.appearance), settings)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """The descriptors, averaged over the points in each pixel, (B, H, W, descriptor)."""
-        points = given(inputs.points)
+        points = require(inputs.points)
         features = self.descriptor.expand(len(points.position), -1, -1)
         return [self.project(features, points.position, points.present, points.seen, inputs)]
 
@@ -64,7 +64,7 @@ class Denoiser(Network):
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """The noisy colour, zero where not kept, and the mask, (B, H, W, 3) and (B, H, W, 1)."""
-        noisy = given(inputs.noisy)
+        noisy = require(inputs.noisy)
         return [noisy.colour, noisy.kept[..., None].to(noisy.colour)]
 
 
@@ -94,11 +94,11 @@ class ResidualBlock(nn.Module):
 
     def forward(self, local: Tensor, shared: Tensor) -> Tensor:
         """(B, P, L) and (B, G) with L + G = 64 → (B, P, 32)."""
-        hidden = _linear(self.hidden, torch.relu(local), torch.relu(shared))
-        return _linear(self.shortcut, local, shared) + self.out(torch.relu(hidden))
+        hidden = _make_linear(self.hidden, torch.relu(local), torch.relu(shared))
+        return _make_linear(self.shortcut, local, shared) + self.out(torch.relu(hidden))
 
 
-def _linear(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
+def _make_linear(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
     """Apply `layer` to each point's [local, shared], without building it."""
     own, common = torch.split(layer.weight, [local.shape[-1], shared.shape[-1]], dim=1)
     return functional.linear(local, own) + functional.linear(shared, common, layer.bias)[:, None]
@@ -163,12 +163,12 @@ class LightTransport(Network):
         self.register_buffer("appearance", torch.from_numpy(frame.appearance), persistent=False)
         self.register_buffer("base", torch.from_numpy(frame.base), persistent=False)
         self.relative = settings.maxima == "relative"
-        self.descriptor = descriptors(points, settings)
+        self.descriptor = make_descriptors(points, settings)
         self.light_transport = LightTransportLayer(self.coordinate_count, appearance + settings.descriptor)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """f_i, averaged over the points in each pixel, (B, H, W, 64)."""
-        points = given(inputs.points)
+        points = require(inputs.points)
         return [self.project(self.point_features(points), points.position, points.present, points.seen, inputs)]
 
     def point_features(self, points: PointInputs) -> Tensor:
@@ -198,7 +198,7 @@ class LightTransportPhotons(LightTransport):
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """The points' features, and log(1 + gathered light), (B, H, W, 3) each, or the photons' features, 64 wide."""
-        features, photons = super().further(inputs), given(inputs.photons)
+        features, photons = super().further(inputs), require(inputs.photons)
         if self.photon_transport is None:
             return [*features, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
         where = photons.position, photons.present, photons.seen

@@ -15,7 +15,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from photonfarm.core.errors import SpecError
-from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, given
+from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, require
 from photonfarm.trainer.networks.projection import Footprint, Optics, footprint
 
 
@@ -38,11 +38,11 @@ class PhotonLight:
 
     def __call__(self, inputs: Inputs) -> list[Tensor]:
         """(B, H, W, 3) for each of `photon_map.WINDOWS`."""
-        photons, view = given(inputs.photons), (inputs.world_to_camera, inputs.depth, inputs.normal)
+        photons, view = require(inputs.photons), (inputs.world_to_camera, inputs.depth, inputs.normal)
         on_side = arrives_on_seen_side(photons.position, photons.direction, photons.normal, inputs.world_to_camera)
         wanted = photons.present & on_side & (photons.bounce >= self._first) & (photons.bounce <= self._last)
         kept = footprint(photons.position, wanted, photons.seen, *view, self._optics)
-        return gathered(photons.power * self._exposure, kept, seen_area(self._optics, *view))
+        return gather_light(photons.power * self._exposure, kept, seen_area(self._optics, *view))
 
 
 WINDOWS = (0.07, 0.17)
@@ -73,7 +73,7 @@ def arrives_on_seen_side(position: Tensor, direction: Tensor, normal: Tensor, wo
     return (direction * normal).sum(dim=-1) * ((position - eye) * normal).sum(dim=-1) > 0
 
 
-def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
+def gather_light(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
     """Irradiance / π in each of `WINDOWS`, (B, H, W, 3): the radiance of white diffuse surfaces.
 
     power (B, K, 3) is flux over the number of paths emitted, area (B, H, W), and pixels where that is 0 are left out.
@@ -85,13 +85,13 @@ def gathered(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
     both = torch.cat([flux * (area > 0)[..., None], area[..., None]], dim=-1).permute(0, 3, 1, 2)
     maps = []
     for share in WINDOWS:
-        around = _blurred(both, max(round(0.5 * (share * W - 1)), 1)).permute(0, 2, 3, 1)
+        around = _blur(both, max(round(0.5 * (share * W - 1)), 1)).permute(0, 2, 3, 1)
         seen = around[..., 3:]
         maps.append(around[..., :3] / torch.where(seen > 0, seen, torch.inf) / math.pi)
     return maps
 
 
-def _blurred(x: Tensor, beside: int) -> Tensor:
+def _blur(x: Tensor, beside: int) -> Tensor:
     """Means over squares with so many pixels on each side of a pixel, three times, (B, C, H, W); zero outside."""
     side = 2 * beside + 1
     for _ in range(3):

@@ -13,7 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.trainer.networks import build, kind_of
+from photonfarm.trainer.networks import build, find_kind
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.projection import Optics
@@ -43,34 +43,34 @@ class NetworkPart:
     gmacs: float  # 10⁹ multiply-adds of matrix products and convolutions, for one image
 
 
-def summary(spec: SceneSpec, settings: NetworkSettings) -> list[NetworkPart]:
+def summarise(spec: SceneSpec, settings: NetworkSettings) -> list[NetworkPart]:
     """The parts of a scene's network. It makes one image of made-up points and buffers for this.
 
     A multiply-add is two of the operations that torch's FlopCounterMode counts, which are those of convolutions and
     matrix products; sums, such as the mean over the points in a pixel, are not counted.
     """
-    network = build(settings, _frame(spec, settings), seed=0)
+    network = build(settings, _make_frame(spec, settings), seed=0)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
-        network(_inputs(spec, settings))
+        network(_make_inputs(spec, settings))
     counts = {name: sum(ops.values()) / 2e9 for name, ops in counter.get_flop_counts().items()}
     root = type(network).__name__
     gmacs = dict.fromkeys(PARTS, 0.0)
     for module, part in MODULES.items():
         gmacs[part] += counts.get(f"{root}.{module}", 0.0)
     rest = counts["Global"] - sum(gmacs.values())
-    parameters = _parameters(network)
+    parameters = _count_parameters(network)
     gmacs[OTHER if parameters[OTHER] else "projection"] = rest
     return [NetworkPart(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
 
 
-def table(parts: list[NetworkPart]) -> str:
+def format_summary(parts: list[NetworkPart]) -> str:
     """The parts and their sum, a line each."""
     total = NetworkPart("total", sum(part.parameters for part in parts), sum(part.gmacs for part in parts))
     lines = [f"{part.name:<14}{part.parameters:>12,}{part.gmacs:>10.3f}" for part in (*parts, total)]
     return "\n".join([f"{'part':<14}{'parameters':>12}{'GMAC':>10}", *lines])
 
 
-def _parameters(network: Network) -> dict[str, int]:
+def _count_parameters(network: Network) -> dict[str, int]:
     """The number of parameters of each part; descriptors belong to the points."""
     counts = dict.fromkeys(PARTS, 0)
     for name, parameter in network.named_parameters():
@@ -79,7 +79,7 @@ def _parameters(network: Network) -> dict[str, int]:
     return counts
 
 
-def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
+def _make_frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
     """A frame with as many points and photons as the scene has; their values do not matter."""
     points = min(settings.points or spec.points, spec.points)
     appearance, base = np.zeros((points, 9), np.float32), np.zeros((points, 3), np.float32)
@@ -88,9 +88,9 @@ def _frame(spec: SceneSpec, settings: NetworkSettings) -> SceneFrame:
     return SceneFrame(optics, np.zeros(3, np.float32), 1.0, base, appearance, *photons, 1.0, -1, 1.0, 1.0)
 
 
-def _inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:
+def _make_inputs(spec: SceneSpec, settings: NetworkSettings) -> Inputs:
     """Inputs of one image that are all zero: all points lie in the eye, and none is projected."""
-    needs = kind_of(settings.architecture).needs
+    needs = find_kind(settings.architecture).needs
     tensors = SampleTensors(spec, needs.fields, points=settings.points).empty(1)
     for values in tensors.values():
         values.zero_()

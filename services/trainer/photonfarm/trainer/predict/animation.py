@@ -23,7 +23,7 @@ FFMPEG = "imageio_ffmpeg"
 PICTURE_WIDTH = 256  # px, at least
 
 
-def enlarged(exposed: F32) -> Picture:
+def enlarge(exposed: F32) -> Picture:
     """Exposed linear radiance, (H, W, 3), as a display shows it; the pixels of a small image are enlarged."""
     scale = max(1, -(-PICTURE_WIDTH // exposed.shape[1]))
     return display(exposed, 1.0).repeat(scale, axis=0).repeat(scale, axis=1)
@@ -89,14 +89,14 @@ def write_mp4(pictures: Iterable[Picture], file: Path, fps: float) -> None:
     with store_errors("write the film", file), tempfile.TemporaryFile() as log:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=log) as process:
             if process.stdin is not None:
-                _pour(chain([first], coming), process.stdin)
+                _write_frames(chain([first], coming), process.stdin)
         log.seek(0)
         lines = log.read().decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
     if process.returncode:
         raise StoreError(f"{file}: ffmpeg cannot write the film: {lines[-1]}")
 
 
-def _pour(pictures: Iterable[Picture], pipe: IO[bytes]) -> None:
+def _write_frames(pictures: Iterable[Picture], pipe: IO[bytes]) -> None:
     """Write the pictures to the pipe until it is closed, and close it."""
     try:
         with pipe:

@@ -31,7 +31,7 @@ from torch.nn import functional
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.records import F32
-from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, given
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, require
 
 LEAST_ALBEDO = 0.01
 """The albedo below which a channel counts as having none: lamps, mirrors, glass, and the sky."""
@@ -57,24 +57,24 @@ def fill_in(noisy: NoisyColour, albedo: Tensor) -> Tensor:
     side = max(kept.shape[1:3])
     while bool(open_.any()) and sigma < 2 * side:
         for kind in (has_albedo, ~has_albedo):
-            filled, open_ = _filled(filled, open_ & kind, open_, noisy.colour, kept * kind, divisor, sigma)
+            filled, open_ = _fill(filled, open_ & kind, open_, noisy.colour, kept * kind, divisor, sigma)
         sigma *= 2
     everything, one = kept.expand_as(divisor), torch.ones_like(divisor)
-    return _filled(filled, open_, open_, noisy.colour, everything, one, sigma)[0]
+    return _fill(filled, open_, open_, noisy.colour, everything, one, sigma)[0]
 
 
-def _filled(
+def _fill(
     image: Tensor, wanted: Tensor, open_: Tensor, colour: Tensor, weight: Tensor, divisor: Tensor, sigma: float
 ) -> tuple[Tensor, Tensor]:
     """The image with the wanted pixels filled in as far as kept ones reach, and those still open; (B, H, W, 3) all."""
     if not bool(wanted.any()):
         return image, open_
-    light, surface = (_blurred(weight * values, sigma) for values in (colour, divisor))
+    light, surface = (_blur(weight * values, sigma) for values in (colour, divisor))
     done = wanted & (surface > 0)
     return torch.where(done, divisor * light / torch.where(done, surface, 1), image), open_ & ~done
 
 
-def _blurred(image: Tensor, sigma: float) -> Tensor:
+def _blur(image: Tensor, sigma: float) -> Tensor:
     """The sum over a Gaussian window around each pixel, (B, H, W, 3); zero beyond the border."""
     reach = math.ceil(REACH * sigma)
     window = torch.exp(-0.5 * (torch.arange(-reach, reach + 1).to(image) / sigma) ** 2)
@@ -95,7 +95,7 @@ class Oidn:
 
     def __init__(self, threads: int = 1) -> None:
         """Load the library. Raises SpecError if the package is not installed or does not work here."""
-        self._oidn = _package()
+        self._oidn = _import_package()
         self._device = self._oidn.Device(self._oidn.OIDN_DEVICE_TYPE_CPU)
         self._device.set_int("numThreads", threads)
         self._device.set_bool("setAffinity", False)  # renderers share the machine
@@ -104,7 +104,7 @@ class Oidn:
 
     def __call__(self, inputs: Inputs) -> Tensor:
         """A batch's images, (B, H, W, 3), linear radiance × exposure."""
-        whole = fill_in(given(inputs.noisy), inputs.albedo)
+        whole = fill_in(require(inputs.noisy), inputs.albedo)
         images = zip(whole.numpy(), inputs.albedo.numpy(), inputs.normal.numpy(), strict=True)
         return torch.from_numpy(np.stack([self.denoised(*image) for image in images]))
 
@@ -131,7 +131,7 @@ class Oidn:
             raise SpecError(f"the denoiser oidn: {PACKAGE} does not work here: {error}")
 
 
-def _package() -> ModuleType:
+def _import_package() -> ModuleType:
     try:
         return import_module(PACKAGE)
     except (ImportError, OSError) as error:  # the latter if its library cannot be loaded

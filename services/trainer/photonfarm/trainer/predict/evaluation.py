@@ -19,7 +19,7 @@ from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.networks import image_of
+from photonfarm.trainer.networks import predict_image
 from photonfarm.trainer.networks.inputs import Inputs, map_tensors
 from photonfarm.trainer.networks.network import Network
 
@@ -87,25 +87,25 @@ class DevicePredictor:
             torch.cuda.synchronize(self.device)
 
 
-def by_turns(calls: Sequence[tuple[DevicePredictor, Inputs]]) -> list[Seconds]:
+def time_by_turns(calls: Sequence[tuple[DevicePredictor, Inputs]]) -> list[Seconds]:
     """The time of each predictor for its inputs, over `TIMED_ROUNDS` rounds of all; the inputs are `of_its_own`."""
     rounds = [[predict.wall_s(inputs) for predict, inputs in calls] for _ in range(WARM_ROUNDS + TIMED_ROUNDS)]
     return [Seconds.of(times) for times in np.array(rounds[WARM_ROUNDS:]).T]
 
 
-def batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[TrainingBatch]:
+def read_batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[TrainingBatch]:
     """The rows as batches, read through the feed, in their order."""
     for start in range(0, len(rows), size):
         feed.ask(rows[start : start + size])
         yield feed.take()
 
 
-def network_predictor(network: Network) -> DevicePredictor:
+def make_network_predictor(network: Network) -> DevicePredictor:
     """The network as a predictor, on the device of its parameters."""
-    return DevicePredictor(partial(image_of, network), next(network.parameters()).device)
+    return DevicePredictor(partial(predict_image, network), next(network.parameters()).device)
 
 
-def mean_colours(samples: Iterator[TrainingBatch]) -> tuple[F32, F32]:
+def average_colours(samples: Iterator[TrainingBatch]) -> tuple[F32, F32]:
     """The mean exposed colours over samples and pixels, (3,) each: the best predictions without any input.
 
     The first is for `error`, the second for `shown`, with light above white cut to white.
@@ -114,32 +114,32 @@ def mean_colours(samples: Iterator[TrainingBatch]) -> tuple[F32, F32]:
     for batch in samples:
         for image in batch.target.double().mean(dim=1).numpy():
             means.append(image.mean(axis=(0, 1)))
-            shown.append(np.minimum(block_means(image), WHITE).mean(axis=(0, 1)))
+            shown.append(np.minimum(average_blocks(image), WHITE).mean(axis=(0, 1)))
     return np.mean(means, axis=0).astype(np.float32), np.mean(shown, axis=0).astype(np.float32)
 
 
-def constant_predictor(colour: F32) -> Predictor:
+def make_constant_predictor(colour: F32) -> Predictor:
     """A predictor of the same colour everywhere."""
     return lambda batch: np.broadcast_to(colour, batch.inputs.albedo.shape)
 
 
-def error_of(batch: TrainingBatch) -> Callable[[F32, F32, F32], float]:
+def choose_error(batch: TrainingBatch) -> Callable[[F32, F32, F32], float]:
     """The noise-free error of predictions for this batch, given A and B; the formula depends on whether A is input."""
     return clean_error if batch.inputs.noisy is None else clean_error_having_seen_a
 
 
-def _shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
+def _measure_shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
     """The error of means over blocks of `BLOCK` × `BLOCK` pixels, with light above white cut to white.
 
     Without the cut a lamp in view, hundreds of times brighter than the surfaces it lights, makes up most of the error.
     Means come before the cut, as noise above white would be cut as well: of single noisy pixels the cut makes the
     targets so much darker that a network that is too dark looks better than the right one.
     """
-    prediction, half_a, half_b = (np.minimum(block_means(image), WHITE) for image in images)
+    prediction, half_a, half_b = (np.minimum(average_blocks(image), WHITE) for image in images)
     return error(prediction, half_a, half_b)
 
 
-def block_means(image: F32) -> F32:
+def average_blocks(image: F32) -> F32:
     """Means over blocks of pixels, (H, W, 3) → (⌈H/BLOCK⌉, ⌈W/BLOCK⌉, 3); blocks at the far edges may be smaller."""
     sums, counts = image, np.ones((*image.shape[:2], 1), np.float32)
     for axis in (0, 1):
@@ -159,10 +159,10 @@ def measure(predict: Predictor, samples: Iterator[TrainingBatch]) -> HeldOutErro
     units: list[Key] = []
     for batch in samples:
         units.extend(batch.units)
-        error = error_of(batch)
+        error = choose_error(batch)
         for image, (half_a, half_b) in zip(predict(batch), batch.target.cpu().numpy(), strict=True):
             errors.append(error(image, half_a, half_b))
-            shown.append(_shown(error, image, half_a, half_b))
+            shown.append(_measure_shown(error, image, half_a, half_b))
             floors.append(noise_floor(half_a, half_b))
     if not errors:
         raise IncompleteError(NONE_COMPLETE)

@@ -27,11 +27,11 @@ from photonfarm.store import Sample, SceneReader, Store
 from photonfarm.store.read.find import Query, find_samples
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.networks.inputs import given
+from photonfarm.trainer.networks.inputs import require
 from photonfarm.trainer.predict import animation
-from photonfarm.trainer.predict.evaluation import error_of
+from photonfarm.trainer.predict.evaluation import choose_error
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.runs.run_folder import with_scenes
+from photonfarm.trainer.runs.run_folder import make_environment
 
 VERB = "buffers"  # of the renderer
 NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
@@ -75,38 +75,38 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     Raises StoreError for a row that is not planned, IncompleteError for one that is not complete.
     """
     torch.set_num_threads(run.settings.threads)
-    source = _source(store, run)
+    source = _open_source(store, run)
     with Feed(source, run.settings.model_copy(update={"device": "cpu"})) as feed:
         if row not in dict(feed.arrivals()[0]):
-            raise _missing(source, row)
+            raise _explain_missing(source, row)
         feed.ask([row])
         batch = feed.take()
         predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), device)
     shown = {"prediction": (image := predict(batch)[0]), "target": batch.target[0].mean(dim=0).numpy()}
     files = tuple(out / f"{name}.png" for name in shown)
-    _make(out)
+    _make_folder(out)
     for file, pixels in zip(files, shown.values(), strict=True):
-        animation.write_png(animation.enlarged(pixels), file)
+        animation.write_png(animation.enlarge(pixels), file)
     (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
-    return InferResult(files, f"row {row}: {_judged(image, batch) if is_held_out else NOT_JUDGED}")
+    return InferResult(files, f"row {row}: {_judge(image, batch) if is_held_out else NOT_JUDGED}")
 
 
-def _missing(source: SceneReader, row: int) -> PhotonfarmError:
+def _explain_missing(source: SceneReader, row: int) -> PhotonfarmError:
     rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests), default=0)
     if row >= rows:
         return StoreError(f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0")
     return IncompleteError(f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers")
 
 
-def _judged(image: F32, batch: TrainingBatch) -> str:
+def _judge(image: F32, batch: TrainingBatch) -> str:
     half_a, half_b = batch.target[0].numpy()
-    return f"held out; squared error {error_of(batch)(image, half_a, half_b):.5f}, the noise taken out"
+    return f"held out; squared error {choose_error(batch)(image, half_a, half_b):.5f}, the noise taken out"
 
 
 # ------------------------------------------------------------------------------------------------------ a camera path
 
 
-def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
+def render_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
     """The frames that `photonfarm buffers` makes for the arguments, such as --orbit 24, and the scene of the run.
 
     Raises SpecError if the verb is not installed, PhotonfarmError with its exit code if it failed.
@@ -119,13 +119,13 @@ def rendered_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "buffers.npz"
         named = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
-        verb, environment = command(VERB, *named, *arguments), with_scenes(run.folder)
+        verb, environment = command(VERB, *named, *arguments), make_environment(run.folder)
         if code := subprocess.run(verb, env=environment, stdout=subprocess.DEVNULL, check=False).returncode:
-            raise _ended(code)
+            raise _make_error(code)
         return Frames.read(file)
 
 
-def _ended(code: int) -> PhotonfarmError:
+def _make_error(code: int) -> PhotonfarmError:
     """An error with the exit code of the verb, which has printed the reason."""
     error = PhotonfarmError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
     error.exit_code = code
@@ -140,18 +140,18 @@ def show_frames(
     Raises SpecError for frames of another scene or film, and for a network that needs a rendered image.
     """
     torch.set_num_threads(run.settings.threads)
-    source = _source(store, run)
-    _check(run, frames, source.spec)
+    source = _open_source(store, run)
+    _check_frames(run, frames, source.spec)
     predict = run.predictor(source.spec, source.base(), device)
-    _make(out)
+    _make_folder(out)
     files = [out / f"frame-{i:04}.png" for i in range(len(frames))]
     seconds = 0.0
-    frame_batches = _batches(run, frames, source)
+    frame_batches = _read_frames(run, frames, source)
     for file in files:
         began = time.perf_counter()
         image = predict(next(frame_batches))[0]
         seconds += time.perf_counter() - began
-        animation.write_png(animation.enlarged(image), file)
+        animation.write_png(animation.enlarge(image), file)
     sentence = f"{len(frames)} frames, {1e3 * seconds / len(frames):.1f} ms each for the network and what it reads"
     animation.write_gif(map(animation.read_png, files), out / "path.gif", fps)
     if not animation.can_write_mp4():
@@ -170,7 +170,7 @@ def check_path(run: TrainedRun) -> None:
         )
 
 
-def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
+def _check_frames(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
     check_path(run)
     film = (len(frames), spec.film.height, spec.film.width)
     if (frames.scene_id, frames.depth.shape) != (run.scene_id, film):
@@ -182,7 +182,7 @@ def _check(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
         raise SpecError(f"{run.folder}: {run.settings.network.architecture} needs photons, and the buffers have none")
 
 
-def _batches(run: TrainedRun, frames: Frames, source: SceneReader) -> Iterator[TrainingBatch]:
+def _read_frames(run: TrainedRun, frames: Frames, source: SceneReader) -> Iterator[TrainingBatch]:
     """The frames one by one, in memory that is reused."""
     spec = source.spec
     tensors = SampleTensors(spec, run.needs.fields, exposure=spec.exposure, points=run.settings.network.points)
@@ -198,19 +198,19 @@ def _batches(run: TrainedRun, frames: Frames, source: SceneReader) -> Iterator[T
             black,
             *seen,
             read_cloud=lambda: source.base()[1],
-            read_photons=lambda: given(frames.photons),
+            read_photons=lambda: require(frames.photons),
         )
         tensors.fill(memory, 0, sample)
         yield TrainingBatch.of((i,), (b"",), memory)
 
 
-def _source(store: str | Path, run: TrainedRun) -> SceneReader:
+def _open_source(store: str | Path, run: TrainedRun) -> SceneReader:
     """The samples of the run's scene; StoreError if there is no store, or it lacks the scene."""
     source = run.source(Store(store).root)
     _ = source.spec  # which says what is there instead
     return source
 
 
-def _make(folder: Path) -> None:
+def _make_folder(folder: Path) -> None:
     with store_errors("make the folder of the pictures", folder):
         folder.mkdir(parents=True, exist_ok=True)

@@ -14,17 +14,17 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader
-from photonfarm.trainer.networks import build, kind_of
-from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, given
+from photonfarm.trainer.networks import build, find_kind
+from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.predict.denoisers import fill_in
-from photonfarm.trainer.predict.evaluation import DevicePredictor, network_predictor
+from photonfarm.trainer.predict.evaluation import DevicePredictor, make_network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
-from photonfarm.trainer.runs.user_code import named_in_errors
+from photonfarm.trainer.runs.user_code import name_in_errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,7 +57,7 @@ class TrainedRun:
     def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:
         """The trained network, on the CPU, for the scene that it was trained on."""
         settings = self.settings.network
-        with named_in_errors(architecture=settings.architecture):
+        with name_in_errors(architecture=settings.architecture):
             network = build(settings, SceneFrame.of(spec, *base, settings), self.settings.seed)
         try:
             network.load_state_dict(self.weights)
@@ -79,12 +79,12 @@ class TrainedRun:
     @property
     def needs(self) -> Needs:
         """The inputs of its network."""
-        return kind_of(self.settings.network.architecture).needs
+        return find_kind(self.settings.network.architecture).needs
 
     def predictor(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud], device: str) -> DevicePredictor:
         """The network as a predictor on a device. SpecError if the device is not usable."""
-        predict = network_predictor(self.network(spec, base).to(usable_device(device)).eval())
-        named = named_in_errors(architecture=self.settings.network.architecture)
+        predict = make_network_predictor(self.network(spec, base).to(usable_device(device)).eval())
+        named = name_in_errors(architecture=self.settings.network.architecture)
         return replace(predict, images=named(predict.images))
 
 
@@ -112,9 +112,9 @@ class ReadyPredictor:
 
     def _images(self) -> Callable[[Inputs], Tensor]:
         if self.denoiser == "none":
-            return lambda inputs: given(inputs.noisy).colour
+            return lambda inputs: require(inputs.noisy).colour
         if self.denoiser == "fill-in":
-            return lambda inputs: fill_in(given(inputs.noisy), inputs.albedo)
+            return lambda inputs: fill_in(require(inputs.noisy), inputs.albedo)
         from photonfarm.trainer.predict.denoisers import Oidn
 
         return Oidn(self.settings.threads)

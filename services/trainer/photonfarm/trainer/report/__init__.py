@@ -13,13 +13,13 @@ from typing import Any
 
 from photonfarm.core.errors import store_errors
 from photonfarm.trainer.compare.evaluate import MeasureProgress
-from photonfarm.trainer.compare.evaluation_page import COMPARISON, comparison
+from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparison
 from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.trained import TrainedRun
-from photonfarm.trainer.report.contents import gathered
-from photonfarm.trainer.report.page import Verdict, markdown, page
-from photonfarm.trainer.report.plots import plots
-from photonfarm.trainer.report.views import OVERVIEW, overview, shown_views
+from photonfarm.trainer.report.contents import gather_contents
+from photonfarm.trainer.report.page import Verdict, format_markdown, render_page
+from photonfarm.trainer.report.plots import draw_plots
+from photonfarm.trainer.report.views import OVERVIEW, choose_views, draw_overview
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
@@ -46,7 +46,7 @@ def write_report(
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()  # an unwritable folder should fail before the measurements
-    contents = gathered(
+    contents = gather_contents(
         store,
         loaded,
         denoisers,
@@ -59,16 +59,16 @@ def write_report(
     )
     if on_progress:
         on_progress("plots and pages are drawn", 0, 0)
-    drawn, views, verdict = plots(contents), shown_views(contents), Verdict.of(contents)
+    drawn, views, verdict = draw_plots(contents), choose_views(contents), Verdict.of(contents)
     text = json.dumps({**contents.document(), "verdict": verdict.sentence}, indent=2, ensure_ascii=False)
     with store_errors("write the report", out):
         for plot in drawn:
             (out / f"{plot.name}.svg").write_bytes(plot.svg)
         (out / "report.json").write_text(text + "\n")
-        (out / "report.md").write_text(markdown(contents, verdict, drawn, COMPARISON))
-        (out / "report.html").write_text(page(contents, verdict, views, drawn))
-    write_png(comparison(contents.evaluation), out / COMPARISON)
+        (out / "report.md").write_text(format_markdown(contents, verdict, drawn, COMPARISON))
+        (out / "report.html").write_text(render_page(contents, verdict, views, drawn))
+    write_png(draw_comparison(contents.evaluation), out / COMPARISON)
     if views:
-        write_png(overview(views), out / OVERVIEW)
+        write_png(draw_overview(views), out / OVERVIEW)
     document: dict[str, Any] = json.loads(text)
     return document

@@ -22,9 +22,15 @@ from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, Pre
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.report.dataset_card import DatasetCard
-from photonfarm.trainer.report.frame_times import FrameTime, Machine, frame_costs, frame_time, points_used
-from photonfarm.trainer.report.trained_runs import Baselines, RunStory, short_names
-from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, worst_cases
+from photonfarm.trainer.report.frame_times import (
+    FrameTime,
+    Machine,
+    assemble_frame_time,
+    count_points,
+    measure_frame_costs,
+)
+from photonfarm.trainer.report.trained_runs import Baselines, RunStory, shorten_names
+from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, find_worst_cases
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
@@ -66,7 +72,7 @@ PublishedTable = dict[str, Published]
 """Rows by architecture, in the order of the published table."""
 
 
-def table_of(spec: SceneSpec) -> tuple[str, PublishedTable] | None:
+def find_published_table(spec: SceneSpec) -> tuple[str, PublishedTable] | None:
     """The name of the published table for scenes of this kind, and its rows; None for a static scene."""
     if spec.lights:
         return "Table 2, movable objects and lights", MOVABLE_LIGHTS
@@ -136,7 +142,7 @@ class ReportContents:
         }
 
 
-def gathered(
+def gather_contents(
     store: str | Path,
     runs: Sequence[TrainedRun],
     denoisers: Sequence[tuple[ReadyDenoiser, int]],
@@ -153,7 +159,7 @@ def gathered(
     card = DatasetCard.of(store, first.scene_id, first.exposure)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     tell = on_progress or (lambda *_: None)
-    close_look = _CloseLook(store, first, kept, points_used(runs), tell, timed=timed)
+    close_look = _CloseLook(store, first, kept, count_points(runs), tell, timed=timed)
     evaluation = evaluate.compare(
         store,
         runs,
@@ -167,9 +173,9 @@ def gathered(
     )
     tell("the mean colour and the untrained network are measured", 0, 0)
     costs = close_look.costs
-    published = table_of(card.spec)
-    names = short_names(list(runs))
-    entries = tuple(_entries(evaluation, names, (runs, denoisers), costs, published[1] if published else {}))
+    published = find_published_table(card.spec)
+    names = shorten_names(list(runs))
+    entries = tuple(_make_entries(evaluation, names, (runs, denoisers), costs, published[1] if published else {}))
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
@@ -181,11 +187,11 @@ def gathered(
         machine=close_look.machine,
         worst=tuple(close_look.worst),
         published=published[0] if published and any(entry.published for entry in entries) else None,
-        inputs=_inputs(store, first, [target.row for target in evaluation.shown]),
+        inputs=_read_inputs(store, first, [target.row for target in evaluation.shown]),
     )
 
 
-def _inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tuple[ViewBuffers, Guides | None]]:
+def _read_inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tuple[ViewBuffers, Guides | None]]:
     """The buffers of some rows, and their guides if the run reads these."""
     source = run.source(store)
     source.refresh()
@@ -193,7 +199,7 @@ def _inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tu
     return {row: (sample.buffers, sample.guides) for row, sample in samples.items()}
 
 
-def _entries(
+def _make_entries(
     evaluation: Evaluation,
     names: list[str],
     measured: tuple[Sequence[TrainedRun], Sequence[tuple[ReadyDenoiser, int]]],
@@ -208,7 +214,7 @@ def _entries(
         name, architecture = row.name, None
         if isinstance(predictor, TrainedRun):
             name, architecture = names[place], predictor.settings.network.architecture
-        time = None if costs is None else frame_time(predictor, row.seconds, costs)
+        time = None if costs is None else assemble_frame_time(predictor, row.seconds, costs)
         entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
     return entries
 
@@ -241,12 +247,12 @@ class _CloseLook:
             self._on_progress("the renderer times frames", 0, 0)
             rows = list(references or images)
             try:
-                self.costs = frame_costs(self._store, self._run, rows, self._kept, self._points)
+                self.costs = measure_frame_costs(self._store, self._run, rows, self._kept, self._points)
             except BackendError as error:
                 self.untimed = str(error)
         self._on_progress("the worst cases are looked for", 0, 0)
         self.machine = Machine.here()
-        self.worst = worst_cases(self._views(images, references))
+        self.worst = find_worst_cases(self._views(images, references))
         return [case.row for case in self.worst]
 
     def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[HeldOutView]:

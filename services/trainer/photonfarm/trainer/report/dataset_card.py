@@ -57,7 +57,7 @@ class DatasetCard:
             requests,
             known,
             len(workers),
-            _spent(scene, core_s),
+            _sum_by_kind(scene, core_s),
         )
 
     @property
@@ -84,7 +84,7 @@ class DatasetCard:
             "scene_id": spec.scene_id,
             "credits": None if spec.credits is None else spec.credits.model_dump(),
             "source": spec.scene.file or f"built-in {spec.scene.builtin}",
-            "kind": kind(spec),
+            "kind": describe_kind(spec),
             "width": spec.film.width,
             "height": spec.film.height,
             "exposure": spec.exposure,
@@ -109,7 +109,7 @@ class DatasetCard:
         }
 
 
-def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanTotals]:
+def _sum_by_kind(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanTotals]:
     """The totals by kind of request, given the seconds of the committed jobs."""
     totals: dict[str, PlanTotals] = {}
     for plan in scene.plans():
@@ -124,7 +124,7 @@ def _spent(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanTotals]
     return {kind: spent for kind, spent in totals.items() if spent.rows}
 
 
-def kind(spec: SceneSpec) -> str:
+def describe_kind(spec: SceneSpec) -> str:
     """The variable parts of a scene, in words."""
     if not spec.groups:
         return "static: views alone differ"

@@ -19,7 +19,7 @@ from photonfarm.core.archives import FrameCosts, Seconds
 from photonfarm.core.errors import BackendError
 from photonfarm.core.processes import command, is_installed
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
-from photonfarm.trainer.runs.run_folder import with_scenes
+from photonfarm.trainer.runs.run_folder import make_environment
 
 CPU_INFO = Path("/proc/cpuinfo")
 
@@ -36,7 +36,7 @@ class Machine:
     @classmethod
     def here(cls) -> Machine:
         """The machine of this process, with its present load."""
-        return cls(_model(), os.cpu_count() or 1, platform.machine(), os.getloadavg())
+        return cls(_read_cpu_model(), os.cpu_count() or 1, platform.machine(), os.getloadavg())
 
     @property
     def stated(self) -> str:
@@ -48,7 +48,7 @@ class Machine:
         )
 
 
-def _model() -> str | None:
+def _read_cpu_model() -> str | None:
     try:
         model = re.search(r"^model name\s*:\s*(.+)$", CPU_INFO.read_text(), re.MULTILINE)
     except OSError:  # another system
@@ -91,7 +91,7 @@ class FrameTime:
         return {**medians, "total": self.total, "ranges": ranges}
 
 
-def frame_costs(
+def measure_frame_costs(
     store: str | Path, run: TrainedRun, rows: Sequence[int], kept: Sequence[int], points: int | None
 ) -> FrameCosts:
     """The renderer's measurement of the frames in some rows, with so many points of the cloud, or with all.
@@ -108,19 +108,19 @@ def frame_costs(
         asked += ["--timed", str(TIMED), *([] if points is None else ["--points", str(points)])]
         asked += [argument for row in rows for argument in ("--row", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
-        verb, environment = command(VERB, *asked), with_scenes(run.folder)
+        verb, environment = command(VERB, *asked), make_environment(run.folder)
         if code := subprocess.run(verb, env=environment, stdout=subprocess.DEVNULL, check=False).returncode:
             raise BackendError(f"`photonfarm {VERB}` ended with exit code {code} here")
         return FrameCosts.read(file)
 
 
-def points_used(runs: Sequence[TrainedRun]) -> int | None:
+def count_points(runs: Sequence[TrainedRun]) -> int | None:
     """The most points whose visibility one of these networks needs; None for the whole cloud."""
     used = [run.settings.network.points for run in runs if _sees_points(run)]
     return None if None in used else max((points for points in used if points), default=None)
 
 
-def frame_time(predictor: TrainedRun | ReadyPredictor, network: Seconds, costs: FrameCosts) -> FrameTime:
+def assemble_frame_time(predictor: TrainedRun | ReadyPredictor, network: Seconds, costs: FrameCosts) -> FrameTime:
     """The parts that a predictor needs, with its network's seconds."""
     needs, parts = predictor.needs, costs.parts()
     return FrameTime(

@@ -69,19 +69,19 @@ OF_CURVES = (
 )
 
 
-def by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
+def group_by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
     """The title, an explanation, and the plots of each kind, without empty kinds."""
     kinds = (("Metrics over the time of a frame", OF_TIME, TIMES), ("Learning", OF_CURVES, CURVES))
     groups = [(title, text, [plot for plot in drawn if plot.name.startswith(kind)]) for title, text, kind in kinds]
     return [each for each in groups if each[2]]
 
 
-def plots(contents: ReportContents) -> list[Plot]:
+def draw_plots(contents: ReportContents) -> list[Plot]:
     """Learning curves, then each metric over the time of a frame if that is known."""
-    return [*_curves(contents), *_over_time(contents)]
+    return [*_draw_curves(contents), *_draw_over_time(contents)]
 
 
-def _drawn(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
+def _draw(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
     import matplotlib as mpl
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
@@ -99,7 +99,7 @@ def _drawn(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
 # -------------------------------------------------------------------------------------------------------------- curves
 
 
-def _curves(contents: ReportContents) -> Iterator[Plot]:
+def _draw_curves(contents: ReportContents) -> Iterator[Plot]:
     per_sample = contents.card.core_s_per_sample
     on_gpu = " (a GPU's: wall seconds)" if any(story.on_gpu for story in contents.stories) else ""
     axes: tuple[tuple[str, str, Callable[[RunStory, CurvePoint], float]], ...] = (
@@ -115,16 +115,18 @@ def _curves(contents: ReportContents) -> Iterator[Plot]:
         if max(len({x(story, point) for point in story.curve}) for story in contents.stories) < FEW:
             continue  # everything was rendered before the first validation
         about = f"Held-out error over {label}"
-        yield _drawn(f"{CURVES}{name}", about, partial(_curve, contents=contents, x=x, label=label))
+        yield _draw(f"{CURVES}{name}", about, partial(_plot_curve, contents=contents, x=x, label=label))
 
 
-def _curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, CurvePoint], float], label: str) -> None:
+def _plot_curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, CurvePoint], float], label: str) -> None:
     for story, colour in zip(contents.stories, cycle(COLOURS), strict=False):
         shown = [point for point in story.curve if point.error > 0]
         places = [(x(story, point), point.error) for point in shown]
         whole = [place for place, point in zip(places, shown, strict=True) if point.held_out == shown[-1].held_out]
-        axes.plot(*_columns(places), color=colour, linewidth=1.2, marker="o", markersize=4, markerfacecolor="white")
-        axes.plot(*_columns(whole), "o", markersize=4, color=colour, label=story.name)
+        axes.plot(
+            *_place_columns(places), color=colour, linewidth=1.2, marker="o", markersize=4, markerfacecolor="white"
+        )
+        axes.plot(*_place_columns(whole), "o", markersize=4, color=colour, label=story.name)
     axes.set_yscale("log")
     lowest = axes.get_ylim()[0]
     levels = {
@@ -136,10 +138,10 @@ def _curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, CurvePoi
             axes.axhline(value, linestyle=style, color="#555555", linewidth=1, label=name)
     axes.set_xlabel(label)
     axes.set_ylabel("held-out squared error, linear")
-    _plain_ticks(axes)
+    _set_plain_ticks(axes)
 
 
-def _columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
+def _place_columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
     return [x for x, _ in places], [y for _, y in places]
 
 
@@ -157,16 +159,16 @@ class PlottedPredictor:
     value: Estimate
 
 
-def _over_time(contents: ReportContents) -> Iterator[Plot]:
+def _draw_over_time(contents: ReportContents) -> Iterator[Plot]:
     for name, title in TITLES.items():
         points = [
-            PlottedPredictor(1e3 * entry.time.total, entry.name, _group(entry), colour, entry.estimates[name])
+            PlottedPredictor(1e3 * entry.time.total, entry.name, _name_group(entry), colour, entry.estimates[name])
             for entry, colour in zip(contents.entries, cycle(COLOURS), strict=False)
             if entry.time is not None and name in entry.estimates
         ]
         if len(points) > 1:
             about = f"{title} over the time of a frame"
-            yield _drawn(f"{TIMES}{name}", about, partial(_scatter, metric=name, points=points))
+            yield _draw(f"{TIMES}{name}", about, partial(_scatter, metric=name, points=points))
 
 
 GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
@@ -179,7 +181,7 @@ OF_TIME = (
 )
 
 
-def _group(entry: ReportEntry) -> str:
+def _name_group(entry: ReportEntry) -> str:
     networks, trained, ready = GROUPS
     if not entry.row.kept:
         return networks
@@ -193,7 +195,7 @@ def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> Non
     lowest = math.inf
     for name, (marker, line) in GROUPS.items():
         members = sorted((p for p in points if p.group == name), key=lambda p: (p.milliseconds, p.name))
-        places = _columns([(p.milliseconds, p.value.mean) for p in members])
+        places = _place_columns([(p.milliseconds, p.value.mean) for p in members])
         axes.plot(*places, linestyle=line or "none", color="#999999", linewidth=1)
         for p in members:
             mean = p.value.mean
@@ -214,7 +216,7 @@ def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> Non
         axes.set_yscale("log")
         if lowest < floor:
             axes.set_ylim(bottom=floor)
-    _plain_ticks(axes)
+    _set_plain_ticks(axes)
     axes.set_xlabel("time per frame, ms")
     axes.set_ylabel(TITLES[metric])
 
@@ -222,20 +224,22 @@ def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> Non
 # ---------------------------------------------------------------------------------------------------------------- axes
 
 
-def _plain_ticks(axes: Axes) -> None:
+def _set_plain_ticks(axes: Axes) -> None:
     """Write round numbers in full on logarithmic axes of a range so small that few powers of ten lie in it."""
     from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
 
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
         if axis.get_scale() == "log" and high < NARROW * low:
             axis.set_major_locator(
-                MaxNLocator(5, steps=[1, 2, 5, 10]) if high < TIGHT * low else FixedLocator(_round_numbers(low, high))
+                MaxNLocator(5, steps=[1, 2, 5, 10])
+                if high < TIGHT * low
+                else FixedLocator(_choose_round_numbers(low, high))
             )
             axis.set_major_formatter(lambda value, _: f"{value:g}")
             axis.set_minor_locator(NullLocator())
 
 
-def _round_numbers(low: float, high: float) -> list[float]:
+def _choose_round_numbers(low: float, high: float) -> list[float]:
     """The numbers 1, 2, 3, 5 and 7, times powers of ten, that lie between two values."""
     decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     return [number for decade in decades for one in (1, 2, 3, 5, 7) if low <= (number := one * 10.0**decade) <= high]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from photonfarm.core.archives import Seconds
 from photonfarm.core.formatting import format_bytes, format_count, format_milliseconds
 from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.compare.evaluation_page import notes, place_of_networks
+from photonfarm.trainer.compare.evaluation_page import describe_device, list_notes
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE, TITLES
 from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
@@ -33,13 +33,19 @@ class Table:
         return replace(self, head=tuple(self.head[place] for place in kept), rows=rows)
 
 
-def tables(contents: ReportContents) -> list[Table]:
+def make_tables(contents: ReportContents) -> list[Table]:
     """All tables, in the order of the report."""
-    every = [_paper(contents), _further(contents), *_frame_parts(contents), _runs(contents), *_worst(contents)]
+    every = [
+        _make_paper_table(contents),
+        _make_further_table(contents),
+        *_make_frame_tables(contents),
+        _make_run_table(contents),
+        *_make_worst_tables(contents),
+    ]
     return [table.without_empty_columns for table in every]
 
 
-def facts(contents: ReportContents) -> list[tuple[str, str]]:
+def list_facts(contents: ReportContents) -> list[tuple[str, str]]:
     """The dataset's card: names and values."""
     card, about = contents.card, contents.card.document()
     spec, status = card.spec, card.status
@@ -54,7 +60,7 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
         (
             "samples",
             f"{card.samples.rows} of {card.samples.planned} planned, {2 * t.half_spp} samples per pixel each, "
-            f"in two independent halves{_further_passes(contents)}",
+            f"in two independent halves{_describe_further_passes(contents)}",
         ),
         ("noise of the targets", f"{contents.evaluation.noise_floor:.4g}, of those held out, as linear MSE"),
         (
@@ -65,21 +71,21 @@ def facts(contents: ReportContents) -> list[tuple[str, str]]:
             + (f", {t.light_samples} light samples" if t.light_samples > 1 else ""),
         ),
         ("points, photons", f"{spec.points} points; {spec.photons.paths} light paths of {spec.photons.depth} edges"),
-        ("seeds", _seeds(contents)),
-        ("cost", _cost(contents)),
+        ("seeds", _describe_seeds(contents)),
+        ("cost", _describe_cost(contents)),
         ("size", format_bytes(status.size_bytes)),
         ("rendered by", f"{format_count(card.workers, 'worker')} with {versions}"),
         ("times taken on", contents.machine.stated),
-        ("GPU", _gpu(contents)),
+        ("GPU", _describe_gpu_use(contents)),
     ]
 
 
-def _further_passes(contents: ReportContents) -> str:
+def _describe_further_passes(contents: ReportContents) -> str:
     further = contents.card.further_passes
     return f"; and {further.rows} further passes of their views, as references need" if further.rows else ""
 
 
-def _cost(contents: ReportContents) -> str:
+def _describe_cost(contents: ReportContents) -> str:
     card, further = contents.card, contents.card.further_passes
     spent = f"{card.samples.core_s:.0f} core-seconds, {1e3 * card.core_s_per_sample:.0f} ms a sample"
     if further.rows:
@@ -87,7 +93,7 @@ def _cost(contents: ReportContents) -> str:
     return f"{spent}; {card.status.redrawn} renders drawn again, as they were not finite"
 
 
-def _gpu(contents: ReportContents) -> str:
+def _describe_gpu_use(contents: ReportContents) -> str:
     """The tasks that ran on a GPU."""
     trained = [story.name for story in contents.stories if story.on_gpu]
     tasks = [f"trained {', '.join(trained)}"] if trained else []
@@ -100,7 +106,7 @@ def _gpu(contents: ReportContents) -> str:
     )
 
 
-def _seeds(contents: ReportContents) -> str:
+def _describe_seeds(contents: ReportContents) -> str:
     asked = []
     for number, request in enumerate(contents.card.requests):
         if request["kind"] == "samples":
@@ -120,7 +126,7 @@ def _seeds(contents: ReportContents) -> str:
 # -------------------------------------------------------------------------------------------------- the paper's columns
 
 
-def _paper(contents: ReportContents) -> Table:
+def _make_paper_table(contents: ReportContents) -> Table:
     """Tables 1 and 2: time per frame, MSE, MSSIM, FID, Feature L1; with the published figures, if there are any."""
     beside = contents.published is not None
     columns = ["time per frame, ms", f"× {contents.measure.name}"]
@@ -131,9 +137,13 @@ def _paper(contents: ReportContents) -> Table:
         head.append(column)
         if beside and column != columns[0]:
             head.append("paper")
-    rows = [_paper_row(contents, entry, beside=beside) for entry in contents.entries]
+    rows = [_format_paper_row(contents, entry, beside=beside) for entry in contents.entries]
     named = f"The paper's columns: {contents.published}" if beside else "The paper's columns"
-    below = [_of_time(contents), *notes(contents.evaluation)[1:], *([_of_paper(contents)] if beside else [])]
+    below = [
+        _describe_time(contents),
+        *list_notes(contents.evaluation)[1:],
+        *([_describe_paper(contents)] if beside else []),
+    ]
     return Table(named, tuple(head), tuple(row[: len(head)] for row in rows), tuple(below))
 
 
@@ -145,20 +155,20 @@ def _has_denoisers(contents: ReportContents) -> bool:
     return any(entry.row.kept is not None for entry in contents.entries)
 
 
-def _of_time(contents: ReportContents) -> str:
+def _describe_time(contents: ReportContents) -> str:
     if contents.costs is None:
         return f"time per frame: n/a, as {contents.untimed}"
     frames, edit = contents.costs.render_s.shape[1], contents.costs.parts()["edit_s"]
     on_cpu = ", ready denoisers on the CPU" if any(entry.architecture is None for entry in contents.entries) else ""
     return (
         f"time per frame: medians of {frames} frames for rendering, buffers, points and photons, on one core by LLVM's "
-        f"code; of {TIMED_ROUNDS} calls, taken by turns, for networks, on {place_of_networks(contents.evaluation)}"
-        f"{on_cpu if contents.evaluation.device != 'cpu' else ''}; editing the scene, {_ms(edit)} ms, which all need, "
-        "is not in it"
+        f"code; of {TIMED_ROUNDS} calls, taken by turns, for networks, on {describe_device(contents.evaluation)}"
+        f"{on_cpu if contents.evaluation.device != 'cpu' else ''}; editing the scene, {_format_times(edit)} ms, "
+        "which all need, is not in it"
     )
 
 
-def _of_paper(contents: ReportContents) -> str:
+def _describe_paper(contents: ReportContents) -> str:
     film, unit = contents.card.spec.film, contents.measure.published
     times = (
         "“paper” are the published figures, of four other rooms' average at 256² with networks of width 64 on another "
@@ -174,15 +184,15 @@ def _of_paper(contents: ReportContents) -> str:
     )
 
 
-def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) -> tuple[str, ...]:
+def _format_paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) -> tuple[str, ...]:
     estimates, paper, unit = entry.estimates, entry.published, contents.measure
     cells = [
         (format_milliseconds(entry.time.total) if entry.time else NOT_AVAILABLE, None),
-        (_ratio(entry, unit, alone=len(contents.entries) == 1), _published_ratio(entry, unit)),
-        (with_interval(estimates.get("mse"), 5), f"{paper.mse:.4f}" if paper else ""),
-        (with_interval(estimates.get("mssim"), 3), f"{paper.mssim:.3f}" if paper else ""),
-        (with_interval(estimates.get("fid"), 1), f"{paper.fid:.1f}" if paper else ""),
-        (with_interval(estimates.get(HEADLINE), 3), f"{paper.feature_l1:.3f}" if paper else ""),
+        (_format_ratio(entry, unit, alone=len(contents.entries) == 1), _format_published_ratio(entry, unit)),
+        (format_with_interval(estimates.get("mse"), 5), f"{paper.mse:.4f}" if paper else ""),
+        (format_with_interval(estimates.get("mssim"), 3), f"{paper.mssim:.3f}" if paper else ""),
+        (format_with_interval(estimates.get("fid"), 1), f"{paper.fid:.1f}" if paper else ""),
+        (format_with_interval(estimates.get(HEADLINE), 3), f"{paper.feature_l1:.3f}" if paper else ""),
     ]
     row = [entry.name]
     for ours, theirs in cells:
@@ -192,19 +202,19 @@ def _paper_row(contents: ReportContents, entry: ReportEntry, *, beside: bool) ->
     return tuple(row)
 
 
-def _ratio(entry: ReportEntry, unit: ReportEntry, *, alone: bool) -> str:
+def _format_ratio(entry: ReportEntry, unit: ReportEntry, *, alone: bool) -> str:
     if alone:
         return ""
     return NOT_AVAILABLE if entry.time is None or unit.time is None else f"{entry.time.total / unit.time.total:.2f}"
 
 
-def _published_ratio(entry: ReportEntry, unit: ReportEntry) -> str:
+def _format_published_ratio(entry: ReportEntry, unit: ReportEntry) -> str:
     if entry.published is None or unit.published is None:
         return ""
     return f"{entry.published.seconds / unit.published.seconds:.2f}"
 
 
-def with_interval(estimate: Estimate | None, digits: int) -> str:
+def format_with_interval(estimate: Estimate | None, digits: int) -> str:
     """Mean and 95 % interval."""
     if estimate is None:
         return NOT_AVAILABLE
@@ -216,20 +226,20 @@ def with_interval(estimate: Estimate | None, digits: int) -> str:
 # -------------------------------------------------------------------------------------------------------------- further
 
 
-def _further(contents: ReportContents) -> Table:
+def _make_further_table(contents: ReportContents) -> Table:
     """Metrics that the paper does not have, and its Fig. 5 in numbers."""
     shown = [m for m in TITLES if m.startswith(("feature", "flip"))] if _has_references(contents) else []
     first = contents.evaluation.rows[0]
     rows = []
     for entry in contents.entries:
-        behind = "–" if entry.row is first else with_interval(entry.row.behind(first), 5)
+        behind = "–" if entry.row is first else format_with_interval(entry.row.behind(first), 5)
         estimates = entry.estimates
         cells = [f"{estimates[m].mean:.4f}" if m in estimates else NOT_AVAILABLE for m in shown]
-        kid = [with_interval(estimates.get("kid"), 4)] if shown else []
-        rows.append((entry.name, with_interval(entry.row.held_out.error, 5), behind, *cells, *kid))
+        kid = [format_with_interval(estimates.get("kid"), 4)] if shown else []
+        rows.append((entry.name, format_with_interval(entry.row.held_out.error, 5), behind, *cells, *kid))
     titles = (*(TITLES[m] for m in shown), *(["KID (95 %)"] if shown else []))
     head = ("architecture", "linear MSE (95 %)", f"more than {contents.entries[0].name}", *titles)
-    below = [notes(contents.evaluation)[0]]
+    below = [list_notes(contents.evaluation)[0]]
     if (metrics := first.metrics) is not None and (weights := metrics.inception) is not None:
         below.append(
             f"FID, KID and Feature L1: {metrics.images} images and as many references; Inception weights of "
@@ -239,13 +249,13 @@ def _further(contents: ReportContents) -> Table:
     return Table("Further metrics", head, tuple(rows), tuple(below))
 
 
-def _frame_parts(contents: ReportContents) -> list[Table]:
+def _make_frame_tables(contents: ReportContents) -> list[Table]:
     if contents.costs is None:
         return []
     rows = tuple(
         (
             entry.name,
-            *(_ms(part) if part else "–" for part in entry.time.parts.values()),
+            *(_format_times(part) if part else "–" for part in entry.time.parts.values()),
             format_milliseconds(entry.time.total),
         )
         for entry in contents.entries
@@ -268,7 +278,7 @@ def _frame_parts(contents: ReportContents) -> list[Table]:
     return [Table("Where the time of a frame goes", head, rows, tuple(below))]
 
 
-def _ms(time: Seconds) -> str:
+def _format_times(time: Seconds) -> str:
     low, high = format_milliseconds(time.low), format_milliseconds(time.high)
     return f"{format_milliseconds(time.median)} ({low} … {high})"
 
@@ -276,7 +286,7 @@ def _ms(time: Seconds) -> str:
 # ---------------------------------------------------------------------------------------------------------- runs, cases
 
 
-def _runs(contents: ReportContents) -> Table:
+def _make_run_table(contents: ReportContents) -> Table:
     rows = []
     for story in contents.stories:
         about = story.document()
@@ -308,7 +318,7 @@ def _runs(contents: ReportContents) -> Table:
     return Table("Training", head, tuple(rows))
 
 
-def _worst(contents: ReportContents) -> list[Table]:
+def _make_worst_tables(contents: ReportContents) -> list[Table]:
     if not contents.worst:
         return []
     rows = tuple((c.kind, f"{c.row}", f"{c.pixels:.1%}", f"{c.mse:.4f}") for c in contents.worst)

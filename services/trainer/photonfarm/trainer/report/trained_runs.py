@@ -15,16 +15,16 @@ from photonfarm.core.errors import IncompleteError
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.predict.evaluation import (
     HeldOutErrors,
-    batches,
-    constant_predictor,
-    mean_colours,
+    average_colours,
+    make_constant_predictor,
+    make_network_predictor,
     measure,
-    network_predictor,
+    read_batches,
 )
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.devices import AUTO, usable_device
-from photonfarm.trainer.runs.progress import bottleneck, samples_per_used, wait_shares
+from photonfarm.trainer.runs.progress import divide_by_used, find_bottleneck, share_waits
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
 
 
@@ -57,7 +57,7 @@ class RunStory:
     @classmethod
     def of(cls, name: str, run: TrainedRun) -> RunStory:
         """Read the story of a run; raises StoreError for a log that cannot be read."""
-        records = run_folder.read(run.folder / METRICS)
+        records = run_folder.read_log(run.folder / METRICS)
         state = checkpoint.load(run.folder / CHECKPOINT)
         arrived, held_out = (state["following"][rows].numpy() for rows in ("arrived", "held_out"))
         training = np.concatenate([[0], np.cumsum(~np.isin(arrived, held_out))])  # of the first n that arrived
@@ -96,7 +96,7 @@ class RunStory:
         """Its part of report.json."""
         state, settings = self.state, self.run.settings
         draws = state["step"] * settings.batch
-        shares = wait_shares(state["seconds"])
+        shares = share_waits(state["seconds"])
         return {
             "name": self.name,
             "folder": str(self.run.folder),
@@ -106,10 +106,10 @@ class RunStory:
             "draws": draws,
             "trained_on": self.trained_on,
             "draws_per_sample": draws / max(self.trained_on, 1),
-            "samples_per_used": samples_per_used(self.trained_on, draws),
+            "samples_per_used": divide_by_used(self.trained_on, draws),
             "seconds": state["seconds"],
             "waits": shares,
-            "bottleneck": bottleneck(shares),
+            "bottleneck": find_bottleneck(shares),
             "curve": [asdict(point) for point in self.curve],
             "on_gpu": self.on_gpu,
             "settings": settings.model_dump(mode="json"),
@@ -117,7 +117,7 @@ class RunStory:
         }
 
 
-def short_names(runs: list[TrainedRun]) -> list[str]:
+def shorten_names(runs: list[TrainedRun]) -> list[str]:
     """The name of each run in a report: its architecture, or its folder if that adds something."""
     for names in ([run.settings.network.architecture for run in runs], [run.folder.name for run in runs]):
         if len(set(names)) == len(runs):
@@ -146,10 +146,10 @@ class Baselines:
             if not training:
                 raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
             some = training[:: -(-len(training) // MOST_TRAINING)]
-            colour, shown_colour = mean_colours(batches(feed, some, settings.batch))
+            colour, shown_colour = average_colours(read_batches(feed, some, settings.batch))
             network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, (feed.geometry, feed.cloud))
             return cls(
-                measure(constant_predictor(colour), batches(feed, rows, settings.batch)),
-                measure(constant_predictor(shown_colour), batches(feed, rows, settings.batch)),
-                measure(network_predictor(network), batches(feed, rows, settings.batch)),
+                measure(make_constant_predictor(colour), read_batches(feed, rows, settings.batch)),
+                measure(make_constant_predictor(shown_colour), read_batches(feed, rows, settings.batch)),
+                measure(make_network_predictor(network), read_batches(feed, rows, settings.batch)),
             )

@@ -15,7 +15,7 @@ from photonfarm.core.records import F32, Guides
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.worst_cases import ALL, WorstCase
-from photonfarm.trainer.report.worst_cases import caption as worst_view
+from photonfarm.trainer.report.worst_cases import name_kinds as worst_view
 
 LARGEST = 0.25  # difference in the metric space that is drawn brightest
 
@@ -59,35 +59,35 @@ class ShownView:
     mse: float  # of the first predictor, in the metric space, with the target's noise
 
 
-def shown_views(contents: ReportContents) -> list[ShownView]:
+def choose_views(contents: ReportContents) -> list[ShownView]:
     """The views with an image by the first predictor: that of median error first, so that no choice flatters."""
     there = contents.entries[0].row.shown
-    views = [_view(contents, target) for target in contents.evaluation.shown if target.row in there]
+    views = [_make_view(contents, target) for target in contents.evaluation.shown if target.row in there]
     median = sorted(views, key=lambda view: view.mse)[(len(views) - 1) // 2 :][:1]
-    first = [replace(view, caption=caption(contents.worst, view.row, is_median=True)) for view in median]
+    first = [replace(view, caption=write_caption(contents.worst, view.row, is_median=True)) for view in median]
     return [*first, *(view for view in views if view not in median)]
 
 
-def _view(contents: ReportContents, target: Target) -> ShownView:
+def _make_view(contents: ReportContents, target: Target) -> ShownView:
     first, *others = [
         (entry.name, entry.row.shown[target.row]) for entry in contents.entries if target.row in entry.row.shown
     ]
     against = "reference" if target.is_reference else "mean of both halves"
     half_spp = contents.card.spec.transport.half_spp
-    prediction, difference, mse = _shown(*first, target.image)
+    prediction, difference, mse = _compare_layers(*first, target.image)
     images = [
-        light(NOISY, f"noisy half, {half_spp} samples per pixel", target.half_a),
+        make_light_layer(NOISY, f"noisy half, {half_spp} samples per pixel", target.half_a),
         prediction,
-        light(against, f"{against}, {target.spp} samples per pixel", target.image),
+        make_light_layer(against, f"{against}, {target.spp} samples per pixel", target.image),
         difference,
     ]
     for name, image in others:
-        images += _shown(name, image, target.image, of=f" of {name}")[:2]
-    inputs = tuple(_inputs(contents, target.row))
-    return ShownView(target.row, caption(contents.worst, target.row), against, tuple(images), inputs, mse)
+        images += _compare_layers(name, image, target.image, of=f" of {name}")[:2]
+    inputs = tuple(_list_inputs(contents, target.row))
+    return ShownView(target.row, write_caption(contents.worst, target.row), against, tuple(images), inputs, mse)
 
 
-def caption(worst: Sequence[WorstCase], row: int, *, is_median: bool = False) -> str:
+def write_caption(worst: Sequence[WorstCase], row: int, *, is_median: bool = False) -> str:
     """What a view is shown for, and its row; one of median error may still be the worst of some kinds of pixels."""
     kinds = [case.kind for case in worst if case.row == row and not (is_median and case.kind == ALL)]
     parts = ["view of median error"] * is_median + ([worst_view(kinds)] if kinds else []) + [f"row {row}"]
@@ -95,23 +95,23 @@ def caption(worst: Sequence[WorstCase], row: int, *, is_median: bool = False) ->
     return text[0].upper() + text[1:]
 
 
-def _shown(name: str, image: F32, target: F32, of: str = "") -> tuple[Layer, Layer, float]:
+def _compare_layers(name: str, image: F32, target: F32, of: str = "") -> tuple[Layer, Layer, float]:
     """A predictor's image and its difference to the target, with the mean of its square."""
     apart = display_values(image) - display_values(target)
     mse = float(np.mean(apart**2))
     return (
-        light(f"{PREDICTION}{of}", f"prediction by {name}", image),
-        Layer(f"{DIFFERENCE}{of}", f"difference{of}, MSE {mse:.4f}", coloured(np.abs(apart).mean(axis=-1))),
+        make_light_layer(f"{PREDICTION}{of}", f"prediction by {name}", image),
+        Layer(f"{DIFFERENCE}{of}", f"difference{of}, MSE {mse:.4f}", colour_difference(np.abs(apart).mean(axis=-1))),
         mse,
     )
 
 
-def light(name: str, caption: str, exposed: F32) -> Layer:
+def make_light_layer(name: str, caption: str, exposed: F32) -> Layer:
     """A layer of exposed linear radiance, (H, W, 3)."""
     return Layer(name, caption, display(exposed, 1.0), exposed)
 
 
-def _inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
+def _list_inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
     if row not in contents.inputs:
         return
     buffers, guides = contents.inputs[row]
@@ -119,14 +119,14 @@ def _inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
     yield Layer("normal", "normal", of_normal(buffers.normal))
     yield Layer("depth", "depth", of_depth(buffers.depth))
     if guides is not None:
-        yield from _guides(guides, contents.card.spec.exposure)
+        yield from _list_guides(guides, contents.card.spec.exposure)
 
 
-def _guides(guides: Guides, exposure: float) -> Iterator[Layer]:
+def _list_guides(guides: Guides, exposure: float) -> Iterator[Layer]:
     for field, name in OF_GUIDES.items():
         values: F32 = getattr(guides, field)
         if field in RADIANCE:
-            layer = light(name, name, np.float32(exposure) * values)
+            layer = make_light_layer(name, name, np.float32(exposure) * values)
         else:
             layer = Layer(
                 name, name, of_albedo(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2))
@@ -135,7 +135,7 @@ def _guides(guides: Guides, exposure: float) -> Iterator[Layer]:
             yield layer
 
 
-def legend(contents: ReportContents) -> str:
+def write_legend(contents: ReportContents) -> str:
     """The legend of the pictures, in sentences."""
     others = "" if not contents.worst else f", and the worst ones of {contents.entries[0].name}, found automatically"
     return (
@@ -145,7 +145,7 @@ def legend(contents: ReportContents) -> str:
     )
 
 
-def coloured(difference: F32) -> Picture:
+def colour_difference(difference: F32) -> Picture:
     """Differences (H, W) as colours (H, W, 3), from black at 0 over red to pale yellow at `LARGEST` and above."""
     import matplotlib as mpl
 
@@ -161,15 +161,15 @@ TITLE = 26  # px, the height of the line above them
 LAYERS = 4  # of each view: noisy half, prediction, target, difference
 
 
-def overview(views: Sequence[ShownView]) -> Picture:
+def draw_overview(views: Sequence[ShownView]) -> Picture:
     """The views as rows, best first, with titles above; small images are enlarged by Lanczos' filter."""
     ordered = sorted(views, key=lambda view: view.mse)
-    lines = [np.concatenate([_framed(layer.picture) for layer in view.images[:LAYERS]], axis=1) for view in ordered]
+    lines = [np.concatenate([_add_frame(layer.picture) for layer in view.images[:LAYERS]], axis=1) for view in ordered]
     sheet = np.concatenate(lines)[:-GAP, :-GAP]
-    return np.concatenate([_titles([layer.name for layer in ordered[0].images[:LAYERS]], sheet.shape[1]), sheet])
+    return np.concatenate([_draw_titles([layer.name for layer in ordered[0].images[:LAYERS]], sheet.shape[1]), sheet])
 
 
-def _titles(titles: Sequence[str], width: int) -> Picture:
+def _draw_titles(titles: Sequence[str], width: int) -> Picture:
     """A line of titles, each at the left of its column."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -180,7 +180,7 @@ def _titles(titles: Sequence[str], width: int) -> Picture:
     return np.asarray(line)
 
 
-def _framed(picture: Picture) -> Picture:
+def _add_frame(picture: Picture) -> Picture:
     """The picture at the width of the columns, with a white margin to the right and below."""
     from PIL import Image
 

@@ -54,7 +54,7 @@ class WorstCase:
     mse: float  # of these pixels, in the metric space, the reference's noise taken out
 
 
-def worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
+def find_worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
     """The view with the largest error for each kind of pixels, in the order of `KINDS`; views may repeat.
 
     Errors are summed over the pixels: of two views with one wrong mirror, the one with the larger mirror is worse.
@@ -65,39 +65,39 @@ def worst_cases(views: list[HeldOutView]) -> list[WorstCase]:
     close = float(np.quantile(depths, CLOSE)) if len(depths) else 0.0
     scored: dict[str, list[tuple[float, WorstCase]]] = {}
     for view in views:
-        error = squared_error(view)
-        for kind, mask in kinds(view, close):
+        error = compute_squared_error(view)
+        for kind, mask in list_kinds(view, close):
             if (share := float(mask.mean())) >= LEAST:
                 case = WorstCase(kind, view.row, share, float(error[mask].mean()))
                 scored.setdefault(kind, []).append((share * case.mse, case))
     return [max(scored[kind], key=lambda each: each[0])[1] for kind in KINDS if kind in scored]
 
 
-def caption(kinds: Sequence[str]) -> str:
+def name_kinds(kinds: Sequence[str]) -> str:
     """The caption of a view that is the worst of some kinds, at least one."""
     *others, last = kinds
     return "worst view of " + " and ".join([*([", ".join(others)] if others else []), last])
 
 
-def squared_error(view: HeldOutView) -> NDArray[np.float64]:
+def compute_squared_error(view: HeldOutView) -> NDArray[np.float64]:
     """The error of each pixel (H, W), over channels, in the metric space: (f − A)(f − B), whose noise averages out."""
     shown, a, b = (display_values(image).astype(np.float64) for image in (view.image, view.half_a, view.half_b))
     product: NDArray[np.float64] = ((shown - a) * (shown - b)).mean(axis=-1)
     return product
 
 
-def kinds(view: HeldOutView, close: float) -> Iterator[tuple[str, Mask]]:
+def list_kinds(view: HeldOutView, close: float) -> Iterator[tuple[str, Mask]]:
     """The kinds of pixels, each with its mask (H, W)."""
     if view.surface is not None:
         yield MIRRORS, view.surface == Surface.MIRROR
         yield SPECULAR, view.surface == Surface.SPECULAR
     yield NEAR, (view.buffers.depth > 0) & (view.buffers.depth < close)
-    yield SHADOWS, shadow_edges(view)
-    yield THIN, thin_objects(view.buffers.depth)
+    yield SHADOWS, find_shadow_edges(view)
+    yield THIN, find_thin_objects(view.buffers.depth)
     yield ALL, np.ones_like(view.buffers.depth, np.bool_)
 
 
-def shadow_edges(view: HeldOutView) -> Mask:
+def find_shadow_edges(view: HeldOutView) -> Mask:
     """The pixels where the irradiance steps between neighbours that are otherwise alike, (H, W).
 
     It must step the same way in both halves of the reference: their noise is independent, and agrees only by chance.
@@ -106,13 +106,15 @@ def shadow_edges(view: HeldOutView) -> Mask:
     irradiance = np.stack([np.log(half.mean(axis=-1) + 1e-3) - albedo for half in (view.half_a, view.half_b)])
     edges = np.zeros(albedo.shape, np.bool_)
     for axis in (0, 1):
-        first, second = _neighbours(edges.shape[axis], axis)
+        first, second = _pair_neighbours(edges.shape[axis], axis)
         steps = irradiance[:, *second] - irradiance[:, *first]
-        edges[first] |= ((steps > STEP).all(axis=0) | (steps < -STEP).all(axis=0)) & _alike(view.buffers, first, second)
+        edges[first] |= ((steps > STEP).all(axis=0) | (steps < -STEP).all(axis=0)) & _find_alike(
+            view.buffers, first, second
+        )
     return edges
 
 
-def thin_objects(depth: F32) -> Mask:
+def find_thin_objects(depth: F32) -> Mask:
     """The pixels of objects that are a few pixels wide, such as the legs of a chair, (H, W), by their depth (H, W).
 
     They are those whose neighbours `THIN_PIXELS` to either side along one axis are farther away.
@@ -130,14 +132,14 @@ def thin_objects(depth: F32) -> Mask:
 Part = tuple[slice, slice]
 
 
-def _neighbours(length: int, axis: int) -> tuple[Part, Part]:
+def _pair_neighbours(length: int, axis: int) -> tuple[Part, Part]:
     """All pixels but the last of an axis, and the next of each."""
     first, second = slice(0, length - 1), slice(1, length)
     every = slice(None)
     return ((first, every), (second, every)) if axis == 0 else ((every, first), (every, second))
 
 
-def _alike(buffers: ViewBuffers, first: Part, second: Part) -> Mask:
+def _find_alike(buffers: ViewBuffers, first: Part, second: Part) -> Mask:
     """Whether two pixels show the same surface and colour."""
     depth, other = buffers.depth[first], buffers.depth[second]
     near = (depth > 0) & (other > 0) & (np.abs(depth - other) < SAME_DEPTH * np.maximum(depth, other))

@@ -50,8 +50,8 @@ def save(path: Path, state: Mapping[str, Any]) -> None:
     A state consists of dictionaries by string, lists, tensors, and the other types of JSON.
     """
     tensors: dict[str, Tensor] = {}
-    described = _apart(state, "", tensors)
-    document = json.dumps({"format": FORMAT, "sha256": _digest(tensors), **described})
+    described = _take_apart(state, "", tensors)
+    document = json.dumps({"format": FORMAT, "sha256": _hash_tensors(tensors), **described})
     content = to_bytes(tensors, {METADATA: document})  # safetensors writing to the file itself would not sync it
     partial = path.with_suffix(".partial")
     with store_errors("write the checkpoint", path):
@@ -72,12 +72,12 @@ def load(path: Path, *, without: str = "") -> dict[str, Any]:
     try:
         document, tensors = _read(path)
     except _DamagedError as error:
-        raise StoreError(f"{path}: {error}; {without or _remedy(path)}") from error.__cause__
+        raise StoreError(f"{path}: {error}; {without or _find_remedy(path)}") from error.__cause__
     if (stored := document.get("format")) != FORMAT:
         raise StoreError(
             f"{path}: has format {stored!r}, but this version reads format {FORMAT}; train anew in another folder"
         )
-    state: dict[str, Any] = _together(document, tensors)
+    state: dict[str, Any] = _put_together(document, tensors)
     return state
 
 
@@ -85,7 +85,7 @@ class _DamagedError(Exception):
     """What is wrong with a checkpoint's bytes."""
 
 
-def _remedy(path: Path) -> str:
+def _find_remedy(path: Path) -> str:
     """What to do about a damaged checkpoint: go on from the good one beside it, if there is one, or begin anew."""
     good = path.with_name(GOOD)
     try:
@@ -112,12 +112,12 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     except UNREADABLE as error:
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise _DamagedError(f"is not a readable checkpoint: {reason}") from error
-    if document.get("format") == FORMAT and document.get("sha256") != _digest(tensors):
+    if document.get("format") == FORMAT and document.get("sha256") != _hash_tensors(tensors):
         raise _DamagedError("is damaged, as its numbers do not match its checksum")
     return document, tensors
 
 
-def _digest(tensors: Mapping[str, Tensor]) -> str:
+def _hash_tensors(tensors: Mapping[str, Tensor]) -> str:
     """The digest of the tensors' names and bytes."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
@@ -126,33 +126,33 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
     return digest.hexdigest()
 
 
-def _apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
+def _take_apart(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
     """The value with a reference in place of each tensor; the tensors are put into `tensors`, by their names."""
     if isinstance(value, Tensor):
         tensors[name] = value.detach().cpu().clone(memory_format=torch.contiguous_format)  # none share memory
         return {TENSOR: name}
     if isinstance(value, Mapping):
-        return {key: _apart(member, f"{name}.{key}".lstrip("."), tensors) for key, member in value.items()}
+        return {key: _take_apart(member, f"{name}.{key}".lstrip("."), tensors) for key, member in value.items()}
     if isinstance(value, list):
-        return [_apart(member, f"{name}.{place}", tensors) for place, member in enumerate(value)]
+        return [_take_apart(member, f"{name}.{place}", tensors) for place, member in enumerate(value)]
     return value
 
 
-def _together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+def _put_together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     """The value with a tensor in place of each reference."""
     if isinstance(value, dict):
         if value.keys() == {TENSOR}:
             return tensors[value[TENSOR]]
-        return {key: _together(member, tensors) for key, member in value.items()}
-    return [_together(member, tensors) for member in value] if isinstance(value, list) else value
+        return {key: _put_together(member, tensors) for key, member in value.items()}
+    return [_put_together(member, tensors) for member in value] if isinstance(value, list) else value
 
 
-def snapshot(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) -> dict[str, Any]:
+def describe_store(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) -> dict[str, Any]:
     """The state of the store at a checkpoint: scene, plans, and how many samples had arrived; `following` has which."""
     return {"scene_id": scene_id, "plans": list(plans), "samples": samples}
 
 
-def versions() -> dict[str, str]:
+def list_versions() -> dict[str, str]:
     """The versions of the packages that a run's arithmetic depends on."""
     return {
         "photonfarm": version("photonfarm"),
@@ -169,20 +169,20 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     """
     kept = [name for name in ("scene_id", "exposure") if name in state and name in identity]
     then, now = ({**{name: one[name] for name in kept}, **one["settings"]} for one in (state, identity))
-    check_of_this_version(path, then["network"])
+    check_version(path, then["network"])
     changed = differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
         differences = "; ".join(
             f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items()
         )
-        options = " ".join(_option(key, then) for key, (then, _) in lasting.items() if key not in kept)
+        options = " ".join(_format_option(key, then) for key, (then, _) in lasting.items() if key not in kept)
         same = f"the same values{f' ({options})' if options else ''}"
         raise SpecError(f"{path}: was trained with {differences}; use another run directory, or {same}")
     return changed
 
 
-def check_of_this_version(path: Path, network: Mapping[str, Any]) -> None:
+def check_version(path: Path, network: Mapping[str, Any]) -> None:
     """Raise SpecError unless a run's stored settings of its network have all present keys.
 
     A missing key would take today's default, and make another network.
@@ -194,7 +194,7 @@ def check_of_this_version(path: Path, network: Mapping[str, Any]) -> None:
         )
 
 
-def _option(key: str, value: Any) -> str:
+def _format_option(key: str, value: Any) -> str:
     """The command-line option that sets a key to a value."""
     name = key.split(".")[-1]
     if name in OPTIONS:
@@ -238,5 +238,5 @@ def read_settings(run: Path) -> TrainSettings:
         raise StoreError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
     except ValueError as error:
         raise StoreError(f"{path}: is not the JSON that a training run leaves there: {error}") from error
-    check_of_this_version(path, document.get("network", {}))
+    check_version(path, document.get("network", {}))
     return settings

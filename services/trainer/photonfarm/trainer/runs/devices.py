@@ -54,7 +54,7 @@ def round_convolutions(device: torch.device, precision: Precision) -> None:
         torch.backends.cudnn.allow_tf32 = precision == "tf32"
 
 
-def described(device: torch.device, precision: Precision = "float32") -> str:
+def describe_device(device: torch.device, precision: Precision = "float32") -> str:
     """The device in words: "cpu", or "cuda (NVIDIA H200)"; with a warning if it is slow at this precision."""
     if device.type == "cuda":
         return f"{device} ({torch.cuda.get_device_name(device)})"
@@ -134,7 +134,7 @@ class Ranks:
 
     def device(self, name: str) -> torch.device:
         """The device of this process; for "cuda" the card with the process's local rank."""
-        return usable_device(_own(name))
+        return usable_device(_choose_own_device(name))
 
     def part(self, rows: Sequence[int]) -> tuple[int, ...]:
         """Every `size`-th row, beginning with this rank's."""
@@ -180,13 +180,13 @@ class Ranks:
             raise IncompleteError(f"rank {self.rank}: another process of this training is gone: {reason}") from error
 
 
-def processes() -> int:
+def count_processes() -> int:
     """The number of processes that torchrun has started; 1 without torchrun."""
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 @contextmanager
-def leading(group: TrainingGroup) -> Iterator[None]:
+def lead(group: TrainingGroup) -> Iterator[None]:
     """Run rank 0's training in the block, and then send the other ranks the command to end.
 
     Within a step they take no command; they notice then that rank 0 is gone.
@@ -200,12 +200,12 @@ def leading(group: TrainingGroup) -> Iterator[None]:
 
 
 @contextmanager
-def ranks(device: str, batch: int) -> Iterator[Ranks | None]:
+def join_ranks(device: str, batch: int) -> Iterator[Ranks | None]:
     """Join the processes that torchrun has started; yields None if this is the only one.
 
     Raises SpecError for a batch of fewer samples than there are processes.
     """
-    size = processes()
+    size = count_processes()
     if size < 2:
         yield None
         return
@@ -213,7 +213,7 @@ def ranks(device: str, batch: int) -> Iterator[Ranks | None]:
         raise SpecError(
             f"batch = {batch}: has fewer samples than the {size} processes that share it; set batch to {size} or more"
         )
-    own = usable_device(_own(device))
+    own = usable_device(_choose_own_device(device))
     if own.type == "cuda":
         torch.cuda.set_device(own)
     distributed.init_process_group("cpu:gloo,cuda:nccl" if own.type == "cuda" else "gloo", timeout=STEP_PATIENCE)
@@ -223,9 +223,11 @@ def ranks(device: str, batch: int) -> Iterator[Ranks | None]:
         distributed.destroy_process_group()
 
 
-def _own(device: str) -> str:
+def _choose_own_device(device: str) -> str:
     """The process's own card if the settings name CUDA or `auto` finds it; raises SpecError for one named card."""
     if device.startswith("cuda:"):
-        raise SpecError(f"device = {device!r}: names one card, but {processes()} processes need one each; give cuda")
+        raise SpecError(
+            f"device = {device!r}: names one card, but {count_processes()} processes need one each; give cuda"
+        )
     on_cuda = device == "cuda" or (device == AUTO and torch.cuda.is_available())
     return f"cuda:{os.environ['LOCAL_RANK']}" if on_cuda else device

@@ -82,21 +82,21 @@ class Stopwatch:
             self.turn(before)
 
 
-def wait_shares(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
+def share_waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
     """The shares of the time since `before` in which training waited for samples to be rendered, and to be read."""
     spent = {name: value - before.get(name, 0.0) for name, value in seconds.items()}
     total = max(sum(spent.values()), 1e-9)
     return {"samples": round(spent["wait_data"] / total, 4), "reading": round(spent["wait_read"] / total, 4)}
 
 
-def bottleneck(shares: Mapping[str, float]) -> Bottleneck:
+def find_bottleneck(shares: Mapping[str, float]) -> Bottleneck:
     """The part that takes most of the time, by `wait_shares`; the rest of the time counts as training."""
     spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
     spent["training"] = 1 - sum(spent.values())
     return max(spent, key=lambda name: spent[name])
 
 
-def samples_per_used(samples: int, draws: int) -> float:
+def divide_by_used(samples: int, draws: int) -> float:
     """The number of arrived samples for each used one; workers skip the scene while it is above their `--ahead`.
 
     A sample counts as used once it is drawn, and a held-out one as soon as it arrives, as in the number that workers
@@ -105,11 +105,11 @@ def samples_per_used(samples: int, draws: int) -> float:
     return samples / max(min(draws, samples), 1)
 
 
-def stated(shares: Mapping[str, float], ahead: float) -> str:
+def format_waits(shares: Mapping[str, float], ahead: float) -> str:
     """The shares of `wait_shares`, the arrived samples for each used one, and the bottleneck, as part of a line."""
     return (
         f"waited {shares['samples']:.1%} of the time for samples and {shares['reading']:.1%} for reading, "
-        f"{ahead:.2f} samples there for each used (--ahead): {bottleneck(shares)} is the bottleneck"
+        f"{ahead:.2f} samples there for each used (--ahead): {find_bottleneck(shares)} is the bottleneck"
     )
 
 
@@ -183,7 +183,7 @@ class RunProgress:
 
 
 @contextmanager
-def followed(progress: RunProgress, run: Path, say: Callable[[str], object] | None) -> Iterator[None]:
+def follow_progress(progress: RunProgress, run: Path, say: Callable[[str], object] | None) -> Iterator[None]:
     """Keep the file up to date until the block ends; say a line every five seconds, and a last one."""
     said = time.monotonic()
 

@@ -23,7 +23,7 @@ from photonfarm.core.records import F32
 from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS, VIEWS
 from photonfarm.scene.spec_loading import SCENES_VARIABLE
 
-__all__ = ["CHECKPOINT", "INITIAL", "METRICS", "SETTINGS", "held", "note_scene_folder", "with_scenes"]
+__all__ = ["CHECKPOINT", "INITIAL", "METRICS", "SETTINGS", "lock_run", "make_environment", "note_scene_folder"]
 
 LOCK = "lock"
 GOOD = "good.safetensors"  # a checkpoint of the last good validation, which a run that diverges goes back to
@@ -31,7 +31,7 @@ SCENE_FOLDER = "scene-folder.txt"
 
 
 @contextmanager
-def held(folder: Path) -> Iterator[None]:
+def lock_run(folder: Path) -> Iterator[None]:
     """Make the folder and lock it; raises StoreError if another trainer has it or it cannot be written.
 
     The system releases the lock when its process ends, however it ends.
@@ -55,7 +55,7 @@ def note_scene_folder(folder: Path, scenes: Path | None) -> None:
             (folder / SCENE_FOLDER).write_text(f"{scenes}\n")
 
 
-def with_scenes(folder: Path) -> dict[str, str]:
+def make_environment(folder: Path) -> dict[str, str]:
     """The environment in which the renderer's verbs find a run's scene: where a variable says, else where noted."""
     try:
         noted = (folder / SCENE_FOLDER).read_text().strip()
@@ -79,8 +79,8 @@ class MetricsLog:
         there; a validation or a change of settings without an end after it was written after the checkpoint.
         """
         with store_errors("cut the log", self._path):
-            lines = _lines(self._path)
-            records = [_record(line, self._path) for line in lines if line.endswith(b"\n")]
+            lines = _read_lines(self._path)
+            records = [_parse_record(line, self._path) for line in lines if line.endswith(b"\n")]
             ends = [i + 1 for i, record in enumerate(records) if (record["step"], record["kind"]) == (step, "end")]
             kept = max(ends, default=0)
             while kept < len(records) and not _is_after(records[kept], step):
@@ -104,11 +104,11 @@ def _is_after(record: dict[str, Any], step: int) -> bool:
     return record["step"] > step or (record["step"] == step and record["kind"] != "train")
 
 
-def _lines(path: Path) -> list[bytes]:
+def _read_lines(path: Path) -> list[bytes]:
     return path.read_bytes().splitlines(keepends=True) if path.exists() else []
 
 
-def _record(line: bytes, path: Path) -> dict[str, Any]:
+def _parse_record(line: bytes, path: Path) -> dict[str, Any]:
     try:
         record: dict[str, Any] = json.loads(line)
         _ = record["step"], record["kind"]
@@ -119,10 +119,10 @@ def _record(line: bytes, path: Path) -> dict[str, Any]:
         ) from error
 
 
-def read(path: Path) -> list[dict[str, Any]]:
+def read_log(path: Path) -> list[dict[str, Any]]:
     """The whole records of a log, in order; a last line cut short by a crash is left out. Raises StoreError."""
     with store_errors("read the log", path):
-        return [_record(line, path) for line in _lines(path) if line.endswith(b"\n")]
+        return [_parse_record(line, path) for line in _read_lines(path) if line.endswith(b"\n")]
 
 
 SHOWN = 4  # the most views

@@ -74,7 +74,7 @@ BIASING_KEYS: Mapping[str, BiasReason] = {
 """The keys of other trainers."""
 
 
-def refuse(settings: Any) -> Any:
+def refuse_biasing(settings: Any) -> Any:
     """Return the settings unchanged; ValidationError, which names key, value and reason, if one of them biases."""
     if not isinstance(settings, Mapping):
         return settings
@@ -120,7 +120,7 @@ Schedule = Literal["epochs", "cosine"]
 ReadyDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
 
 
-def _one_of(kind: Any) -> BeforeValidator:
+def _check_choice(kind: Any) -> BeforeValidator:
     """A validator for the values of a literal, and for `MODULE:NAME`."""
 
     def check(name: object) -> object:
@@ -133,8 +133,8 @@ def _one_of(kind: Any) -> BeforeValidator:
     return BeforeValidator(check)
 
 
-ArchitectureName = Annotated[str, _one_of(Architecture)]
-LossName = Annotated[str, _one_of(Loss)]
+ArchitectureName = Annotated[str, _check_choice(Architecture)]
+LossName = Annotated[str, _check_choice(Loss)]
 
 MOST_HELD_OUT = 512
 """The most samples that a finished run is measured on."""
@@ -225,7 +225,7 @@ class TrainSettings(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _refuse_what_biases(cls, settings: Any) -> Any:
-        return refuse(settings)
+        return refuse_biasing(settings)
 
     @model_validator(mode="after")
     def _has_the_other_half(self) -> Self:
@@ -296,13 +296,13 @@ PRESETS: dict[str, Callable[..., TrainSettings]] = {
 }
 
 
-def preset(name: str, *, network: Mapping[str, object] = MappingProxyType({}), **changes: object) -> TrainSettings:
+def make_preset(name: str, *, network: Mapping[str, object] = MappingProxyType({}), **changes: object) -> TrainSettings:
     """The settings of a preset with changes, those of its network in `network`. Raises ValidationError."""
     settings = PRESETS[name](**changes)
     return TrainSettings.model_validate({**dict(settings), "network": {**dict(settings.network), **network}})
 
 
-def settings_of(name: str, changes: Mapping[str, Any]) -> TrainSettings:
+def make_settings(name: str, changes: Mapping[str, Any]) -> TrainSettings:
     """A preset with changes by key; keys of the network stand among the others. Raises SpecError for each fault."""
     network = {key: value for key, value in changes.items() if key in NetworkSettings.model_fields}
     others = {key: value for key, value in changes.items() if key not in network}
@@ -311,6 +311,6 @@ def settings_of(name: str, changes: Mapping[str, Any]) -> TrainSettings:
     if name not in PRESETS:
         raise SpecError(f"the settings of the training: preset = {name!r}: is none of {', '.join(PRESETS)}")
     try:
-        return preset(name, network=network, **others)
+        return make_preset(name, network=network, **others)
     except ValidationError as error:
         raise SpecError(f"the settings of the training: {'; '.join(sentences(error, KEYS))}") from error

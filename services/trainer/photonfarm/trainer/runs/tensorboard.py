@@ -70,7 +70,7 @@ class EventFiles:
 
 
 @contextmanager
-def event_files(run: Path) -> Iterator[EventFiles | None]:
+def open_event_files(run: Path) -> Iterator[EventFiles | None]:
     """Event files in the folder `run`/tensorboard; None if TensorBoard is not installed."""
     if find_spec("tensorboard") is None:
         yield None

@@ -48,13 +48,13 @@ def load(key: str, name: str) -> Any:
     return getattr(loaded, attribute)
 
 
-def _hint(error: Exception) -> str:
+def _suggest(error: Exception) -> str:
     is_of_none = isinstance(error, AttributeError) and error.obj is None
     return "; inputs that the network's `needs` does not name are None" if is_of_none else ""
 
 
 @contextmanager
-def named_in_errors(**own: str) -> Iterator[None]:
+def name_in_errors(**own: str) -> Iterator[None]:
     """Turn an error from inside a user's module into a SpecError of one sentence, which names the line.
 
     `own` are settings and their values, of which those of the form `MODULE:NAME` count. Other errors pass.
@@ -69,5 +69,7 @@ def named_in_errors(**own: str) -> Iterator[None]:
             file = getattr(sys.modules.get(name.partition(":")[0]), "__file__", None)
             if is_own(name) and (own_frames := [frame for frame in frames if frame.filename == file]):
                 where = f"{file}, line {own_frames[-1].lineno}, in {own_frames[-1].name}"
-                raise SpecError(f"{key} = {name!r}: {where}: {type(error).__name__}: {error}{_hint(error)}") from error
+                raise SpecError(
+                    f"{key} = {name!r}: {where}: {type(error).__name__}: {error}{_suggest(error)}"
+                ) from error
         raise

@@ -19,12 +19,12 @@ from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch
-from photonfarm.trainer.networks import build, image_of
+from photonfarm.trainer.networks import build, predict_image
 from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.devices import SINGLE_PROCESS, TrainingGroup
 from photonfarm.trainer.runs.settings import Compilation, TrainSettings
-from photonfarm.trainer.training.losses import loss_of
+from photonfarm.trainer.training.losses import find_loss
 
 
 def build_optimiser(weights: Iterable[nn.Parameter], settings: TrainSettings) -> torch.optim.Optimizer:
@@ -43,18 +43,18 @@ def build_optimiser(weights: Iterable[nn.Parameter], settings: TrainSettings) ->
     )
 
 
-def rate_at(step: int, settings: TrainSettings) -> float:
+def compute_rate(step: int, settings: TrainSettings) -> float:
     """The learning rate of a step, by the schedule of the settings.
 
     "epochs": learning_rate × decay^epoch, where an epoch is a number of samples drawn [supplement 3.1]. "cosine" is
     ours.
     """
     if settings.schedule == "cosine":
-        return settings.learning_rate * _cosine(step, settings.max_steps, int(settings.warm_up * settings.max_steps))
+        return settings.learning_rate * _anneal(step, settings.max_steps, int(settings.warm_up * settings.max_steps))
     return settings.learning_rate * settings.decay ** (step * settings.batch // settings.epoch_samples)
 
 
-def _cosine(step: int, steps: int, rising: int) -> float:
+def _anneal(step: int, steps: int, rising: int) -> float:
     """The share of the rate: linearly up to 1 over `rising` steps, then (1 + cos πx) / 2 down to 0 at `steps`.
 
     The first part is of Goyal et al., Accurate, Large Minibatch SGD, 2017 (2.2); the second of Loshchilov and Hutter,
@@ -118,12 +118,12 @@ def compile_network(network: nn.Module, how: Compilation, device: torch.device) 
 
 
 @contextmanager
-def compiling(how: Compilation) -> Iterator[None]:
+def name_compile_errors(how: Compilation) -> Iterator[None]:
     """Turn a failure to compile into a SpecError of one sentence."""
     try:
         yield
     except Exception as error:
-        if how == "off" or not isinstance(error, _compilers_errors()):
+        if how == "off" or not isinstance(error, _list_compiler_errors()):
             raise
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise SpecError(
@@ -132,7 +132,7 @@ def compiling(how: Compilation) -> Iterator[None]:
         ) from error
 
 
-def _compilers_errors() -> tuple[type[Exception], ...]:
+def _list_compiler_errors() -> tuple[type[Exception], ...]:
     """The errors of torch's compiler, which is imported here only where it has been used."""
     from torch._dynamo.exc import TorchDynamoException
 
@@ -179,7 +179,7 @@ class Learner:
         self._settings, self._group = settings, group
         self._device = group.device(settings.device)
         self.network = build(settings.network, frame, settings.seed).to(self._device)
-        self._loss, self.verdict = loss_of(settings.loss)  # the loss, and the result of the test of its unbiasedness
+        self._loss, self.verdict = find_loss(settings.loss)  # the loss, and the result of the test of its unbiasedness
         self.optimiser = build_optimiser(self.network.parameters(), settings)
         self.average = WeightAverage(self.network, settings.average) if settings.average else None
         compile_network(self.network, settings.compile, self._device)  # and not the average, copied before
@@ -192,7 +192,7 @@ class Learner:
 
     def rate(self, number: int) -> float:
         """The learning rate of step `number`."""
-        return self.rate_factor * rate_at(number, self._settings)
+        return self.rate_factor * compute_rate(number, self._settings)
 
     def step(self, number: int, batch: TrainingBatch) -> float:
         """Take an optimiser step on this process' part of a batch [supplement 3.1]; returns the whole batch's loss.
@@ -203,7 +203,7 @@ class Learner:
             group["lr"] = self.rate(number)
         self.optimiser.zero_grad()
         batch = batch.to(self._device).for_training()
-        loss = self._loss(image_of(self.network, batch.inputs), batch.target)
+        loss = self._loss(predict_image(self.network, batch.inputs), batch.target)
         torch.autograd.backward(loss)
         value = self._group.average(list(self.network.parameters()), loss, len(batch.rows))
         if math.isfinite(value):

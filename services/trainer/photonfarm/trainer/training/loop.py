@@ -21,14 +21,14 @@ from photonfarm.core.statistics import group_means
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
 from photonfarm.trainer.data.batch_stream import BatchStream, Growth
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.predict.evaluation import batches, network_predictor
+from photonfarm.trainer.predict.evaluation import make_network_predictor, read_batches
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import SINGLE_PROCESS, TrainingGroup, usable_device
-from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, samples_per_used, wait_shares
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, held
+from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used, share_waits
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, lock_run
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.runs.user_code import named_in_errors
-from photonfarm.trainer.training.learner import DivergedError, Learner, compiling
+from photonfarm.trainer.runs.user_code import name_in_errors
+from photonfarm.trainer.training.learner import DivergedError, Learner, name_compile_errors
 from photonfarm.trainer.training.other_ranks import Presence
 from photonfarm.trainer.training.validation import (
     BestValidation,
@@ -36,8 +36,8 @@ from photonfarm.trainer.training.validation import (
     GoodState,
     Show,
     Validation,
-    compared,
-    settle,
+    compare,
+    settle_files,
     validate,
 )
 
@@ -105,7 +105,7 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
     def is_over() -> bool:
         return watch.total >= (settings.max_seconds or math.inf)
 
-    with held(run), Presence(source, f"trainer of run {run}", hooks.on_wait) as presence:
+    with lock_run(run), Presence(source, f"trainer of run {run}", hooks.on_wait) as presence:
         while not source.ready() and not is_over() and not hooks.stop.wait(settings.poll_seconds):
             pass
         if not source.ready() or not presence.begin(hooks.stop, is_over):
@@ -114,7 +114,7 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
         own = {"architecture": settings.network.architecture, "loss": settings.loss}
         resident = ResidentSamples(hooks.group.device(settings.device), settings.resident_gb)
         fed = Feed(source, settings, hooks.clock, resident=resident)
-        with fed as feed, named_in_errors(**own), compiling(settings.compile):
+        with fed as feed, name_in_errors(**own), name_compile_errors(settings.compile):
             return Session(feed, settings, run, watch, hooks, presence).run()
 
 
@@ -172,7 +172,7 @@ class Session:
 
     def _start(self) -> Changes:
         self._send_begin(continues=False)
-        settle(self._run, None)
+        settle_files(self._run, None)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
 
@@ -182,7 +182,7 @@ class Session:
         changed = checkpoint.check_continues(path, state, self._identity())
         checkpoint.check_same_store(path, state, self._feed.plan_requests())
         recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have no recovery
-        settle(self._run, recovery["good"])
+        settle_files(self._run, recovery["good"])
         self._good.restore(state, self._run, recover=self._settings.recover)
         if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
             self._best = BestValidation.of(recovery["best"])
@@ -228,8 +228,8 @@ class Session:
             "seconds": self._watch.seconds,
             "last_error": self._last_error,
             "following": self._stream.state(),
-            "store": checkpoint.snapshot(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
-            "versions": checkpoint.versions(),
+            "store": checkpoint.describe_store(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
+            "versions": checkpoint.list_versions(),
         }
 
     def _ended(self) -> str | None:
@@ -302,8 +302,8 @@ class Session:
         rows = self._stream.held_out[: self._settings.validation_samples]
         with self._watch.on("validate"):
             self._stream.drop()
-            held_out_batches = batches(self._feed, rows, self._settings.batch)
-            predict, loss = network_predictor(self._learner.predicting.eval()), self._settings.loss
+            held_out_batches = read_batches(self._feed, rows, self._settings.batch)
+            predict, loss = make_network_predictor(self._learner.predicting.eval()), self._settings.loss
             now = validate(predict, self._step, held_out_batches, self._hooks.on_images, loss=loss)
             self._learner.network.train()
             self._stream.ask_again()
@@ -326,13 +326,13 @@ class Session:
             shown_error=float(group_means(held_out.shown, held_out.units).mean()),
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
-            waits=wait_shares(seconds := self._watch.seconds, self._seconds_logged),
+            waits=share_waits(seconds := self._watch.seconds, self._seconds_logged),
             **self._counts(),
         )
         self._seconds_logged = seconds
 
     def _compare(self, now: Validation) -> None:
-        self._compared = compared(now, self._best)
+        self._compared = compare(now, self._best)
         if self._compared.is_best:
             self._best = BestValidation(now.step, now.errors, now.judge)
 
@@ -382,7 +382,7 @@ class Session:
 
     def _counts(self) -> dict[str, Any]:
         draws, samples = self._used()
-        ahead = round(samples_per_used(samples, draws), 3)
+        ahead = round(divide_by_used(samples, draws), 3)
         seconds = {k: round(v, 3) for k, v in self._watch.seconds.items()}
         return {"draws": draws, "samples": samples, "samples_per_used": ahead, "seconds": seconds}
 

@@ -59,22 +59,27 @@ class Verdict:
         return f"{sentence} standard errors; elsewhere it is not that with the clean target ({self.elsewhere:.0f})"
 
 
-def judged(loss: LossFunction) -> Verdict:
+def judge(loss: LossFunction) -> Verdict:
     """Test a loss on images of random brightness, whose pixels are dark with rare bright samples; deterministic.
 
     `loss` takes a prediction (B, H, W, 3) and targets (B, 2, H, W, 3), and returns the mean over the batch, ().
     """
     generator = torch.Generator().manual_seed(0)
     clean = 0.1 + torch.rand(1, SIZE, SIZE, 3, generator=generator)
-    at_clean = _away(loss, clean, clean, torch.zeros_like(clean), generator)
+    at_clean = _measure_distance(loss, clean, clean, torch.zeros_like(clean), generator)
     others = (0.5 * clean, 2.0 * clean)
-    elsewhere = (_away(loss, at, clean, _gradients(loss, at, _halves(clean))[0], generator) for at in others)
+    elsewhere = (
+        _measure_distance(loss, at, clean, _compute_gradients(loss, at, _make_halves(clean))[0], generator)
+        for at in others
+    )
     return Verdict(at_clean, max(elsewhere))
 
 
-def _away(loss: LossFunction, at: Tensor, clean: Tensor, wanted: Tensor, generator: torch.Generator) -> float:
+def _measure_distance(
+    loss: LossFunction, at: Tensor, clean: Tensor, wanted: Tensor, generator: torch.Generator
+) -> float:
     """The largest distance of the mean gradient at a prediction from the wanted one, in standard errors."""
-    drawn = [_gradients(loss, at, _noisy(clean, generator)) for _ in range(DRAWS // BATCH)]
+    drawn = [_compute_gradients(loss, at, _draw_noisy(clean, generator)) for _ in range(DRAWS // BATCH)]
     gradients = torch.cat(drawn).double()
     error = gradients.std(dim=0) / len(gradients) ** 0.5
     off = (gradients.mean(dim=0) - wanted).abs()
@@ -82,20 +87,20 @@ def _away(loss: LossFunction, at: Tensor, clean: Tensor, wanted: Tensor, generat
     return float((off / (error + tiny)).max())
 
 
-def _gradients(loss: LossFunction, at: Tensor, targets: Tensor) -> Tensor:
+def _compute_gradients(loss: LossFunction, at: Tensor, targets: Tensor) -> Tensor:
     """The gradients with each target, as if it were a batch of its own: (B, H, W, 3)."""
     prediction = at.expand(len(targets), -1, -1, -1).clone().requires_grad_()
     (gradient,) = torch.autograd.grad(loss(prediction, targets), prediction)
     return gradient.detach() * len(targets)
 
 
-def _noisy(clean: Tensor, generator: torch.Generator) -> Tensor:
+def _draw_noisy(clean: Tensor, generator: torch.Generator) -> Tensor:
     """Targets whose mean is the clean image: (B, 2, H, W, 3), mostly a fifth of it, rarely much more."""
     bright = torch.rand(BATCH, 2, *clean.shape[1:], generator=generator) < RARE
     return torch.where(bright, (1 - 0.2 * (1 - RARE)) / RARE, 0.2) * clean[:, None]
 
 
-def _halves(clean: Tensor) -> Tensor:
+def _make_halves(clean: Tensor) -> Tensor:
     """The clean image as both halves, (1, 2, H, W, 3)."""
     return clean[:, None].expand(-1, 2, -1, -1, -1)
 
@@ -157,7 +162,7 @@ LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 }
 
 
-def loss_of(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | None]:
+def find_loss(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | None]:
     """The loss of a name; for a user's own (`MODULE:NAME`) also the result of the test of its unbiasedness.
 
     A loss takes a prediction (B, H, W, 3) and two targets (B, 2, H, W, 3), and returns the mean over the batch, ().
@@ -166,7 +171,7 @@ def loss_of(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | No
     if name in LOSSES:
         return LOSSES[name], None
     loss = user_code.load("loss", name)
-    verdict = judged(loss)
+    verdict = judge(loss)
     if not verdict.is_unbiased:
         raise SpecError(f"loss = {name!r}: is refused because noisy targets bias it: {verdict}")
     return loss, verdict

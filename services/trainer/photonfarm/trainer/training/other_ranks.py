@@ -23,7 +23,7 @@ from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.learner import Learner, compiling
+from photonfarm.trainer.training.learner import Learner, name_compile_errors
 from photonfarm.trainer.training.validation import GoodState
 
 
@@ -42,7 +42,7 @@ def assist(source: Callable[[str, float], SampleSource], settings: TrainSettings
         good, step = GoodState(Learner(feed, settings, ranks)), value["step"]
         if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run, recover=settings.recover)
-        with compiling(settings.compile):
+        with name_compile_errors(settings.compile):
             _follow(ranks, feed, good, step)
 
 

@@ -153,7 +153,7 @@ class Comparison:
         return {name: error if math.isfinite(error) else None for name, error in errors.items()}
 
 
-def compared(now: Validation, best: BestValidation | None) -> Comparison:
+def compare(now: Validation, best: BestValidation | None) -> Comparison:
     """Compare a validation with the best one; with itself if there is none of the same rows and the same error.
 
     The held-out set grows while the store does, and samples may be incomplete for a while: the mean over other rows
@@ -194,7 +194,7 @@ class GoodState:
 
     def keep(self, step: int, rest: Mapping[str, Any] | None = None) -> None:
         """Keep the learner's state at a step, and the rest of a checkpoint, which makes its file one."""
-        self._kept, self.step, self._is_new = _copied({**self._learner.state(), **(rest or {})}), step, True
+        self._kept, self.step, self._is_new = _copy({**self._learner.state(), **(rest or {})}), step, True
 
     def step_or_go_back(self, number: int, batch: TrainingBatch) -> float | None:
         """Take a step; returns the loss, or None if it was not finite and the learner went back.
@@ -222,7 +222,7 @@ class GoodState:
         """Give the learner the kept state; DivergedError, with `found` in its message, if nothing is kept."""
         if self.step is None:
             raise DivergedError(fault)
-        self._learner.restore(_copied(self._kept))  # a copy, as the optimiser changes the tensors it is given
+        self._learner.restore(_copy(self._kept))  # a copy, as the optimiser changes the tensors it is given
 
     def state(self) -> dict[str, Any]:
         """Its part of a checkpoint; the rest is in a file beside it, by `saved_with`."""
@@ -237,7 +237,7 @@ class GoodState:
         if (own := state.get("recovery")) is None:  # of an older version
             return
         self.recoveries, self._learner.rate_factor = own["recoveries"], own["rate_factor"]
-        if recover and own["good"] is not None and (kept := _loaded(run / GOOD)).get("step") == own["good"]:
+        if recover and own["good"] is not None and (kept := _load(run / GOOD)).get("step") == own["good"]:
             self._kept, self.step = kept, own["good"]
 
     @contextmanager
@@ -255,25 +255,25 @@ class GoodState:
             self._is_new = False
 
 
-def settle(run: Path, step: int | None) -> None:
+def settle_files(run: Path, step: int | None) -> None:
     """Finish the work of a killed run: make the state that its last checkpoint refers to, kept at `step`, GOOD."""
     with store_errors("keep the last good state", run):
         if step is None:
             (run / GOOD).unlink(missing_ok=True)
-        if step is not None and _loaded(run / NEXT).get("step") == step:
+        if step is not None and _load(run / NEXT).get("step") == step:
             (run / NEXT).replace(run / GOOD)
         (run / NEXT).unlink(missing_ok=True)
 
 
-def _loaded(path: Path) -> dict[str, Any]:
+def _load(path: Path) -> dict[str, Any]:
     """The content of a file; empty if there is none."""
     return checkpoint.load(path, without=WITHOUT) if path.exists() else {}
 
 
-def _copied(value: Any) -> Any:
+def _copy(value: Any) -> Any:
     """The value with copies of its tensors, on the CPU."""
     if isinstance(value, Tensor):
         return value.detach().to("cpu", copy=True)
     if isinstance(value, Mapping):
-        return {key: _copied(member) for key, member in value.items()}
-    return [_copied(member) for member in value] if isinstance(value, list) else value
+        return {key: _copy(member) for key, member in value.items()}
+    return [_copy(member) for member in value] if isinstance(value, list) else value

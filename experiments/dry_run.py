@@ -48,12 +48,11 @@ class Need:
             sum(count_operations(spec, run) for run in runs),
         )
 
-    def line(self, tflops: float) -> str:
-        """All of it in words, with the hours of a device that sustains so many 10¹² operations a second."""
+    def describe(self) -> str:
+        """All of it in words."""
         return (
             f"{self.name}: {self.samples:,} samples {self.sample_hours:.1f} core-h; {self.passes:,} further passes for "
-            f"references {self.pass_hours:.1f} core-h; {self.runs} runs {self.operations:.2g} operations, "
-            f"{self.operations / (tflops * 1e12) / 3600:.1f} h at {tflops:g} TFLOP/s"
+            f"references {self.pass_hours:.1f} core-h; {self.runs} runs {self.operations:.2g} operations"
         )
 
 

@@ -34,7 +34,6 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--workers", type=_parse_count, default=2, help="processes at a time, a core each (2)")
     parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
     parser.add_argument("--dry-run", action="store_true", help="say what it would take, and do none of it")
-    parser.add_argument("--tflops", type=float, default=50.0, help="10¹² operations a second that a GPU sustains (50)")
     return parser
 
 
@@ -57,7 +56,7 @@ def main() -> int:
         return SpecError.exit_code
     if arguments.dry_run:
         for experiment in experiments:
-            print(dry_run.measure_need(experiment).line(arguments.tflops), flush=True)
+            print(dry_run.measure_need(experiment).describe(), flush=True)
         return 0
     failed = False
     for experiment in experiments:

@@ -26,8 +26,7 @@ from bench.harness import results
 from experiments import equal_time
 from experiments.experiment import HERE, Experiment, Part, SizeName, list_names
 from experiments.paper_tables import CLOSE, describe_lacking, format_errors, format_further_metrics, format_orders
-from experiments.room_tables import format_costs, format_descriptions, format_rooms, summarise, wrap
-from experiments.rooms import Room
+from experiments.rooms import Room, format_costs, format_descriptions, format_rooms, summarise, wrap
 from photonfarm.core.errors import IncompleteError, PhotonfarmError
 from photonfarm.trainer.report.contents import FIXED_LIGHTS, MOVABLE_LIGHTS, PublishedTable
 

@@ -15,8 +15,7 @@ from experiments import experiment, run
 from experiments.dry_run import Need
 from experiments.experiment import Experiment, SizeName, list_names, merge
 from experiments.paper_tables import format_errors
-from experiments.room_tables import format_rooms
-from experiments.rooms import Room
+from experiments.rooms import Room, format_rooms
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
 from photonfarm.core.errors import SpecError
 from photonfarm.plan.sample_costs import SampleCosts
@@ -127,7 +126,9 @@ def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> Non
     assert need.pass_hours == pytest.approx(2 * (3 + 2 * 0.5) / 3600)
     longer = Need.of(with_size(tiny, train={**tiny.size.train, "max_steps": 6}), SampleCosts("0" * 32, 1, 1, 1, 1, 0))
     assert longer.operations == pytest.approx(2 * need.operations)
-    assert need.line(1.0).startswith("tiny: 12 samples 0.0 core-h; 2 further passes for references 0.0 core-h; 3 runs ")
+    assert need.describe().startswith(
+        "tiny: 12 samples 0.0 core-h; 2 further passes for references 0.0 core-h; 3 runs "
+    )
 
 
 def reports(stages: Stages) -> list[int]:

@@ -71,7 +71,7 @@ class FarmPages:
         """The samples that landed last, and the maps of noise and cost."""
         samples = self.samples(scene_id)
         rows = self._walls[scene_id].get()
-        return {"rows": rows, "map": samples.mapped(self._cost_of(scene_id))}
+        return {"rows": rows, "map": samples.map_noise(self._cost_of(scene_id))}
 
     def about(self, scene_id: str, row: int) -> dict[str, Any]:
         """One sample in figures."""

@@ -151,7 +151,7 @@ class SceneSamples:
             "images": ["mean", "a", "b", "noise", *_draw_images(sample)],
         }
 
-    def mapped(self, cost_of: Callable[[int], float | None]) -> dict[str, Any]:
+    def map_noise(self, cost_of: Callable[[int], float | None]) -> dict[str, Any]:
         """Where samples were seen from, in the plane below `up`, with their noise and what they cost."""
         with self._lock:
             noise = dict(self._noise)

@@ -71,7 +71,7 @@ def test_photons_of_longer_paths_than_the_images_have_are_left_out(make_source, 
     network, inputs = build(settings, frame, 0), batch_of(source, (0,), NEEDS).inputs
     inputs.photons.bounce.masked_fill_(inputs.photons.present, 2)
     with torch.no_grad():
-        assert any(found.any() for found in network.gathered(inputs)) == counts
+        assert any(found.any() for found in network.gather_light(inputs)) == counts
 
 
 def box(pixels: int, beside: int) -> np.ndarray:
@@ -118,7 +118,7 @@ def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_
         inputs = batch_of(source, (row,), NEEDS).inputs
         with torch.no_grad():
             known = network.known(inputs, network.further(inputs))
-            torch.testing.assert_close(known, inputs.albedo * network.gathered(inputs)[1])
+            torch.testing.assert_close(known, inputs.albedo * network.gather_light(inputs)[1])
         diffuse = inputs.albedo[0].sum(dim=-1).numpy() > 0
         found.append(known[0].numpy()[diffuse])
         wanted.append(source.spec.exposure * source.clean(row)[diffuse])
@@ -136,7 +136,7 @@ def test_demodulation_is_of_what_is_learned_and_not_of_the_photon_map(make_sourc
     with torch.no_grad():
         further = network.further(inputs)
         learned = network.synthesise(torch.cat([*further, network.image_space(inputs)], dim=-1))
-        known = network.gathered(inputs)[1] * inputs.albedo if gathers else 0
+        known = network.gather_light(inputs)[1] * inputs.albedo if gathers else 0
         torch.testing.assert_close(network(inputs), learned * (inputs.albedo + 0.2) + known)
 
 

@@ -23,7 +23,7 @@ def test_phase_and_time_left_follow_the_session() -> None:
     now[0] = 5.0
     assert progress.line() == "step 0/100: waits for samples for 5 s, 0 samples have arrived"
     progress.phase("train")
-    progress.drawn(80, 24)
+    progress.note_draws(80, 24)
     now[0] = 25.0
     found = progress.look()
     assert (found["step"], found["phase"], found["samples"]) == (20, "trains", 24)
@@ -41,7 +41,7 @@ def test_the_last_line_is_of_the_last_step(run: Path) -> None:
     for samples in (0, 24):
         progress = RunProgress(20, batch=4)
         with follow_progress(progress, run, said.append):
-            progress.drawn(4 * samples, samples)
+            progress.note_draws(4 * samples, samples)
     assert said == ["step 24 (20 wanted), 24 samples have arrived"], "and none where nothing has arrived"
 
 
@@ -54,7 +54,7 @@ def test_a_line_comes_every_five_seconds_and_others_read_the_file_meanwhile(
     run.mkdir()
     progress = RunProgress(100, batch=1)
     with follow_progress(progress, run, said.append):
-        progress.drawn(30, 50)
+        progress.note_draws(30, 50)
         end = time.monotonic() + 10
         while len(said) < 2 and time.monotonic() < end:
             time.sleep(0.02)

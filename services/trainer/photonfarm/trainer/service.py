@@ -129,12 +129,12 @@ def _lead(
             log(f"exposure is {source.spec.exposure:g}, which {of}, and not {spec.exposure:g} as the spec says")
         progress, begun = RunProgress(settings.max_steps, settings.batch), False
 
-        def drawn(draws: int, samples: int) -> None:
+        def follow_draws(draws: int, samples: int) -> None:
             nonlocal begun
             if draws and not begun:
                 log(f"continues at step {draws // settings.batch} of run {folder}")
             begun = True
-            progress.drawn(draws, samples)
+            progress.note_draws(draws, samples)
             on_draws(draws, samples)
 
         def show(step: int, rows: tuple[int, ...], targets: F32, predictions: F32) -> None:
@@ -151,7 +151,7 @@ def _lead(
                 Hooks(
                     stop=stop,
                     on_record=lambda record: [follow(record) for follow in followers],
-                    on_draws=drawn,
+                    on_draws=follow_draws,
                     on_phase=progress.phase,
                     on_images=show,
                     on_wait=log,

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
-
-import click
-
-from photonfarm.core.statistics import stated
-from photonfarm.trainer.runs import progress
-
-if TYPE_CHECKING:
-    from photonfarm.trainer.dry_run.dry_run import DryRun
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
+import click
 from rich import markup
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from photonfarm.core.processes import repeating
+from photonfarm.core.statistics import stated
 from photonfarm.core.waiting import SILENCE_S, Steps
+from photonfarm.trainer.runs import progress
+
+if TYPE_CHECKING:
+    from photonfarm.trainer.dry_run.dry_run import DryRun
 
 
 def print_record(of: dict[str, Any]) -> None:

@@ -177,11 +177,11 @@ def compare(
     test = _Test(store, samples, references_by_row, shown, network, str(place), on_progress or (lambda *_: None))
     ready = [ReadyPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
     test.on_progress("networks are loaded and timed", 0, 0)
-    leading, *others = test.timed([*runs, *ready])
-    first_of_all = test.measured(leading)
+    leading, *others = test.time_by_turns([*runs, *ready])
+    first_of_all = test.measure_one(leading)
     if choose:
         shown += [row for row in dict.fromkeys(choose(first_of_all.images, references_by_row)) if row not in shown]
-    rows = [first_of_all.row(shown), *(test.measured(other).row(shown) for other in others)]
+    rows = [first_of_all.row(shown), *(test.measure_one(other).row(shown) for other in others)]
     return Evaluation(
         scene=spec.name,
         scene_id=first.scene_id,
@@ -272,7 +272,7 @@ class _Test:
     on_progress: MeasureProgress
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def timed(self, predictors: Sequence[TrainedRun | ReadyPredictor]) -> list[_Timed]:
+    def time_by_turns(self, predictors: Sequence[TrainedRun | ReadyPredictor]) -> list[_Timed]:
         """Load all predictors, and time them by turns on the first sample."""
         calls = [self._call(predictor) for predictor in predictors]
         ready = zip(predictors, calls, time_by_turns(calls), strict=True)
@@ -285,7 +285,7 @@ class _Test:
                 return predict, predict.of_its_own(batch.inputs)
         raise IncompleteError(NONE_COMPLETE)
 
-    def measured(self, timed: _Timed) -> _Measured:
+    def measure_one(self, timed: _Timed) -> _Measured:
         """Measure a predictor on all samples."""
         predictor, rows, size = timed.predictor, self.samples.rows, timed.predictor.settings.batch
         with self._feed(predictor, batch=size) as feed:

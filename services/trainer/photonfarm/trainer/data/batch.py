@@ -121,12 +121,12 @@ class ResidentSamples:
         """The rows of the samples that are kept."""
         return tuple(self._kept)
 
-    def lacking(self, rows: Iterable[int]) -> list[int]:
+    def list_lacking(self, rows: Iterable[int]) -> list[int]:
         """Those of the rows that are not kept, each once, in their order."""
         return [row for row in dict.fromkeys(rows) if row not in self._kept]
 
     def batch(self, rows: Sequence[int], fresh: TrainingBatch) -> TrainingBatch:
-        """The batch of these rows on the device, of which `fresh` has those that were `lacking`; keeps what fits.
+        """The batch of these rows on the device, of which `fresh` has those that `list_lacking` gave; keeps what fits.
 
         Its tensors are its own. Values are those of the store's samples, to the bit, wherever they were kept.
         """

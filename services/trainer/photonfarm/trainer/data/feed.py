@@ -258,7 +258,7 @@ class Feed:
         while not (self._known.issuperset(rows) and self._missing.isdisjoint(rows)) and time.monotonic() < late:
             self._poll()
             time.sleep(NAP_S)
-        fresh = rows if self._resident is None else self._resident.lacking(rows)
+        fresh = rows if self._resident is None else self._resident.list_lacking(rows)
         batch = read_batch(self._source, self._dataset, fresh, self._needs.kept, memory)
         return batch if self._resident is None else self._resident.batch(rows, batch)
 

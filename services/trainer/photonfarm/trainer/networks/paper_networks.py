@@ -200,11 +200,11 @@ class LightTransportPhotons(LightTransport):
         """The points' features, and log(1 + gathered light), (B, H, W, 3) each, or the photons' features, 64 wide."""
         features, photons = super().further(inputs), require(inputs.photons)
         if self.photon_transport is None:
-            return [*features, *(torch.log1p(radiance) for radiance in self.gathered(inputs))]
+            return [*features, *(torch.log1p(radiance) for radiance in self.gather_light(inputs))]
         where = photons.position, photons.present, photons.seen
         return [*features, self.project(self.photon_features(photons), *where, inputs)]
 
-    def gathered(self, inputs: Inputs) -> list[Tensor]:
+    def gather_light(self, inputs: Inputs) -> list[Tensor]:
         """The light of all photons by `PhotonLight`, (B, H, W, 3) for each window."""
         return self.photon_light(inputs)
 

@@ -106,9 +106,9 @@ class Oidn:
         """A batch's images, (B, H, W, 3), linear radiance × exposure."""
         whole = fill_in(require(inputs.noisy), inputs.albedo)
         images = zip(whole.numpy(), inputs.albedo.numpy(), inputs.normal.numpy(), strict=True)
-        return torch.from_numpy(np.stack([self.denoised(*image) for image in images]))
+        return torch.from_numpy(np.stack([self.denoise(*image) for image in images]))
 
-    def denoised(self, colour: F32, albedo: F32, normal: F32) -> F32:
+    def denoise(self, colour: F32, albedo: F32, normal: F32) -> F32:
         """One denoised image, (H, W, 3) each. Albedo and normals are taken as free of noise, which ours are."""
         result = np.empty_like(colour, order="C")
         named = {"color": colour, "albedo": np.clip(albedo, 0, 1), "normal": normal, "output": result}

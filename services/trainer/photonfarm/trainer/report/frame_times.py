@@ -39,7 +39,7 @@ class Machine:
         return cls(_read_cpu_model(), os.cpu_count() or 1, platform.machine(), os.getloadavg())
 
     @property
-    def stated(self) -> str:
+    def sentence(self) -> str:
         """The machine in words, on one line."""
         load = ", ".join(f"{average:.1f}" for average in self.load_average)
         return (

@@ -75,7 +75,7 @@ def list_facts(contents: ReportContents) -> list[tuple[str, str]]:
         ("cost", _describe_cost(contents)),
         ("size", format_bytes(status.size_bytes)),
         ("rendered by", f"{format_count(card.workers, 'worker')} with {versions}"),
-        ("times taken on", contents.machine.stated),
+        ("times taken on", contents.machine.sentence),
         ("GPU", _describe_gpu_use(contents)),
     ]
 

@@ -144,7 +144,7 @@ class RunProgress:
         if kind != self._phase[0]:
             self._phase = (kind, self._clock())
 
-    def drawn(self, draws: int, samples: int) -> None:
+    def note_draws(self, draws: int, samples: int) -> None:
         """Note the samples drawn so far, and those that have arrived."""
         self._step, self._samples = draws // self._batch, samples
 

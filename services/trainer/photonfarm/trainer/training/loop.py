@@ -211,7 +211,7 @@ class Session:
         with self._watch.on("save"):
             recovery = {**self._good.state(), "best": self._best.state() if self._best else None}
             state = {**self._learner.state(), **self._state(), "recovery": recovery}
-            with self._good.saved_with(self._run):
+            with self._good.save_with(self._run):
                 checkpoint.save(self._run / CHECKPOINT, state)
 
     def _keep(self) -> None:
@@ -340,7 +340,7 @@ class Session:
         """Keep the state after the last validation, or go back, in all processes."""
         comparison = self._compared
         if comparison is not None and comparison.is_clearly_worse:
-            reason = f"step {self._step}: {comparison.stated}"
+            reason = f"step {self._step}: {comparison.sentence}"
             self._hooks.group.send("back", reason)
             self._good.go_back(reason)
             self._log_recovered("held-out error", comparison)
@@ -356,7 +356,7 @@ class Session:
         if comparison is not None and not comparison.is_worse:
             self._keep()
         elif comparison is not None:
-            self._good.give(f"step {self._step}: {comparison.stated}")
+            self._good.give(f"step {self._step}: {comparison.sentence}")
             self._log_recovered("end", comparison)
             self._validate()
 

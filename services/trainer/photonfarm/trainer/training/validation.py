@@ -142,7 +142,7 @@ class Comparison:
         return self.is_worse and deviation is not None and self.difference.mean > DEVIATIONS * deviation
 
     @property
-    def stated(self) -> str:
+    def sentence(self) -> str:
         """Both errors in words."""
         before = f", and was {self.best:.5g} at best" if math.isfinite(self.best) else ""
         return f"the held-out error is {self.error:.5g}{before}"
@@ -225,7 +225,7 @@ class GoodState:
         self._learner.restore(_copy(self._kept))  # a copy, as the optimiser changes the tensors it is given
 
     def state(self) -> dict[str, Any]:
-        """Its part of a checkpoint; the rest is in a file beside it, by `saved_with`."""
+        """Its part of a checkpoint; the rest is in a file beside it, by `save_with`."""
         return {"good": self.step, "recoveries": self.recoveries, "rate_factor": self._learner.rate_factor}
 
     def restore(self, state: dict[str, Any], run: Path, *, recover: bool) -> None:
@@ -241,7 +241,7 @@ class GoodState:
             self._kept, self.step = kept, own["good"]
 
     @contextmanager
-    def saved_with(self, run: Path) -> Iterator[None]:
+    def save_with(self, run: Path) -> Iterator[None]:
         """Write the kept state; inside, the checkpoint that refers to it is written; then it replaces the one before.
 
         So a run that is killed at any moment finds the state that its last checkpoint refers to, by `settle`.

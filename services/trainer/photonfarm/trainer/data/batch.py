@@ -5,7 +5,7 @@ Shape letters: B batch, H W image.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal
 
@@ -134,7 +134,9 @@ class ResidentSamples:
         parts = {row: _take_one(moved, place) for place, row in enumerate(fresh.rows)}
         for row, part in parts.items():
             if self._has_room(needed := count_bytes(part)):
-                self._kept[row], self._bytes = _map_sample(torch.clone, part), self._bytes + needed
+                inputs = map_tensors(torch.clone, part.inputs)
+                self._kept[row] = TrainingBatch(part.rows, part.units, inputs, torch.clone(part.target))
+                self._bytes += needed
         return _join_samples([parts[row] if row in parts else self._kept[row] for row in rows]) if rows else moved
 
     def _has_room(self, needed: int) -> bool:
@@ -155,11 +157,6 @@ def _take_one(batch: TrainingBatch, place: int) -> TrainingBatch:
     """One sample of a batch, in the batch's memory."""
     inputs = map_tensors(lambda tensor: tensor[place : place + 1], batch.inputs)
     return TrainingBatch((batch.rows[place],), (batch.units[place],), inputs, batch.target[place : place + 1])
-
-
-def _map_sample(change: Callable[[Tensor], Tensor], sample: TrainingBatch) -> TrainingBatch:
-    """The sample with `change` applied to its tensors."""
-    return TrainingBatch(sample.rows, sample.units, map_tensors(change, sample.inputs), change(sample.target))
 
 
 def _join_samples(samples: Sequence[TrainingBatch]) -> TrainingBatch:

@@ -63,15 +63,13 @@ class DevicePredictor:
     @torch.no_grad()
     def __call__(self, batch: TrainingBatch) -> F32:
         """A batch's images."""
-        images: F32 = self.images(self._there(batch.inputs)).cpu().numpy()
+        inputs = map_tensors(lambda tensor: tensor.to(self.device), batch.inputs)
+        images: F32 = self.images(inputs).cpu().numpy()
         return images
 
     def of_its_own(self, inputs: Inputs) -> Inputs:
         """A copy of these inputs on the predictor's device, which outlives their batch."""
         return map_tensors(lambda tensor: tensor.to(self.device, copy=True), inputs)
-
-    def _there(self, inputs: Inputs) -> Inputs:
-        return map_tensors(lambda tensor: tensor.to(self.device), inputs)
 
     @torch.no_grad()
     def wall_s(self, inputs: Inputs) -> float:

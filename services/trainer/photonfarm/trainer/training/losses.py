@@ -67,10 +67,10 @@ def judge(loss: LossFunction) -> Verdict:
     generator = torch.Generator().manual_seed(0)
     clean = 0.1 + torch.rand(1, SIZE, SIZE, 3, generator=generator)
     at_clean = _measure_distance(loss, clean, clean, torch.zeros_like(clean), generator)
-    others = (0.5 * clean, 2.0 * clean)
+    halves = clean[:, None].expand(-1, 2, -1, -1, -1)  # the clean image as both, (1, 2, H, W, 3)
     elsewhere = (
-        _measure_distance(loss, at, clean, _compute_gradients(loss, at, _make_halves(clean))[0], generator)
-        for at in others
+        _measure_distance(loss, at, clean, _compute_gradients(loss, at, halves)[0], generator)
+        for at in (0.5 * clean, 2.0 * clean)
     )
     return Verdict(at_clean, max(elsewhere))
 
@@ -98,11 +98,6 @@ def _draw_noisy(clean: Tensor, generator: torch.Generator) -> Tensor:
     """Targets whose mean is the clean image: (B, 2, H, W, 3), mostly a fifth of it, rarely much more."""
     bright = torch.rand(BATCH, 2, *clean.shape[1:], generator=generator) < RARE
     return torch.where(bright, (1 - 0.2 * (1 - RARE)) / RARE, 0.2) * clean[:, None]
-
-
-def _make_halves(clean: Tensor) -> Tensor:
-    """The clean image as both halves, (1, 2, H, W, 3)."""
-    return clean[:, None].expand(-1, 2, -1, -1, -1)
 
 
 RELATIVE_EPSILON = 0.05

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from bench.farm.account import planned
 from bench.farm.workers import make_sample
 from bench.harness.processes import Processes, answer
-from photonfarm.core.processes import tied
+from photonfarm.core.processes import tie
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.scene.spec_loading import load_spec
@@ -77,7 +77,7 @@ def farm(folder: Path, options: argparse.Namespace, count: int) -> ConcurrentWor
         told = {"PHOTONFARM_STORE": str(folder / "store"), "PHOTONFARM_REDIS_URL": redis.url}
         verb = [sys.executable, "-m", "photonfarm.cli", "work", "--until-complete", "--quiet", "--name"]
         running = [
-            subprocess.Popen(tied([*verb, f"worker-{i}"]), env={**os.environ, **told}, stdin=subprocess.DEVNULL)
+            subprocess.Popen(tie([*verb, f"worker-{i}"]), env={**os.environ, **told}, stdin=subprocess.DEVNULL)
             for i in range(count)
         ]
         codes = [process.wait() for process in running]

@@ -12,8 +12,8 @@ from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.text import Text
 
-from photonfarm.core.waiting import in_words
-from photonfarm.farm.training import counted
+from photonfarm.core.waiting import format_span
+from photonfarm.farm.training import count_steps
 from photonfarm.farm.up import FarmProgress
 
 PLAIN_LINE_S = 5.0  # between progress lines where there is no terminal for bars
@@ -71,9 +71,9 @@ def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
     """The progress in words, with the time that the samples still take, if it is known."""
     (samples, planned), (passes, further) = found.samples, found.passes
     in_hand = f" (+{found.in_hand} in hand)" if found.in_hand else ""
-    left = f", {in_words(left_s)} left" if left_s and samples < planned else ""
+    left = f", {format_span(left_s)} left" if left_s and samples < planned else ""
     words = f"  further passes {passes}/{further}" if further else ""
-    training = f"  steps {counted(found.step, found.steps)}{found.note}" if found.steps else ""
+    training = f"  steps {count_steps(found.step, found.steps)}{found.note}" if found.steps else ""
     why = f"  ({'; '.join(found.waits)})" if found.waits else f"  ({'; '.join(found.doing)})" if found.doing else ""
     return f"samples {samples}/{planned}{in_hand}{left}{words}{training}{why}"
 

@@ -10,8 +10,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from photonfarm.core.waiting import in_words
-from photonfarm.farm.status import NoQueue, failed
+from photonfarm.core.waiting import format_span
+from photonfarm.farm.status import NoQueue, describe_failed
 from photonfarm.farm.watch import FarmView, FarmWatch, SceneView
 
 LOOK_S = 2.0
@@ -28,22 +28,28 @@ def keep_watching(watch: FarmWatch) -> None:
                 time.sleep(PLAIN_S)
         with Live(console=console, auto_refresh=False) as live:
             while True:
-                live.update(drawn(watch.look()), refresh=True)
+                live.update(draw_farm(watch.look()), refresh=True)
                 time.sleep(LOOK_S)
     except KeyboardInterrupt:
         return
 
 
-def drawn(view: FarmView) -> Group:
+def draw_farm(view: FarmView) -> Group:
     """The farm as a terminal shows it."""
     table = Table("scene", "id", "samples", "in hand", "rate", "left", "core time", "size", box=None, pad_edge=False)
     for scene in view.scenes:
         if scene.error:
             continue
         table.add_row(
-            Text(scene.name), scene.scene_id[:8], _counted(scene), str(scene.in_hand), _rate(scene), _left(scene),
-            f"{scene.core_s:.0f} s", f"{scene.size_bytes / 1e6:.1f} MB",
-        )  # fmt: skip
+            Text(scene.name),
+            scene.scene_id[:8],
+            _describe_progress(scene),
+            str(scene.in_hand),
+            _rate(scene),
+            _describe_left(scene),
+            f"{scene.core_s:.0f} s",
+            f"{scene.size_bytes / 1e6:.1f} MB",
+        )
     return Group(Text(time.strftime("%H:%M:%S")), table, *(Text(line) for line in _below(view)))
 
 
@@ -55,9 +61,9 @@ def lines(view: FarmView) -> Iterator[str]:
             continue
         in_hand = f" (+{scene.in_hand} in hand)" if scene.in_hand else ""
         parts = (
-            f"samples {_counted(scene)}{in_hand}",
+            f"samples {_describe_progress(scene)}{in_hand}",
             _rate(scene),
-            _left(scene),
+            _describe_left(scene),
             "" if scene.missing else "all there",
         )
         yield f"{now}  {scene.name} {scene.scene_id[:8]}: {', '.join(filter(None, parts))}"
@@ -76,7 +82,7 @@ def _below(view: FarmView) -> Iterator[str]:
         yield f"  worker {name} {activity}"
     yield from (f"  {training.line}" for training in view.trainings)
     yield from (f"  {wait}" for wait in view.waits)
-    yield from (f"  before: {failed(cause)}" for cause in view.queue.kept)
+    yield from (f"  before: {describe_failed(cause)}" for cause in view.queue.kept)
 
 
 def _without_redis(view: FarmView) -> str:
@@ -86,7 +92,7 @@ def _without_redis(view: FarmView) -> str:
     return "no farm is at work here"
 
 
-def _counted(scene: SceneView) -> str:
+def _describe_progress(scene: SceneView) -> str:
     further = f", passes {scene.passes[0]}/{scene.passes[1]}" if scene.passes[1] else ""
     return f"{scene.samples[0]}/{scene.samples[1]}{further}"
 
@@ -97,5 +103,5 @@ def _rate(scene: SceneView) -> str:
     return f"{scene.rate:.1f} samples/s" if scene.rate >= 1 else f"{60 * scene.rate:.1f} samples/min"
 
 
-def _left(scene: SceneView) -> str:
-    return "" if scene.left_s is None else f"{in_words(scene.left_s)} left"
+def _describe_left(scene: SceneView) -> str:
+    return "" if scene.left_s is None else f"{format_span(scene.left_s)} left"

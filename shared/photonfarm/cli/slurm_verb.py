@@ -127,7 +127,7 @@ def slurm(
         click.echo("\n".join(scripts.values()), nl=False)
         return
     check_slurm()
-    planned = _planned(named, store, queue_url, request, shard_rows, options)
+    planned = _plan(named, store, queue_url, request, shard_rows, options)
     started = launch(scripts, options["logs"].absolute())
     if as_json:
         from photonfarm.cli import show
@@ -139,7 +139,7 @@ def slurm(
         click.echo(f"job {started.trainer}: the trainer, which begins once the first worker has")
 
 
-def _planned(
+def _plan(
     named: Sequence[NamedSpec],
     store: str | Path,
     queue_url: str | None,
@@ -161,9 +161,9 @@ def _planned(
         found = planned[-1]
         click.echo(f"scene {found.scene_id}: {found.planned} samples planned, {found.planned_before} before", err=True)
     if queue_url is not None:
-        from photonfarm.queue import with_password_of
+        from photonfarm.queue import add_password
 
-        url = with_password_of(password_file(), queue_url)
+        url = add_password(password_file(), queue_url)
         queue_missing(Store(store), url, retry=options["retry"])
     return planned
 
@@ -199,11 +199,11 @@ def _surroundings(named: Sequence[NamedSpec], store: str | Path, queue_url: str 
     variables = {"PHOTONFARM_CONFIG": config, "PHOTONFARM_REDIS_PASSWORD_FILE": str(file) if file else None}
     absolute = tuple((name, str(Path(path).absolute())) for name, path in variables.items() if path)
     return Surroundings(
-        Path.cwd(), logs.absolute(), place, queue_url is not None, _to_be_written(queue_url), tuple(scenes), absolute
+        Path.cwd(), logs.absolute(), place, queue_url is not None, _url_of_script(queue_url), tuple(scenes), absolute
     )
 
 
-def _to_be_written(queue_url: str | None) -> str | None:
+def _url_of_script(queue_url: str | None) -> str | None:
     """The URL of Redis for a script; None if it holds a password, which the environment or configuration has."""
     if queue_url is None:
         return None

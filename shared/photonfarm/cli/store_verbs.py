@@ -50,7 +50,7 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
             when=datetime.now(UTC).isoformat(timespec="seconds"),
             repair=repair,
             on_progress=on_progress,
-            on_wait=show_store.waiting,
+            on_wait=show_store.print_waiting,
         )
     show_store.check(report, as_json)
     sys.exit(report.exit_code)
@@ -92,7 +92,7 @@ def find(
     opened = Store(store)
     query = Query.of(modification=modification, view=view, sample=sample, row=row, job=job, tolerance=tolerance)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
-    show_store.found(find_samples(opened, ids, query, limit=limit), store, as_json)
+    show_store.print_matches(find_samples(opened, ids, query, limit=limit), store, as_json)
 
 
 @click.command()
@@ -136,9 +136,9 @@ def merge(
     for each in write_views(merged, out):
         written.append(each)
         if not as_json:
-            show_store.merged(each)
+            show_store.print_merged(each)
     if as_json:
-        show_store.merged_document(written)
+        show_store.print_merged_document(written)
     if not written:
         if not find_samples(opened, ids, query, limit=1).count:
             raise StoreError("no sample that is planned fits; `photonfarm store find` shows what there is")
@@ -166,8 +166,8 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
     from photonfarm.farm.join import join as joined
 
     with show_store.copying() as on_progress:
-        result = joined(store, other, scene, on_progress=on_progress, on_wait=show_store.waiting)
-    show_store.joined(result, as_json)
+        result = joined(store, other, scene, on_progress=on_progress, on_wait=show_store.print_waiting)
+    show_store.print_joined(result, as_json)
 
 
 @click.command()
@@ -188,7 +188,7 @@ def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> 
 
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
-    show_store.withdrawn(withdrawn(stored, plan, on_wait=show_store.waiting), as_json)
+    show_store.print_withdrawn(withdrawn(stored, plan, on_wait=show_store.print_waiting), as_json)
 
 
 @click.command()
@@ -210,9 +210,9 @@ def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
     opened = Store(store)
     scene_id = scene_named(opened, scene)
     if not yes:
-        question = f"Delete {show_store.contents(opened, scene_id)} of {store}?"
+        question = f"Delete {show_store.describe_contents(opened, scene_id)} of {store}?"
         if not sys.stdin.isatty():
             raise click.UsageError(f"{question} Without a terminal to ask, --yes is required.")
         if not click.confirm(question, err=True):
             raise click.ClickException("nothing is deleted")
-    show_store.forgotten(forgotten(opened, scene_id, on_wait=show_store.waiting), as_json)
+    show_store.print_forgotten(forgotten(opened, scene_id, on_wait=show_store.print_waiting), as_json)

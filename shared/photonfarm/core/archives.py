@@ -31,7 +31,7 @@ def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> N
 
 
 @contextmanager
-def stored_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
+def read_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
     """The arrays of a file by name, each read at its first use.
 
     Raises StoreError if the file is missing, unreadable or damaged, and if the code inside the `with` raises KeyError,
@@ -120,6 +120,6 @@ class FrameCosts:
     @classmethod
     def read(cls, file: Path) -> Self:
         """Read what `write` stored; raises StoreError for anything else."""
-        with stored_arrays(file, "frame costs", "measure-frames") as stored:
+        with read_arrays(file, "frame costs", "measure-frames") as stored:
             arrays: dict[str, Any] = {each.name: stored[each.name] for each in fields(cls)}
             return cls(**{**arrays, "scene_id": str(arrays["scene_id"])})

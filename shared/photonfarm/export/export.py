@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core.errors import IncompleteError, SpecError
-from photonfarm.core.waiting import waiting
+from photonfarm.core.waiting import tell_waiting
 from photonfarm.export import card, configurations, folder, manifest
 from photonfarm.export.columns import GUIDES, Column, Contents, buffers_named, columns, ranges, spans
 from photonfarm.export.folder import Files, Planned
@@ -94,7 +94,7 @@ def _bytes_of(found: Sequence[Column]) -> int:
 
 def _snapshot(store: str | Path, stored: SceneStore, settings: ExportSettings, log: Callable[[str], None]) -> Snapshot:
     guides = not set(GUIDES).isdisjoint(settings.buffers)
-    with waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
+    with tell_waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
         snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
     log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete")
     return snapshot
@@ -135,7 +135,7 @@ class _Export:
             self._form.write(part.file, self._samples(snapshot, part), self._contents)
             written_bytes += part.file.stat().st_size
         rows = [*there, *new]
-        with waiting(self._log, f"describing {len(rows)} samples"):
+        with tell_waiting(self._log, f"describing {len(rows)} samples"):
             self._finish(snapshot, rows)
         shared = len(self._configurations)
         return Result(str(self._out), snapshot.spec.scene_id, len(rows), len(new), len(planned), written_bytes, shared)

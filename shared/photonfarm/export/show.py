@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.cli.show import print_json
-from photonfarm.core.waiting import in_words
+from photonfarm.core.waiting import format_span
 from photonfarm.export.export import OnProgress, Result
 
 LINE_S = 4.0
@@ -36,7 +36,7 @@ def progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
             speed = f"{rate:.0f}/s, {rate * size_bytes / done / 1e6:.0f} MB/s"
             bars.update(bar, completed=done, total=total, rate=speed, visible=True)
             if not console.is_terminal and (now - last > LINE_S or done == total):
-                last, left = now, in_words((total - done) / rate)
+                last, left = now, format_span((total - done) / rate)
                 console.print(f"{done}/{total} samples, {speed}, {left} left", highlight=False)
 
         def say(line: str) -> None:

@@ -48,7 +48,7 @@ def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Re
         raise SpecError(fault)
 
 
-def chosen_hold_out(spec: SceneSpec, store: str | Path, request: Request) -> float:
+def choose_hold_out(spec: SceneSpec, store: str | Path, request: Request) -> float:
     """The share to hold out where a user names none: the default, or just enough for one of what a small plan has.
 
     Raises SpecError if there is only one configuration (in a static scene, view).
@@ -115,7 +115,7 @@ def _units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> set[Ke
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:
         wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
-    planned = _planned(spec, plans, wanted)
+    planned = _plan_views(spec, plans, wanted)
     return set(units_of(planned, np.arange(len(planned.view_row))))
 
 
@@ -126,7 +126,7 @@ def _plans(spec: SceneSpec, store: str | Path) -> list[StoredPlan]:
     return []
 
 
-def _planned(spec: SceneSpec, plans: list[StoredPlan], wanted: Request) -> PlannedViews:
+def _plan_views(spec: SceneSpec, plans: list[StoredPlan], wanted: Request) -> PlannedViews:
     """The views of a scene's plans and of a request."""
     known = content(plans)
     first_job, shard_rows = (plans[-1].end_job, plans[0].shard_rows) if plans else (0, SHARD_ROWS)
@@ -229,17 +229,17 @@ def submit(
     with at_work(opened.storage, named.spec.scene_id, "submit", log.warning):
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten
-    queued = _queued(opened, redis_url, retry=retry or anew)
+    queued = _queue(opened, redis_url, retry=retry or anew)
     return Submission(
         planned.scene_id, planned.plan, planned.new, planned.known, queued,
         note=first_plan_note(opened, named.spec) if planned.plan == 0 else None,
         halves_from=other if planned.new else None,
-        replaced=None if before is None else _replaced(before, named.spec),
+        replaced=None if before is None else _describe_replaced(before, named.spec),
         scenes=named.scenes,
     )  # fmt: skip
 
 
-def _replaced(there: SceneSpec, here: SceneSpec) -> str | None:
+def _describe_replaced(there: SceneSpec, here: SceneSpec) -> str | None:
     """What a stored spec has lost to a submitted one of the same ids, in words; None if they agree."""
     then, now = (spec.model_dump(mode="json", exclude={"scene", "stored_exponent"}) for spec in (there, here))
     changes = differing(then, now)
@@ -269,7 +269,7 @@ def top_up(
         )
     with at_work(opened.storage, scene_id, "top-up", log.warning):
         planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
-    queued = None if dry_run else _queued(opened, redis_url, retry=retry)
+    queued = None if dry_run else _queue(opened, redis_url, retry=retry)
     return TopUpSubmission(
         planned.scene_id,
         planned.plan,
@@ -282,7 +282,7 @@ def top_up(
     )
 
 
-def _queued(store: Store, redis_url: str | None, *, retry: bool | str) -> int | None:
+def _queue(store: Store, redis_url: str | None, *, retry: bool | str) -> int | None:
     """The number of jobs that are queued now; None without Redis. Workers that have none learn it from the store."""
     if retry is True:
         with store_errors("note a retry", store.storage.where):

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from redis import Redis, RedisError
 
 from photonfarm.core.errors import IncompleteError, QueueError, SpecError, StoreError
-from photonfarm.core.processes import Stop, repeating
+from photonfarm.core.processes import Stop, repeat
 from photonfarm.scene.spec import Film
 from photonfarm.scene.spec_loading import load_spec, scene_folder
 from photonfarm.store import Store
@@ -289,7 +289,7 @@ def _sign_of_life(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise StoreError(f"{folder}: the folder of the training run cannot be written: {error.strerror}") from error
     try:
-        with repeating(ALIVE_S / 4, (folder / ALIVE_FILE).touch):
+        with repeat(ALIVE_S / 4, (folder / ALIVE_FILE).touch):
             yield
     finally:
         if folder.is_dir():
@@ -308,7 +308,7 @@ def _reported(
     """
     reporter = _ConsumptionReporter(redis_url, store, scene_id, log)
     try:
-        with repeating(REPORT_S, reporter.report):
+        with repeat(REPORT_S, reporter.report):
             yield reporter.take
     finally:
         reporter.report()

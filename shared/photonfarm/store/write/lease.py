@@ -24,7 +24,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext, supp
 from typing import Any
 
 from photonfarm.core.errors import IncompleteError, StoreError, store_errors
-from photonfarm.core.processes import is_gone, process_space, repeating
+from photonfarm.core.processes import is_gone, process_space, repeat
 from photonfarm.store.io.storage import Storage, put_json, read_or_none
 
 LEASES = "leases"
@@ -200,7 +200,7 @@ class Claim:
     def renewed(self) -> Iterator[None]:
         """Renew the file in a thread of its own, and remove it at the end."""
         try:
-            with repeating(BEAT_S, self._renew):
+            with repeat(BEAT_S, self._renew):
                 yield
         finally:
             with suppress(OSError):

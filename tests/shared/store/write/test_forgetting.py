@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from photonfarm.cli.store_verbs import forget as verb
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
-from photonfarm.queue import job_name, keep_failure, times_failed
+from photonfarm.queue import count_failures, job_name, keep_failure
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
@@ -137,7 +137,7 @@ def test_its_failures_are_forgotten_and_those_of_others_are_not(store: Store, sc
     for each in (scene, other):
         keep_failure(store, job_name(each.scene_id, 0), "IncompleteError: no", worker="w1")
     forget(Store(store.root), scene.scene_id)
-    assert times_failed(store) == {job_name(other.scene_id, 0): 1}
+    assert count_failures(store) == {job_name(other.scene_id, 0): 1}
 
 
 @pytest.mark.parametrize("point", range(1, 12))

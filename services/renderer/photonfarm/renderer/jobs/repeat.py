@@ -19,7 +19,7 @@ from photonfarm.core.files import whole_file
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import block_z_test
-from photonfarm.core.waiting import Log, waiting
+from photonfarm.core.waiting import Log, tell_waiting
 from photonfarm.plan.request import sample_key
 from photonfarm.renderer.jobs.estimates import halves_of
 from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
@@ -153,10 +153,10 @@ def repeat(
     key = sample_key(stored.spec.radiance_id, modification, view.vector, number)
     at = _row_of(stored, key)
     spec = located(_beside(scene, _as_rendered(opened, stored, key)))
-    with waiting(log, f"loading scene {spec.name}"):
+    with tell_waiting(log, f"loading scene {spec.name}"):
         loaded = load(spec)
         loaded.apply(modification)
-    with waiting(log, f"rendering pass {number} of the view in row {row}"):
+    with tell_waiting(log, f"rendering pass {number} of the view in row {row}"):
         ((halves, _),) = halves_of(loaded, [(key, view)])
     there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)

@@ -113,7 +113,7 @@ class TrainerPace:
             for scene_id, progress in self._progress().items()
             if progress.committed_samples > AHEAD_MINIMUM and progress.committed_samples < progress.planned_samples
         }
-        used = queue.consumed_samples(self._connection, list(committed))
+        used = queue.read_consumed(self._connection, list(committed))
         return {
             scene_id: f"{samples} samples are committed, and the trainer has used {used[scene_id]} "
             f"(--ahead {self._ratio:g})"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photonfarm.core.statistics import stated
+from photonfarm.core.statistics import format_estimate
 from photonfarm.trainer.runs import wait_times
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ from rich import markup
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from photonfarm.core.processes import repeating
+from photonfarm.core.processes import repeat
 from photonfarm.core.waiting import SILENCE_S, Steps
 
 
@@ -37,8 +37,8 @@ def record(of: dict[str, Any]) -> None:
     if of["kind"] == "validation":
         there = f"on {of['held_out']} of {of['samples']} samples; "
         click.echo(
-            f"step {of['step']}: held-out error {stated(of['error'], of['standard_error'])} "
-            f"({stated(of['shown_error'], None)} up to white) {there}"
+            f"step {of['step']}: held-out error {format_estimate(of['error'], of['standard_error'])} "
+            f"({format_estimate(of['shown_error'], None)} up to white) {there}"
             + wait_times.stated(of["waits"], of["samples_per_used"]),
             err=True,
         )
@@ -59,7 +59,8 @@ def _recovered(log_record: dict[str, Any]) -> str:
     elif errors["now"] is None:
         found = "the held-out error is not finite"
     else:
-        found = f"held-out error {stated(errors['now'], None)} (best so far {stated(errors['best'], None)})"
+        now, best = (format_estimate(errors[when], None) for when in ("now", "best"))
+        found = f"held-out error {now} (best so far {best})"
     if log_record["cause"] == "end":
         return f"{found}; ends with {back_to}"
     return f"{found}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"
@@ -112,5 +113,5 @@ def _lines() -> Iterator[OnProgress]:
             return f"{name}, for {time.monotonic() - since_s:.0f} s"
         return f"{name}: sample {samples.words()}"
 
-    with repeating(SILENCE_S, lambda: click.echo(line(), err=True)):
+    with repeat(SILENCE_S, lambda: click.echo(line(), err=True)):
         yield show

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from photonfarm.core.waiting import in_words
+from photonfarm.core.waiting import format_span
 from photonfarm.trainer.dry_run.dry_run import DryRun
 
 
@@ -34,7 +34,7 @@ def text(found: DryRun) -> str:
         f"memory       {_size(found.memory_bytes)} at least: "
         + ", ".join(f"{name} {_size(size)}" for name, size in parts),
         *([] if timed.peak_bytes is None else [f"             {_size(timed.peak_bytes)} at the timed steps"]),
-        f"here         {_seconds(timed.step_s)} a step, {rate:,.0f} GFLOP/s, {in_words(found.seconds)} in all, on "
+        f"here         {_seconds(timed.step_s)} a step, {rate:,.0f} GFLOP/s, {format_span(found.seconds)} in all, on "
         f"{timed.device}",
         f"             (median of {timed.steps} steps of {timed.samples}{of}, on made-up samples; without reading, "
         "waiting, validation)",

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from photonfarm.core.pictures import reduced, rendered
+from photonfarm.core.pictures import reduce_image, render_page
 from photonfarm.core.records import F32
 from photonfarm.trainer.compare import evaluation_table
 from photonfarm.trainer.compare.comparison import markdown_table
@@ -62,7 +62,7 @@ LARGEST_HALF = np.float32(np.finfo(np.float16).max)
 
 def page(contents: ReportContents, verdict: Verdict, views: Sequence[ShownView], drawn: list[Plot]) -> str:
     """The report's HTML."""
-    return rendered(
+    return render_page(
         TEMPLATE,
         title=f"photonfarm: {contents.card.spec.name}",
         verdict=verdict,
@@ -103,5 +103,5 @@ def _by_importance(views: Sequence[ShownView]) -> Iterator[tuple[int, str, F32]]
 
 def half_floats(light: F32) -> str:
     """Light (H, W, 3) as base64 of little-endian half floats; of a large film, the means over blocks of pixels."""
-    halves = np.clip(reduced(np.nan_to_num(light), LARGEST), -LARGEST_HALF, LARGEST_HALF).astype("<f2")
+    halves = np.clip(reduce_image(np.nan_to_num(light), LARGEST), -LARGEST_HALF, LARGEST_HALF).astype("<f2")
     return b64encode(halves.tobytes()).decode()

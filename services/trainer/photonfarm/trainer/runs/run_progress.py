@@ -10,9 +10,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from photonfarm.core.files import write_whole
-from photonfarm.core.processes import repeating
-from photonfarm.core.waiting import in_words
-from photonfarm.farm.training import PROGRESS, TRAINS, WAITS, counted
+from photonfarm.core.processes import repeat
+from photonfarm.core.waiting import format_span
+from photonfarm.farm.training import PROGRESS, TRAINS, WAITS, count_steps
 from photonfarm.trainer.runs.wait_times import TimeKind
 
 FILE_S = 2.0  # between two versions of the file
@@ -66,7 +66,7 @@ class RunProgress:
     def line(self) -> str:
         """The present state in words."""
         found = self.look()
-        left = f", {in_words(found['left_s'])} left" if isinstance(found["left_s"], float) else ""
+        left = f", {format_span(found['left_s'])} left" if isinstance(found["left_s"], float) else ""
         since = f" for {found['phase_s']:.0f} s" if found["phase"] != TRAINS else ""
         return f"{self._steps_done}: {found['phase']}{since}, {self._samples} samples have arrived{left}"
 
@@ -76,7 +76,7 @@ class RunProgress:
 
     @property
     def _steps_done(self) -> str:
-        return f"step {counted(self._step, self._steps)}"
+        return f"step {count_steps(self._step, self._steps)}"
 
 
 @contextmanager
@@ -93,7 +93,7 @@ def followed(progress: RunProgress, run: Path, say: Callable[[str], object] | No
             say(progress.line())
 
     try:
-        with repeating(FILE_S, follow):
+        with repeat(FILE_S, follow):
             yield
         if say is not None and (last := progress.last_line()):
             say(last)

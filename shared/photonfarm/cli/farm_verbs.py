@@ -254,7 +254,7 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
 
     Ctrl-C stops it within seconds; the same command goes on from there.
     """
-    from photonfarm.cli.show_up import FarmTalk
+    from photonfarm.cli.show_watch import FarmTalk
     from photonfarm.farm.devices import AUTO, CPU, DEVICE_VARIABLE, cards_here, worker_devices
     from photonfarm.farm.up import WORKERS, run_farm, trainer_arguments
 

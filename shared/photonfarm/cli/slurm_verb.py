@@ -20,7 +20,7 @@ from photonfarm.cli.options import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from photonfarm.farm.slurm.scripts import Surroundings
+    from photonfarm.farm.slurm import Surroundings
     from photonfarm.farm.submission import Submission
     from photonfarm.plan.request import Request
     from photonfarm.scene.spec_loading import NamedSpec
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 def _limit(ctx: click.Context, param: click.Parameter, text: str | None) -> str | None:  # noqa: ARG001
     from photonfarm.core.errors import SpecError
-    from photonfarm.farm.slurm.scripts import LEAST_LIMIT_S, limit_s
+    from photonfarm.farm.slurm import LEAST_LIMIT_S, limit_s
 
     try:
         if text is not None and limit_s(text) < LEAST_LIMIT_S:
@@ -115,7 +115,7 @@ def slurm(
 
     Exit code 9: sbatch is not here, or refuses.
     """
-    from photonfarm.farm.slurm.launch import check_slurm, launch
+    from photonfarm.farm.slurm import check_slurm, launch
     from photonfarm.scene.spec_loading import NamedSpec
 
     if options["train"] and len(specs) > 1:
@@ -172,8 +172,7 @@ def _scripts(
     named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, options: dict[str, Any]
 ) -> dict[str, str]:
     """The scripts by their names."""
-    from photonfarm.farm.slurm.launch import TRAINER, WORKERS
-    from photonfarm.farm.slurm.scripts import Resources, trainer_script, worker_script
+    from photonfarm.farm.slurm import TRAINER, WORKERS, Resources, trainer_script, worker_script
 
     at = _surroundings(named, store, queue_url, options["logs"])
     words = [_word(spec.name) for spec in named]
@@ -191,7 +190,7 @@ def _scripts(
 
 
 def _surroundings(named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, logs: Path) -> Surroundings:
-    from photonfarm.farm.slurm.scripts import Surroundings
+    from photonfarm.farm.slurm import Surroundings
 
     place = str(store.absolute()) if isinstance(store, Path) else store
     scenes = dict.fromkeys(spec.scenes for spec in named if spec.scenes)

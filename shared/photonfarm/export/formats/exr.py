@@ -8,9 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from photonfarm.core.archives import write_arrays
+from photonfarm.core.archives import write_arrays, write_layers
 from photonfarm.core.errors import store_errors
-from photonfarm.core.exr import write_layers
 from photonfarm.core.files import write_whole
 from photonfarm.export.columns import HALVES, Contents, rows_in
 from photonfarm.export.folder import SAMPLES

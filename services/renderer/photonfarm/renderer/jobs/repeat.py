@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core import pictures
-from photonfarm.core.archives import write_arrays
+from photonfarm.core.archives import write_arrays, write_layers
 from photonfarm.core.errors import SpecError, StoreError, store_errors
-from photonfarm.core.exr import write_layers
 from photonfarm.core.files import whole_file
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32

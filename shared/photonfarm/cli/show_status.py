@@ -111,7 +111,7 @@ def _known_queue(found: StoreQueue, scenes: Sequence[SceneStatus], store: str | 
     )
     for name, activity in sorted(status.activities.items()):
         click.echo(f"  worker {name} {activity}")
-    for line in idle(status, {scene.scene_id: scene.name for scene in scenes}):
+    for line in idle(status, {scene.scene_id: scene.name for scene in scenes}, missing):
         click.echo(f"  {line}")
     _failures("", causes, store)
 

@@ -76,7 +76,9 @@ def check(report: StoreReport, as_json: bool) -> None:
     if report.parts:
         click.echo(f"tmp: {report.parts} unfinished files; workers sweep those of the dead")
     if report.quarantine:
-        click.echo(f"set aside to {report.quarantine}, with a record of why; workers render what is missing now")
+        click.echo(
+            f"set aside to {report.quarantine}, with a record of why; workers render the jobs that are missing now"
+        )
     wrong = sum(_wrong(scene) for scene in report.scenes)
     if not wrong:
         click.echo("nothing is wrong")
@@ -261,5 +263,6 @@ def print_withdrawn(result: Withdrawal, as_json: bool) -> None:
     kept = f", {result.kept} stay planned, as rendered ones show their views or configurations" if result.kept else ""
     jobs = "1 job" if result.jobs == 1 else f"{result.jobs} jobs"
     forgotten = f"{result.samples} samples in {jobs} are forgotten" if result.jobs else "nothing is left to withdraw"
-    said = f"{forgotten}; {result.rendered} are rendered and stay{kept}"
+    left = "" if result.jobs else f"; {result.left}"
+    said = f"{forgotten}; {result.rendered} are rendered and stay{kept}{left}"
     click.echo(f"plan {result.plan} of scene {result.scene_id} ({result.name}): {said}")

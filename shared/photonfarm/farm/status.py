@@ -195,19 +195,21 @@ def waits(
     `names` are those of the store's scenes, by their ids, and `missing` samples are planned and not committed.
     """
     if isinstance(queue, StoreQueue):
-        yield from idle(queue.status, names)
+        yield from idle(queue.status, names, missing)
         yield from (Wait("job_failed", len(cause.jobs), describe_failed(cause)) for cause in queue.causes)
-        if missing and not queue.status.workers:
-            why = f"{missing} samples wait for a worker: none is alive; `photonfarm work` starts one"
-            yield Wait("no_worker", missing, why)
     for training in trainings:
         if training.phase == WAITS:
             why = f"{training.run}: the trainer {WAITS}" + ("" if missing else ", and all that are planned are there")
             yield Wait("trainer_waits", 1, why)
 
 
-def idle(found: QueueStatus, names: Mapping[str, str]) -> Iterator[Wait]:
-    """Yield why scenes are not rendered, by the workers' reports."""
+def idle(found: QueueStatus, names: Mapping[str, str], missing: int) -> Iterator[Wait]:
+    """Yield why scenes are not rendered, by the workers' reports; and that none is there for `missing` samples."""
+    if missing and not found.workers:
+        why = (
+            f"{missing} samples wait for a worker: none is alive; `photonfarm work` starts one, which also queues them"
+        )
+        yield Wait("no_worker", missing, why)
     for scene_id, reasons in found.left.items():
         if scene_id in names:
             reason = next(iter(reasons.values()))

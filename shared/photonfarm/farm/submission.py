@@ -29,7 +29,8 @@ from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.read.find import scene_named
 from photonfarm.store.read.other_scenes import first_plan_note, other_scenes, with_same_radiance
 from photonfarm.store.write.lease import at_work
-from photonfarm.store.write.plans import StoredPlan, content
+from photonfarm.store.write.plans import StoredPlan, content, load_all
+from photonfarm.store.write.scene_store import SCENES, stored_spec
 
 MOST_NAMED = 4096
 """The largest number of configurations that a message proposes."""
@@ -121,9 +122,7 @@ def _units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> set[Ke
 
 def _plans(spec: SceneSpec, store: str | Path) -> list[StoredPlan]:
     """The plans of a scene; none if the store does not have it."""
-    if not is_vacant(store) and spec.scene_id in (opened := Store(store)).scene_ids():
-        return opened.scene(spec.scene_id).plans()
-    return []
+    return [] if is_vacant(store) else load_all(Store(store).storage, f"{SCENES}/{spec.scene_id}", [])
 
 
 def _plan_views(spec: SceneSpec, plans: list[StoredPlan], wanted: Request) -> PlannedViews:
@@ -225,7 +224,7 @@ def submit(
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
     other = scene_named(opened, halves_from) if halves_from else with_same_radiance(opened, named.spec)
-    before = opened.scene(named.spec.scene_id).spec if opened.has_scene(named.spec.scene_id) else None
+    before = stored_spec(opened.storage, named.spec.scene_id)
     with at_work(opened.storage, named.spec.scene_id, "submit", log.warning):
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten

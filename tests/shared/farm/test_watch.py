@@ -129,6 +129,15 @@ def test_samples_that_no_worker_renders_wait_for_one(store: Store, connection: r
     assert list(status.waits(queue_of(store, common_redis.url), {}, 0)) == []
 
 
+def test_status_says_that_missing_samples_wait_for_a_worker(
+    scene: SceneStore, store: Store, connection: redis.Redis, common_redis: EmbeddedRedis
+) -> None:
+    words = ["status", "--store", str(store.root), "--redis", common_redis.url]
+    assert "8 samples wait for a worker" in CliRunner().invoke(umbrella, words).stdout
+    samples.commit_all(scene)
+    assert "wait for a worker" not in CliRunner().invoke(umbrella, words).stdout
+
+
 def test_failures_outlive_redis_until_their_job_is_committed(scene: SceneStore, store: Store, tmp_path: Path) -> None:
     name = queue.job_name(scene.scene_id, 1)
     queue.keep_failure(store, name, "ValueError: 7", worker="ada")

@@ -76,13 +76,14 @@ def check_store(
     *,
     when: str,
     repair: bool = False,
+    joined_from: Store | None = None,
     on_progress: CheckProgress | None = None,
     on_wait: OnWait = lambda _: None,
 ) -> StoreReport:
     """Check every scene of a store, or one; `repair` sets what is damaged aside, at the time `when`.
 
-    A repair waits with `on_wait` until it has a damaged scene alone. Raises StoreError if the scene is not there, or
-    the store cannot be read.
+    Plans of joins are written again from `joined_from`. A repair waits with `on_wait` until it has a damaged scene
+    alone. Raises StoreError if the scene is not there, or the store cannot be read.
     """
     storage = store.storage
     with store_errors("check the store", storage.where):
@@ -92,7 +93,7 @@ def check_store(
         quarantine = Quarantine(storage, when)
         reports = []
         for each in ids:
-            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None), on_wait)
+            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None), on_wait, joined_from)
             reports.append(checking.run(quarantine if repair else None))
         return StoreReport(
             tuple(reports), sum(name.endswith(".partial") for name in storage.names(TMP)), repair, quarantine.folder
@@ -116,13 +117,20 @@ class _SceneChecking:
     """One scene on its way through the check."""
 
     def __init__(
-        self, storage: Storage, scene_id: str, scenes: int, on_progress: CheckProgress, on_wait: OnWait
+        self,
+        storage: Storage,
+        scene_id: str,
+        scenes: int,
+        on_progress: CheckProgress,
+        on_wait: OnWait,
+        joined_from: Store | None,
     ) -> None:
         self._storage = storage
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
         self._on_progress = on_progress
         self._on_wait = on_wait
+        self._joined_from = joined_from
         self._findings = Findings()
         self._markers: dict[int, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
@@ -167,14 +175,14 @@ class _SceneChecking:
         if quarantine is None or not damaged:
             return check, []
         rewritten = []
-        repair = PlanRepair(self._storage, spec, self._name, quarantine)
+        repair = PlanRepair(self._storage, spec, self._name, quarantine, self._joined_from)
         with self._alone():
             for number in range(plans.count(self._storage, self._name)):
                 folder = f"{plans.folder(self._name, number)}/"
                 if why := [finding for finding in damaged if str(finding.file).startswith(folder)]:
                     try:
                         repair.run(number, why)
-                        rewritten.append(f"plan {number}, written again from its request")
+                        rewritten.append(f"plan {number}, written again")
                     except StoreError as error:
                         what = str(error).partition(": ")[2]
                         self._add([Finding(Cause.PLAN, what, self._scene_id, file=folder[:-1])])

@@ -26,6 +26,21 @@ REWRITE = "`photonfarm store check --repair` writes the inputs of a plan again f
 """The remedy for most damage of a plan."""
 
 
+def rejoin(store_id: str) -> str:
+    """The remedy for damaged inputs of a plan of a join."""
+    return (
+        "`photonfarm store check --repair --joined-from OTHER` writes the inputs of the plan again from the store that "
+        f"it was joined from, of the id {store_id}"
+    )
+
+
+SET_ASIDE = "`photonfarm store check --repair` sets it aside, and `photonfarm submit` of the same spec writes it again"
+"""The remedy for a damaged spec."""
+
+BASE_ASIDE = "`photonfarm store check --repair` sets it aside, and the next job that a worker renders writes it again"
+"""The remedy for a damaged base."""
+
+
 class Remedy(Enum):
     """The remedies for causes."""
 

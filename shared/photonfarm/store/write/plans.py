@@ -106,6 +106,7 @@ class PlanAttributes:
     shard_rows: int
     radiance_exponent: int  # the power of two by which radiance is stored
     halves_from: str | None
+    checksums: Mapping[str, str]  # of each zarr.json, by its name in the folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +171,7 @@ def build(
     """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
     import zarr
 
+    from photonfarm.store.format.metadata import seal
     from photonfarm.store.write.staging import group_in
 
     count = len(rows.sample_modification)
@@ -193,6 +195,7 @@ def build(
             more = schema.vector_attributes(declared.name, [each.name for each in spec.groups])
             schema.create_input(group, declared, getattr(rows, declared.name), more)
         schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
+    seal(part)
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
@@ -248,26 +251,31 @@ def _counted(storage: Storage, scene: str, names: list[str], loaded: int) -> int
 def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     """A plan; raises CorruptError if it is missing or not as it was written."""
     name = folder(scene, number)
-    group, about = _opened(storage, name)
-    with _unreadable(storage, name):
+    group, about = opened(storage, name)
+    with _unreadable(storage, name, rewritten(about.request)):
         rows = PlannedRows(*(_input(storage, name, group, each) for each in INPUTS))
     named = int(np.count_nonzero(rows.sample_modification != UNUSED))
     numbers = about.first_job, about.jobs, about.shard_rows
     return StoredPlan(number, name, about.request, *numbers, rows, about.halves_from, named=named)
 
 
+def rewritten(request: Request | TopUp | Joined) -> str:
+    """The remedy for damaged inputs of a plan."""
+    return findings.rejoin(request.store) if isinstance(request, Joined) else findings.REWRITE
+
+
 def read_about(storage: Storage, name: str) -> PlanAttributes:
     """The attributes of the plan in a folder; raises CorruptError if they are missing or not as they were written."""
-    return _opened(storage, name)[1]
+    return opened(storage, name)[1]
 
 
-def _opened(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
-    import zarr
+def opened(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
+    """The group of the plan in a folder, and its attributes; raises as `read_about`."""
+    from photonfarm.store.format.metadata import open_group
 
-    with _unreadable(storage, name):
-        group = zarr.open_group(storage.zarr(name), mode="r", zarr_format=3, use_consolidated=False)
-        check_version(group.attrs, f"{storage.where}/{name}")
-        return group, about_plan(dict(group.attrs))
+    with _unreadable(storage, name, findings.RESTORE):
+        group, checksums = open_group(storage, name)
+        return group, _about_plan(dict(group.attrs), checksums)
 
 
 def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]:
@@ -277,16 +285,14 @@ def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]
 
 
 @contextlib.contextmanager
-def _unreadable(storage: Storage, name: str) -> Iterator[None]:
+def _unreadable(storage: Storage, name: str, remedy: str) -> Iterator[None]:
     """Turn what readers of a plan raise into CorruptError."""
     try:
         yield
     except FileNotFoundError as error:
         raise CorruptError(f"{storage.where}/{name}: {findings.MISSING}") from error
-    except (ValueError, KeyError, TypeError, RuntimeError) as error:
-        raise CorruptError(
-            f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {findings.REWRITE}"
-        ) from error
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
+        raise CorruptError(f"{storage.where}/{name}: is not a readable plan: {reason(error)}; {remedy}") from error
 
 
 def reason(error: Exception) -> str:
@@ -296,18 +302,13 @@ def reason(error: Exception) -> str:
     return f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
 
 
-def check_version(attributes: Mapping[str, Any], where: str) -> None:
-    """Return if a plan's attributes are of this program's version; else raises StoreError, with a sentence."""
-    declarations.check_version(attributes.get("format"), attributes.get("version"), where, "the plan's zarr.json")
-
-
-def about_plan(attributes: dict[str, Any]) -> PlanAttributes:
+def _about_plan(attributes: dict[str, Any], checksums: Mapping[str, str]) -> PlanAttributes:
     """Read the attributes of a plan's group; raises ValueError or KeyError."""
     request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
     first_job, jobs, shard_rows, exponent = (
         int(attributes[name]) for name in ("first_job", "jobs", "shard_rows", "radiance_exponent")
     )
-    return PlanAttributes(request, first_job, jobs, shard_rows, exponent, attributes.get("halves_from"))
+    return PlanAttributes(request, first_job, jobs, shard_rows, exponent, attributes.get("halves_from"), checksums)
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:

@@ -69,12 +69,12 @@ class Progress:
 class SceneStore:
     """One scene of a store."""
 
-    def __init__(self, storage: Storage, scene_id: str) -> None:
-        """Open; raises StoreError if there is no such scene."""
+    def __init__(self, storage: Storage, scene_id: str, spec: SceneSpec | None = None) -> None:
+        """Open; raises StoreError if there is no such scene. A `spec` stands for the stored one, if that is lost."""
         self.storage = storage
         self.scene_id = scene_id
         self.name = f"{SCENES}/{scene_id}"  # of its folder
-        self.spec = read_spec(storage, scene_id)
+        self.spec = read_spec(storage, scene_id) if spec is None else stored_spec(storage, scene_id) or spec
         self._plans: list[StoredPlan] = []
         self._followed = FollowedMarkers(storage, self.name)
 
@@ -302,10 +302,19 @@ def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
     except OSError as error:
         raise StoreError(f"{storage.where}/{name}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
-        raise CorruptError(f"{storage.where}/{name}: is not a scene spec: {'; '.join(sentences(error))}") from error
+        why = "; ".join(sentences(error))
+        raise CorruptError(f"{storage.where}/{name}: is not a scene spec: {why}; {findings.SET_ASIDE}") from error
     if spec.scene_id != scene_id:
-        raise CorruptError(f"{storage.where}/{name}: has scene id {spec.scene_id}, not that of its folder")
+        why = f"has scene id {spec.scene_id}, not that of its folder"
+        raise CorruptError(f"{storage.where}/{name}: {why}; {findings.SET_ASIDE}")
     return spec
+
+
+def stored_spec(storage: Storage, scene_id: str) -> SceneSpec | None:
+    """The stored spec of a scene; None if it is lost, or nothing of the scene is there. Raises as `read_spec`."""
+    with store_errors("look for a spec", storage.where):
+        is_stored = storage.exists(f"{SCENES}/{scene_id}/spec.json")
+    return read_spec(storage, scene_id) if is_stored else None
 
 
 def write_spec(storage: Storage, spec: SceneSpec) -> None:
@@ -315,7 +324,7 @@ def write_spec(storage: Storage, spec: SceneSpec) -> None:
     """
     folder = f"{SCENES}/{spec.scene_id}"
     name = f"{folder}/spec.json"
-    there = read_spec(storage, spec.scene_id) if storage.exists(name) else None
+    there = stored_spec(storage, spec.scene_id)
     exponent = _exponent_of_plans(storage, folder) if there is None else there.radiance_exponent
     stored = spec.model_copy(update={"stored_exponent": spec.radiance_exponent if exponent is None else exponent})
     if stored != there:
@@ -339,6 +348,7 @@ def _exponent_of_plans(storage: Storage, scene: str) -> int | None:
 def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:
     import zarr
 
+    from photonfarm.store.format.metadata import seal
     from photonfarm.store.write.staging import group_in
 
     with group_in(folder) as store:
@@ -347,23 +357,25 @@ def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) 
             group = root.create_group(name, attributes=declarations.stamp())
             for declared in declarations.BASE[name]:
                 schema.create_input(group, declared, getattr(record, declared.name))
+    seal(folder)
 
 
 def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:
     """Geometry and base point cloud in a scene's folder; raises StoreError while they are not there."""
-    import zarr
+    from photonfarm.store.format.metadata import open_group
 
     folder = f"{scene}/base"
     if not storage.exists(f"{folder}/zarr.json"):
         raise StoreError(f"{storage.where}/{scene}: its base is not there yet; the first job of the scene writes it")
     try:
-        root: Any = zarr.open_group(storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
+        root, _ = open_group(storage, folder)
 
         def whole(part: str, record: type[Geometry] | type[BasePointCloud]) -> dict[str, NDArray[Any]]:
             names = [field.name for field in fields(record)]
             return {name: schema.read_input(storage, f"{folder}/{part}/{name}", root[part][name]) for name in names}
 
         geometry, cloud = Geometry(**whole("geometry", Geometry)), BasePointCloud(**whole("cloud", BasePointCloud))
-    except (ValueError, KeyError, RuntimeError, FileNotFoundError) as error:
-        raise CorruptError(f"{storage.where}/{folder}: is not what was committed: {error}") from error
+    except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError) as error:
+        why = f"{error}; {findings.BASE_ASIDE}"
+        raise CorruptError(f"{storage.where}/{folder}: is not what was committed: {why}") from error
     return geometry, cloud

@@ -131,7 +131,7 @@ class Store:
         if dry_run and not self.has_scene(spec.scene_id):
             expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or usual_rows)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
-        scene = self.scene(spec.scene_id) if dry_run else self.add(spec)
+        scene = SceneStore(self.storage, spec.scene_id, spec) if dry_run else self.add(spec)
         return scene.plan(
             request, shard_rows=shard_rows, usual_rows=usual_rows, halves_from=halves_from, dry_run=dry_run
         )

@@ -38,10 +38,11 @@ class Withdrawal:
     samples: int  # forgotten now
     rendered: int  # samples of the plan in committed jobs, which stay
     kept: int  # samples that stay planned, as rendered ones show their views or configurations
+    left: str  # what is planned still and not rendered, by plan, in words
 
 
 def withdraw(scene: SceneStore, number: int | None = None, *, on_wait: OnWait = lambda _: None) -> Withdrawal:
-    """Withdraw the jobs of a plan, by default of the last one, that are not committed.
+    """Withdraw the jobs of a plan, by default of the last one that has such, that are not committed.
 
     Jobs that hold views or configurations of committed ones stay planned. Raises SpecError for a plan that is not
     there, and where samples of a later plan refer to its rows. It waits with `on_wait` for the scene's lease.
@@ -52,22 +53,30 @@ def withdraw(scene: SceneStore, number: int | None = None, *, on_wait: OnWait = 
 
 
 def _withdraw(scene: SceneStore, number: int | None) -> Withdrawal:
-    found = scene.plans()
+    found, committed = scene.plans(), scene.committed_jobs()
     if not found or (number is not None and number >= len(found)):
-        there = f"the last one is {len(found) - 1}" if found else "nothing is planned"
+        there = f"the last one is {len(found) - 1}; {_left(found, committed)}" if found else "nothing is planned"
         raise SpecError(f"scene {scene.scene_id} ({scene.spec.name}): has no plan {number or 0}; {there}")
-    plan = found[-1 if number is None else number]
-    committed = scene.committed_jobs()
-    jobs = _withdrawable(scene, found, plan, committed)
-    if jobs:
-        markers.write_withdrawn(scene.storage, plan.folder, plan.withdrawn | jobs)
+    for plan in reversed(found) if number is None else [found[number]]:
+        jobs = _withdrawable(scene, found, plan, committed)
+        if jobs:
+            markers.write_withdrawn(scene.storage, plan.folder, plan.withdrawn | jobs)
+            break
     samples = {job: plan.samples_in(job) for job in range(plan.first_job, plan.end_job)}
     rendered = sum(count for job, count in samples.items() if job in committed)
     forgotten = sum(samples[job] for job in jobs)
     return Withdrawal(
         scene.scene_id, scene.spec.name, plan.number, len(jobs), forgotten, rendered,
-        sum(samples.values()) - rendered - forgotten,
+        sum(samples.values()) - rendered - forgotten, _left(found, committed | jobs),
     )  # fmt: skip
+
+
+def _left(found: list[StoredPlan], done: set[int]) -> str:
+    """What is planned in other jobs than those that are done, in words."""
+    jobs = {plan.number: set(range(plan.first_job, plan.end_job)) - done for plan in found}
+    samples = {plan.number: sum(map(plan.samples_in, jobs[plan.number])) for plan in found}
+    left = ", ".join(f"{count} samples of plan {number}" for number, count in samples.items() if count)
+    return f"not rendered yet: {left or 'none'}"
 
 
 def _withdrawable(scene: SceneStore, found: list[StoredPlan], plan: StoredPlan, committed: set[int]) -> set[int]:
@@ -77,12 +86,13 @@ def _withdrawable(scene: SceneStore, found: list[StoredPlan], plan: StoredPlan, 
         leant_on: set[int] = set()
         for other in found[plan.number :]:
             own, referred = _references(other)
-            stays = ~np.isin(own, list(jobs))
-            leant_on = {int(job) for job in np.unique(referred[stays]) if int(job) in jobs}
-            if leant_on and other.number > plan.number:
+            leaning = ~np.isin(own, list(jobs)) & np.isin(referred, list(jobs)).any(axis=1)
+            leant_on = jobs & set(referred[leaning].ravel().tolist())
+            if other.number > plan.number and not committed.issuperset(own[leaning].tolist()):
                 of = f"plan {plan.number} of scene {scene.scene_id} ({scene.spec.name})"
                 why = f"plan {other.number} has samples of its views or configurations"
-                raise SpecError(f"{of}: {why}; withdraw plan {other.number} first")
+                first = f"withdraw plan {other.number} first; {_left(found, committed)}"
+                raise SpecError(f"{of}: {why}; {first}")
             if leant_on:
                 break
         if not leant_on:

@@ -18,6 +18,7 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.spec import Emitters, GuideSpec
 from photonfarm.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.store.format import declarations, markers, schema
+from photonfarm.store.format.metadata import seal
 from photonfarm.store.io.local import LocalStorage
 
 DOCUMENT = Path(__file__).parents[4] / "docs/store-format.md"
@@ -243,6 +244,8 @@ def add_everywhere(scene: SceneStore) -> None:
         group = zarr.open_group(str(path), mode="r+")
         group.create_array("variance", data=np.ones((3, 2)))
         group.create_group("appendix")
+    for path in (plan, base):
+        seal(path)
 
 
 def test_unknown_files_arrays_attributes_and_keys_are_ignored(scene: SceneStore, tmp_path: Path) -> None:

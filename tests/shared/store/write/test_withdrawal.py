@@ -123,6 +123,26 @@ def test_a_later_plan_that_leans_on_it_is_withdrawn_first(scene: SceneStore) -> 
         withdraw(scene, 2)
 
 
+def test_without_a_number_it_is_the_last_plan_that_has_something_to_withdraw(scene: SceneStore) -> None:
+    scene.plan(Request(modifications=10))
+    assert [withdraw(scene).plan, withdraw(scene).plan] == [1, 0]
+    scene.plan(Request(modifications=3))
+    scene.plan(Request(modifications=2, views_per_modification=2))
+    for job in set(scene.missing_jobs()) & set(range(scene.plans()[3].first_job, scene.jobs())):
+        assert samples.commit(scene, job, samples.outputs(scene, job))
+    nothing = withdraw(scene, 3)
+    assert (nothing.jobs, nothing.left) == (0, "not rendered yet: 1 samples of plan 2")
+    done = withdraw(scene)
+    assert (done.plan, done.samples, withdraw(scene).left) == (2, 1, "not rendered yet: none")
+
+
+def test_what_rendered_samples_of_a_later_plan_lean_on_stays_planned(scene: SceneStore) -> None:
+    scene.plan(TopUp.of("+8", ["rows=2-3"]))
+    assert samples.commit(scene, 4, samples.outputs(scene, 4))
+    done = withdraw(scene)
+    assert (done.plan, done.samples, done.kept) == (0, 2, 2)
+
+
 def test_rows_of_withdrawn_jobs_are_unused(scene: SceneStore) -> None:
     withdraw(scene)
     (plan,) = fresh(scene).plans()

@@ -25,7 +25,7 @@ def costs(folder: Path, count: int) -> Costs:
     from photonfarm.scene.modification import modification_keys
     from photonfarm.scene.spec_loading import NamedSpec
     from photonfarm.store import SceneReader, Store
-    from photonfarm.store.write import plans
+    from photonfarm.store.model import plans
 
     spec = NamedSpec.load(SPEC).spec
     store = Store(folder / "store", create=True)

@@ -22,7 +22,7 @@ from photonfarm.plan.request import Request
 from photonfarm.queue import connect, reconcile
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
-from photonfarm.store.write.lease import leases
+from photonfarm.store.model.lease import leases
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 

@@ -20,10 +20,10 @@ from photonfarm.core.waiting import SILENCE_S
 from photonfarm.farm.join import JoinedScene, OnProgress
 from photonfarm.store import Store
 from photonfarm.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
+from photonfarm.store.model.findings import Finding, FindingGroup, Remedy
+from photonfarm.store.model.withdrawal import Forgotten, Withdrawal
 from photonfarm.store.read.find import FoundSample, Matches
 from photonfarm.store.read.merge import WrittenView
-from photonfarm.store.write.findings import Finding, FindingGroup, Remedy
-from photonfarm.store.write.withdrawal import Forgotten, Withdrawal
 
 
 @contextlib.contextmanager

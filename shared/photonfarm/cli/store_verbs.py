@@ -191,8 +191,8 @@ def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> 
     """
     from photonfarm.cli import show_store
     from photonfarm.store import Store
+    from photonfarm.store.model.withdrawal import withdraw as withdrawn
     from photonfarm.store.read.find import scene_named
-    from photonfarm.store.write.withdrawal import withdraw as withdrawn
 
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
@@ -212,8 +212,8 @@ def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
     """
     from photonfarm.cli import show_store
     from photonfarm.store import Store
+    from photonfarm.store.model.withdrawal import forget as forgotten
     from photonfarm.store.read.find import scene_named
-    from photonfarm.store.write.withdrawal import forget as forgotten
 
     opened = Store(store)
     scene_id = scene_named(opened, scene)

@@ -17,8 +17,8 @@ from photonfarm.core.errors import CorruptError, QueueError, StoreError, store_e
 from photonfarm.store import SceneStatus, Store
 from photonfarm.store.format.markers import COMMITTED
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write.scene_store import SCENES
-from photonfarm.store.write.store import FAILURES_FOLDER
+from photonfarm.store.model.scene_store import SCENES
+from photonfarm.store.model.store import FAILURES_FOLDER
 
 if TYPE_CHECKING:
     from photonfarm.queue import Failure, FailureCause, QueueStatus

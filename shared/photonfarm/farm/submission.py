@@ -26,11 +26,11 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
+from photonfarm.store.model.lease import at_work
+from photonfarm.store.model.plans import StoredPlan, content, load_all
+from photonfarm.store.model.scene_store import SCENES, stored_spec
 from photonfarm.store.read.find import scene_named
 from photonfarm.store.read.other_scenes import first_plan_note, other_scenes, with_same_radiance
-from photonfarm.store.write.lease import at_work
-from photonfarm.store.write.plans import StoredPlan, content, load_all
-from photonfarm.store.write.scene_store import SCENES, stored_spec
 
 MOST_NAMED = 4096
 """The largest number of configurations that a message proposes."""

@@ -20,7 +20,7 @@ from pathlib import Path
 from photonfarm.queue.job import TRIES, RenderArguments, is_job_name
 from photonfarm.store import Store
 from photonfarm.store.io.storage import put_json
-from photonfarm.store.write.store import FAILURES_FOLDER
+from photonfarm.store.model.store import FAILURES_FOLDER
 
 REASON_LETTERS = 2000
 

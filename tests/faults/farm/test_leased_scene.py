@@ -10,7 +10,7 @@ from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.queue import TRIES, connect, queue_status
 from photonfarm.queue.rq_adapter import open_queue
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.write.lease import lease
+from photonfarm.store.model.lease import lease
 
 
 @pytest.mark.parametrize("share", [None, "0/1"])

@@ -19,7 +19,7 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers
-from photonfarm.store.write.lease import LeasedError, lease
+from photonfarm.store.model.lease import LeasedError, lease
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ import torch
 from photonfarm.core.errors import IncompleteError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.write.lease import lease
-from photonfarm.store.write.withdrawal import forget
+from photonfarm.store.model.lease import lease
+from photonfarm.store.model.withdrawal import forget
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.distributed import leading, ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT

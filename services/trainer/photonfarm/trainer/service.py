@@ -18,8 +18,8 @@ from photonfarm.scene.spec import Film
 from photonfarm.scene.spec_loading import load_spec, scene_folder
 from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
+from photonfarm.store.model.scene_store import held as scenes_held
 from photonfarm.store.read.other_scenes import other_scenes
-from photonfarm.store.write.scene_store import held as scenes_held
 from photonfarm.trainer.runs.run_folder import held, note_scene_folder
 from photonfarm.trainer.runs.run_progress import RunProgress, followed
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of

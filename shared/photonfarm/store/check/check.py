@@ -22,12 +22,12 @@ from photonfarm.store.check.plan_repair import PlanRepair
 from photonfarm.store.check.repeated_seeds import equal_samples
 from photonfarm.store.format import markers
 from photonfarm.store.io.storage import TMP, Storage
-from photonfarm.store.write import plans
-from photonfarm.store.write.findings import Cause, Finding, FindingGroup, Findings, Remedy
-from photonfarm.store.write.lease import Claim, OnWait, lease
-from photonfarm.store.write.quarantine import Quarantine, was_set_aside
-from photonfarm.store.write.scene_store import SCENES, read_spec, scene_ids
-from photonfarm.store.write.store import Store
+from photonfarm.store.model import plans
+from photonfarm.store.model.findings import Cause, Finding, FindingGroup, Findings, Remedy
+from photonfarm.store.model.lease import Claim, OnWait, lease
+from photonfarm.store.model.quarantine import Quarantine, was_set_aside
+from photonfarm.store.model.scene_store import SCENES, read_spec, scene_ids
+from photonfarm.store.model.store import Store
 
 CheckProgress = Callable[[str, int, int, int], None]
 """Called with the scene's name, the jobs checked, the jobs to check, and the bytes read."""

@@ -16,9 +16,9 @@ from photonfarm.store.check.content_check import CheckTotals, ContentCheck, is_f
 from photonfarm.store.format import markers, schema
 from photonfarm.store.format.shards import Shard
 from photonfarm.store.io.storage import Storage
-from photonfarm.store.write import findings, plans
-from photonfarm.store.write.findings import Cause, Finding
-from photonfarm.store.write.plans import JobRows, StoredPlan
+from photonfarm.store.model import findings, plans
+from photonfarm.store.model.findings import Cause, Finding
+from photonfarm.store.model.plans import JobRows, StoredPlan
 
 KINDS: tuple[schema.RowKind, ...] = ("sample", "view", "modification")
 

@@ -23,10 +23,10 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.check.job_check import CheckTarget
 from photonfarm.store.format import markers, schema
 from photonfarm.store.io.storage import Storage
-from photonfarm.store.write import findings, plans
-from photonfarm.store.write.findings import Cause, Finding
-from photonfarm.store.write.plans import StoredPlan
-from photonfarm.store.write.scene_store import read_base
+from photonfarm.store.model import findings, plans
+from photonfarm.store.model.findings import Cause, Finding
+from photonfarm.store.model.plans import StoredPlan
+from photonfarm.store.model.scene_store import read_base
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError)
 """What zarr-python raises for damaged metadata and chunks; a group in place of an array lacks its attributes."""

@@ -28,11 +28,11 @@ from photonfarm.store.format import declarations, schema
 from photonfarm.store.format.declarations import ArrayDeclaration
 from photonfarm.store.format.shards import crc_of
 from photonfarm.store.io.storage import Storage, read_or_none
-from photonfarm.store.write import findings, plans
-from photonfarm.store.write.findings import Finding
-from photonfarm.store.write.plans import PlanAttributes, StoredPlan
-from photonfarm.store.write.quarantine import Quarantine
-from photonfarm.store.write.store import Store
+from photonfarm.store.model import findings, plans
+from photonfarm.store.model.findings import Finding
+from photonfarm.store.model.plans import PlanAttributes, StoredPlan
+from photonfarm.store.model.quarantine import Quarantine
+from photonfarm.store.model.store import Store
 
 Mask = NDArray[np.bool_]
 
@@ -60,7 +60,7 @@ class PlanRepair:
         """
         before = plans.load_all(self._storage, self._scene, [], until=number)
         folder = plans.folder(self._scene, number)
-        about = plans.read_about(self._storage, folder)
+        _, about = plans.opened(self._storage, folder)
         rows = self._rows(folder, about, before)
         self._compare(folder, rows, about.first_job * about.shard_rows)
         found = {str(finding.file).removeprefix(f"{folder}/").partition("/")[0] for finding in why}

@@ -17,8 +17,8 @@ from photonfarm.store.check.content_check import CheckTotals, is_constant
 from photonfarm.store.check.job_check import CheckTarget
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import Shard
-from photonfarm.store.write import plans
-from photonfarm.store.write.findings import Cause, Finding
+from photonfarm.store.model import plans
+from photonfarm.store.model.findings import Cause, Finding
 
 DRAWN = 4
 """The number of seeds that a renderer may draw for a half: three are tried, and one may be the other half's."""

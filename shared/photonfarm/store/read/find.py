@@ -24,11 +24,11 @@ from photonfarm.scene.view import view_keys
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import Shard
 from photonfarm.store.io.storage import renew_copy
+from photonfarm.store.model import plans
+from photonfarm.store.model.plans import StoredPlan
+from photonfarm.store.model.scene_store import SceneStore
+from photonfarm.store.model.store import Store
 from photonfarm.store.read.other_scenes import scene_of, told_apart
-from photonfarm.store.write import plans
-from photonfarm.store.write.plans import StoredPlan
-from photonfarm.store.write.scene_store import SceneStore
-from photonfarm.store.write.store import Store
 
 _KEY = re.compile(r"[0-9a-fA-F]{32}")
 

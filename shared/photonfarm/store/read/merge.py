@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from photonfarm.core.archives import read_arrays, write_arrays
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.core.records import F32
+from photonfarm.store.model.scene_store import SceneStore
 from photonfarm.store.read.batch import Batch
 from photonfarm.store.read.find import Query, SceneMatch
 from photonfarm.store.read.reader import SceneReader
-from photonfarm.store.write.scene_store import SceneStore
 
 F64 = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from photonfarm.core.errors import StoreError
 from photonfarm.core.models import differing
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store.write.scene_store import SceneStore, held
-from photonfarm.store.write.store import Store
+from photonfarm.store.model.scene_store import SceneStore, held
+from photonfarm.store.model.store import Store
 
 FEW = 4
 """Up to so many differing keys are named."""

@@ -29,12 +29,12 @@ from photonfarm.store.format import markers, schema
 from photonfarm.store.format.markers import FollowedMarkers
 from photonfarm.store.format.shards import OpenShards, Shard
 from photonfarm.store.io.storage import FORMAT_FILE, open_storage, renew_copy
+from photonfarm.store.model import plans
+from photonfarm.store.model.lease import at_work, leases
+from photonfarm.store.model.plans import StoredPlan
+from photonfarm.store.model.scene_store import SCENES, is_there, read_base, read_spec
+from photonfarm.store.model.store import check_format
 from photonfarm.store.read.batch import Batch, Sample
-from photonfarm.store.write import plans
-from photonfarm.store.write.lease import at_work, leases
-from photonfarm.store.write.plans import StoredPlan
-from photonfarm.store.write.scene_store import SCENES, is_there, read_base, read_spec
-from photonfarm.store.write.store import check_format
 
 REPAIR = "`photonfarm store check --repair` sets its job aside, and workers render it again"
 """The remedy for damaged samples."""

@@ -17,7 +17,7 @@ import pytest
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check import check
-from photonfarm.store.write.quarantine import Quarantine
+from photonfarm.store.model.quarantine import Quarantine
 
 scene, outputs = stores.scene, stores.outputs
 commit_all, checked, found, data = stores.commit_all, stores.checked, stores.found, stores.data

@@ -18,14 +18,14 @@ from photonfarm.queue import count_failures, job_name, keep_failure
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
+from photonfarm.store.model.withdrawal import forget
 from photonfarm.store.read import reader as reading
-from photonfarm.store.write.withdrawal import forget
 
 FORGET = """
 import os, signal, sys
 from photonfarm.store import Store
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write.withdrawal import forget
+from photonfarm.store.model.withdrawal import forget
 left = int(sys.argv[3])
 for name in ("delete", "delete_folder", "adopt"):
     def dying(*args, plain=getattr(LocalStorage, name), **options):

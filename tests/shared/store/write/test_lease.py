@@ -15,15 +15,15 @@ from photonfarm.core.errors import StoreError
 from photonfarm.core.processes import process_space
 from photonfarm.store import Store
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write import lease as leasing
-from photonfarm.store.write.lease import LeasedError, at_work, lease, leases
+from photonfarm.store.model import lease as leasing
+from photonfarm.store.model.lease import LeasedError, at_work, lease, leases
 
 SCENE = "0123456789abcdef0123456789abcdef"
 
 AT_WORK = """
 import sys, time
 from photonfarm.store import Store
-from photonfarm.store.write.lease import at_work
+from photonfarm.store.model.lease import at_work
 with at_work(Store(sys.argv[1]).storage, sys.argv[2], "worker w1 at job 12"):
     print("in", flush=True)
     sys.stdin.readline()

@@ -16,9 +16,9 @@ from photonfarm.plan.top_up import TopUp
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
-from photonfarm.store.write.lease import at_work
-from photonfarm.store.write.status import scene_status
-from photonfarm.store.write.withdrawal import withdraw
+from photonfarm.store.model.lease import at_work
+from photonfarm.store.model.status import scene_status
+from photonfarm.store.model.withdrawal import withdraw
 
 REQUEST = Request(modifications=8, views_per_modification=1)
 

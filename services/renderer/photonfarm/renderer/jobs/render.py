@@ -39,7 +39,7 @@ from photonfarm.scene.spec import GuideSpec, SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
 from photonfarm.scene.view import View
 from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
-from photonfarm.store.write.lease import at_work
+from photonfarm.store.model.lease import at_work
 
 SCENES_KEPT = 2
 """The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""

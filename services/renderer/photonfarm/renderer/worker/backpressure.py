@@ -19,7 +19,7 @@ from photonfarm.core.errors import store_errors
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write.scene_store import Progress
+from photonfarm.store.model.scene_store import Progress
 
 AHEAD_MINIMUM = 256
 """The samples that may be committed before any is used, as a trainer first waits for some, held-out ones included."""

@@ -24,7 +24,7 @@ from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, R
 from photonfarm.renderer.worker.share_source import ShareSource
 from photonfarm.renderer.worker.source import Ending, JobSource, TakenError
 from photonfarm.store import Store
-from photonfarm.store.write.lease import leases
+from photonfarm.store.model.lease import leases
 
 log = logging.getLogger(__name__)
 

@@ -20,11 +20,11 @@ from photonfarm.core.errors import SpecError, StoreError, store_errors
 from photonfarm.plan.request import UNUSED
 from photonfarm.store.format import markers
 from photonfarm.store.io.storage import put_json
-from photonfarm.store.write import plans
-from photonfarm.store.write.lease import OnWait, lease
-from photonfarm.store.write.plans import StoredPlan
-from photonfarm.store.write.scene_store import SCENES, SceneStore, is_there
-from photonfarm.store.write.store import FAILURES_FOLDER, Store
+from photonfarm.store.model import plans
+from photonfarm.store.model.lease import OnWait, lease
+from photonfarm.store.model.plans import StoredPlan
+from photonfarm.store.model.scene_store import SCENES, SceneStore, is_there
+from photonfarm.store.model.store import FAILURES_FOLDER, Store
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,8 +9,8 @@ from functools import partial
 from typing import Any
 
 from photonfarm.core.errors import CorruptError, StoreError
-from photonfarm.store.write.scene_store import SceneStore
-from photonfarm.store.write.store import Store, check_format
+from photonfarm.store.model.scene_store import SceneStore
+from photonfarm.store.model.store import Store, check_format
 
 
 @dataclass(frozen=True, slots=True)

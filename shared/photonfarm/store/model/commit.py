@@ -32,9 +32,9 @@ from photonfarm.store.format.shards import (
     stays_finite,
 )
 from photonfarm.store.io.storage import Storage, discard, renew_copy
-from photonfarm.store.write.findings import Cause, Finding
-from photonfarm.store.write.plans import JobRows
-from photonfarm.store.write.quarantine import Quarantine
+from photonfarm.store.model.findings import Cause, Finding
+from photonfarm.store.model.plans import JobRows
+from photonfarm.store.model.quarantine import Quarantine
 
 WAITING_ROWS = 8
 """The most rows that wait to be written: more would only hide for a while that the disk is slower than the renderer."""

@@ -13,7 +13,7 @@ from photonfarm.plan.request import SHARD_ROWS, PlannedContent, Request, expand
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.format import declarations
 from photonfarm.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, Storage, open_storage, put_json
-from photonfarm.store.write.scene_store import (
+from photonfarm.store.model.scene_store import (
     SCENES,
     PlanResult,
     SceneStore,

@@ -20,7 +20,7 @@ from typing import Any
 from photonfarm.core.errors import CorruptError, store_errors
 from photonfarm.store.format import markers
 from photonfarm.store.io.storage import Storage, discard, put_json, read_or_none
-from photonfarm.store.write.findings import Finding
+from photonfarm.store.model.findings import Finding
 
 QUARANTINE = "quarantine"
 _DIGITS = 6

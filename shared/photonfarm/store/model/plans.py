@@ -34,7 +34,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store.format import declarations, markers, schema
 from photonfarm.store.io.storage import Storage
-from photonfarm.store.write import findings
+from photonfarm.store.model import findings
 
 PLANS = "plans"
 NAME_DIGITS = 6
@@ -172,7 +172,7 @@ def build(
     import zarr
 
     from photonfarm.store.format.metadata import seal
-    from photonfarm.store.write.staging import group_in
+    from photonfarm.store.model.staging import group_in
 
     count = len(rows.sample_modification)
     attributes: Any = {
@@ -264,13 +264,8 @@ def rewritten(request: Request | TopUp | Joined) -> str:
     return findings.rejoin(request.store) if isinstance(request, Joined) else findings.REWRITE
 
 
-def read_about(storage: Storage, name: str) -> PlanAttributes:
-    """The attributes of the plan in a folder; raises CorruptError if they are missing or not as they were written."""
-    return opened(storage, name)[1]
-
-
 def opened(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
-    """The group of the plan in a folder, and its attributes; raises as `read_about`."""
+    """The group of the plan in a folder, and its attributes; raises CorruptError unless they are as written."""
     from photonfarm.store.format.metadata import open_group
 
     with _unreadable(storage, name, findings.RESTORE):

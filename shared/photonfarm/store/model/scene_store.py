@@ -35,9 +35,9 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.format import declarations, markers, schema
 from photonfarm.store.format.markers import FollowedMarkers
 from photonfarm.store.io.storage import Storage, put_json
-from photonfarm.store.write import findings, plans
-from photonfarm.store.write.commit import JobWriter
-from photonfarm.store.write.plans import JobRows, StoredPlan
+from photonfarm.store.model import findings, plans
+from photonfarm.store.model.commit import JobWriter
+from photonfarm.store.model.plans import JobRows, StoredPlan
 
 SCENES = "scenes"
 
@@ -339,7 +339,7 @@ def _exponent_of_plans(storage: Storage, scene: str) -> int | None:
     numbers = range(plans.count(storage, scene))
     for number in numbers:
         with contextlib.suppress(CorruptError):
-            return plans.read_about(storage, plans.folder(scene, number)).radiance_exponent
+            return plans.opened(storage, plans.folder(scene, number))[1].radiance_exponent
     if numbers:
         raise CorruptError(f"{storage.where}/{scene}: the spec is lost, and no plan can be read; {findings.RESTORE}")
     return None
@@ -349,7 +349,7 @@ def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) 
     import zarr
 
     from photonfarm.store.format.metadata import seal
-    from photonfarm.store.write.staging import group_in
+    from photonfarm.store.model.staging import group_in
 
     with group_in(folder) as store:
         root = zarr.open_group(store, mode="w-", zarr_format=3, attributes=declarations.stamp())

@@ -82,7 +82,7 @@ bench-%: $(DEV)
 
 # The integrator on 36 rows of hard scenes, each against its truth: make stability ARGS="--quick --only 13".
 stability: $(DEV)
-	$(BIN)/python -m bench.stability $(ARGS)
+	$(BIN)/python -m tests.stability $(ARGS)
 
 # Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
 experiments-%: $(DEV)

@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from bench.stability.scenes.case import ALL, QUICK, HardScene, SceneDict
-from bench.stability.scenes.hard_scenes import camera, grey, rectangle, shining
-from bench.stability.scenes.truths import PATH, known, known_on_plane
+from tests.stability.scenes.case import ALL, QUICK, HardScene, SceneDict
+from tests.stability.scenes.hard_scenes import camera, grey, rectangle, shining
+from tests.stability.scenes.truths import PATH, known, known_on_plane
 
 Points = npt.NDArray[np.float64]  # [N, 3]
 Values = npt.NDArray[np.float64]  # [N]

@@ -11,10 +11,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.stability.weights.joined_paths import JoinedPaths, Pinhole, TechniqueCounts, gain, steps
-from bench.stability.weights.oracle import F64, OraclePaths
 from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.lights.emission import Lights
+from tests.stability.weights.joined_paths import JoinedPaths, Pinhole, TechniqueCounts, gain, steps
+from tests.stability.weights.oracle import F64, OraclePaths
 
 
 def stored(lights: Lights, joined: JoinedPaths, lens: Pinhole) -> OraclePaths:

@@ -19,7 +19,6 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.stability.weights.oracle import F64
 from photonfarm.renderer.bdpt import randomness, weights
 from photonfarm.renderer.bdpt.camera import EyeStart, primary_rays, sample_sensor
 from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
@@ -33,6 +32,7 @@ from photonfarm.renderer.bdpt.lights.emission import (
     hit_densities,
     sample_direct,
 )
+from tests.stability.weights.oracle import F64
 
 _FOUND = 1e-3  # a ray to a sampled point of a light must end this near to it, relative to the scene's size
 

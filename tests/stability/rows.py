@@ -5,8 +5,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 
-from bench.stability.scenes import cameras, closed_form, lights, surfaces
-from bench.stability.scenes.case import BdptSettings, HardScene, Refusal
+from tests.stability.scenes import cameras, closed_form, lights, surfaces
+from tests.stability.scenes.case import BdptSettings, HardScene, Refusal
 
 SCENES: tuple[HardScene, ...] = tuple(
     sorted((*closed_form.SCENES, *lights.SCENES, *surfaces.SCENES, *cameras.SCENES), key=lambda scene: scene.row)

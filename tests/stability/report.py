@@ -9,12 +9,12 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from bench.stability.markdown import markdown as markdown
-from bench.stability.pictures import keep, sheet, triple
-from bench.stability.rows import ROWS
-from bench.stability.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
-from bench.stability.scenes.case import BdptSettings, HardScene, Refusal
 from photonfarm.core.pictures import Picture
+from tests.stability.markdown import markdown as markdown
+from tests.stability.pictures import keep, sheet, triple
+from tests.stability.rows import ROWS
+from tests.stability.runner import ROUNDING, SIGNIFICANCE, SceneOutcome, SceneResult, run
+from tests.stability.scenes.case import BdptSettings, HardScene, Refusal
 
 Label = TypeVar("Label", int, str)
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench.stability import runner
-from bench.stability.rows import SCENES
-from bench.stability.runner import SceneOutcome, compare, run, seen_bias
-from bench.stability.scenes.case import FIRST, QUICK, BdptSettings
-from bench.stability.scenes.truths import rendered
+from tests.stability import runner
+from tests.stability.rows import SCENES
+from tests.stability.runner import SceneOutcome, compare, run, seen_bias
+from tests.stability.scenes.case import FIRST, QUICK, BdptSettings
+from tests.stability.scenes.truths import rendered
 
 
 def scene(label: str) -> Any:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from bench.stability.pictures import FULL_Z
-from bench.stability.rows import ROWS
-from bench.stability.runner import ROUNDING, SIGNIFICANCE, SceneResult, plus_minus
 from photonfarm.core.statistics import two_sided_limit
+from tests.stability.pictures import FULL_Z
+from tests.stability.rows import ROWS
+from tests.stability.runner import ROUNDING, SIGNIFICANCE, SceneResult, plus_minus
 
 if TYPE_CHECKING:
-    from bench.stability.report import StabilityReport
+    from tests.stability.report import StabilityReport
 
 EYE_ALONE = (
     "Mesh lights with smooth vertex normals: no light path starts there and none is joined to them, hits alone find "

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.stability.runner import Renders, SceneOutcome
 from photonfarm.core.pictures import Picture, display
+from tests.stability.runner import Renders, SceneOutcome
 
 SIDE = 96
 """The pixels of one picture's side on the sheet."""

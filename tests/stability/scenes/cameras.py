@@ -8,10 +8,10 @@ from typing import Any
 
 import mitsuba as mi
 
-from bench.stability.scenes import hard_scenes
-from bench.stability.scenes.case import EYE_ALONE, LONG, QUICK, HardScene, Refusal, SceneDict
-from bench.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
-from bench.stability.scenes.truths import PATH, crop_of_full_image, same_by_bdpt
+from tests.stability.scenes import hard_scenes
+from tests.stability.scenes.case import EYE_ALONE, LONG, QUICK, HardScene, Refusal, SceneDict
+from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
+from tests.stability.scenes.truths import PATH, crop_of_full_image, same_by_bdpt
 
 
 def seen_by(**changes: Any) -> Callable[[int], SceneDict]:

@@ -16,9 +16,9 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from bench.stability.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
-from bench.stability.scenes.truths import PATH, load, render
 from photonfarm.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
+from tests.stability.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
+from tests.stability.scenes.truths import PATH, load, render
 
 SIGNIFICANCE = 4e-6
 """The probability that a right scene fails with one pair of settings: 0.1 % for 250 pairs, more than there are."""
@@ -114,7 +114,7 @@ def run(
         integrator = {"type": "bdpt", "max_depth": item.max_depth, "rr_depth": item.rr_depth}
         integrator |= counts.parameters
         bdpt = render(scene, integrator, effort.spp, range(seed, seed + effort.seeds))
-        command = f"python -m bench.stability --only {item.label} --settings {counts} --seed {seed}"
+        command = f"python -m tests.stability --only {item.label} --settings {counts} --seed {seed}"
         outcome = _judged(item, effort, counts, bdpt, truth, start, command + " --quick" * quick)
         yield replace(outcome, result=replace(outcome.result, path_ratio=path[0], path_ratio_standard_error=path[1]))
         start = time.process_time()
@@ -234,6 +234,6 @@ def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     result = SceneResult(
         refusal.row, refusal.name, text, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
         None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
-        f"python -m bench.stability --only {refusal.label}" + " --quick" * quick,
+        f"python -m tests.stability --only {refusal.label}" + " --quick" * quick,
     )  # fmt: skip
     return SceneOutcome(result)

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from bench.stability import report, rows
-from bench.stability.__main__ import main
-from bench.stability.pictures import FULL_Z, SIDE, of_z, sheet
-from bench.stability.runner import SceneResult, plus_minus, run
-from bench.stability.scenes.case import BdptSettings
-from bench.stability.scenes.truths import known
+from tests.stability import report, rows
+from tests.stability.__main__ import main
+from tests.stability.pictures import FULL_Z, SIDE, of_z, sheet
+from tests.stability.runner import SceneResult, plus_minus, run
+from tests.stability.scenes.case import BdptSettings
+from tests.stability.scenes.truths import known
 
 
 def call(tmp_path: Path, *arguments: str) -> int:
@@ -25,7 +25,7 @@ def test_the_report_is_written_as_markdown_json_and_picture(tmp_path: Path) -> N
     out = tmp_path / "out"
     text = (out / "stability.md").read_text(encoding="utf-8")
     assert "**2 of 2 rows pass**, 2 of 2 scenes. There are 36 rows; the others were not tried." in text
-    assert "python -m bench.stability --quick --only 5 --only 30" in text
+    assert "python -m tests.stability --quick --only 5 --only 30" in text
     assert "only the box filter is allowed" in text
     assert "smooth vertex normals" in text
     document = json.loads((out / "stability.json").read_text(encoding="utf-8"))
@@ -43,7 +43,7 @@ def test_a_failing_row_gives_exit_code_one_its_command_and_its_renders(
     monkeypatch.setattr(rows, "SCENES", (wrong,))
     monkeypatch.setattr(rows, "REFUSALS", ())
     assert call(tmp_path, "--quick", "--settings", "1,1") == 1
-    again = "again: python -m bench.stability --only 05-empty --settings 1,1 --seed 0 --quick"
+    again = "again: python -m tests.stability --only 05-empty --settings 1,1 --seed 0 --quick"
     assert again in capsys.readouterr().err
     kept = tmp_path / "out" / "failures" / "05-empty_1,1"
     assert np.load(kept / "bdpt.npy").shape == (12, 16, 16, 3)
@@ -125,7 +125,7 @@ def test_an_unknown_row_is_wrong_usage_and_answered_in_a_sentence(
     with pytest.raises(SystemExit) as ended:
         call(tmp_path, "--quick", "--only", row)
     assert ended.value.code == 2
-    assert capsys.readouterr().err.splitlines()[-1] == f"python -m bench.stability: error: {said}"
+    assert capsys.readouterr().err.splitlines()[-1] == f"python -m tests.stability: error: {said}"
 
 
 def test_errors_of_ratios_are_written_with_two_digits() -> None:

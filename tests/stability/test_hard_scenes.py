@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.stability.pictures import keep
-from bench.stability.rows import REFUSALS, ROWS, SCENES
-from bench.stability.runner import message_of, run
-from bench.stability.scenes.case import GUIDED, BdptSettings, HardScene, Refusal
+from tests.stability.pictures import keep
+from tests.stability.rows import REFUSALS, ROWS, SCENES
+from tests.stability.runner import message_of, run
+from tests.stability.scenes.case import GUIDED, BdptSettings, HardScene, Refusal
 
 SLOW = ("18-mask-veils", "25-hundred-lights-at-once")
 FAILURES = Path(os.environ.get("PHOTONFARM_TEST_FAILURES", "test-failures"))
@@ -61,9 +61,10 @@ def test_what_would_be_wrong_is_refused_with_the_reason(refusal: Refusal) -> Non
 
 
 def test_every_row_has_a_quick_version() -> None:
-    assert {item.row for item in (*QUICK, *REFUSALS)} - {None} == set(range(1, ROWS + 1))
+    found = {*(scene.row for scene in QUICK), *(refusal.row for refusal in REFUSALS)}
+    assert found - {None} == set(range(1, ROWS + 1))
 
 
 def test_labels_are_unique() -> None:
-    labels = [item.label for item in (*SCENES, *REFUSALS)]
+    labels = [*(scene.label for scene in SCENES), *(refusal.label for refusal in REFUSALS)]
     assert len(set(labels)) == len(labels)

@@ -9,8 +9,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.stability.scenes import hard_scenes
-from bench.stability.scenes.case import (
+from tests.stability.scenes import hard_scenes
+from tests.stability.scenes.case import (
     ALL,
     LONG,
     QUICK,
@@ -21,9 +21,9 @@ from bench.stability.scenes.case import (
     SceneDict,
     Truth,
 )
-from bench.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
-from bench.stability.scenes.meshes import grid, octahedron
-from bench.stability.scenes.truths import PATH, TRUTH_SEEDS, load, render, rendered
+from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
+from tests.stability.scenes.meshes import grid, octahedron
+from tests.stability.scenes.truths import PATH, TRUTH_SEEDS, load, render, rendered
 
 # ------------------------------------------------ Lights at infinity, and edits ------------------------------------
 

@@ -8,7 +8,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from bench.stability.scenes.case import Effort, HardScene, Images, SceneDict, Truth
+from tests.stability.scenes.case import Effort, HardScene, Images, SceneDict, Truth
 
 LANES = 1 << 20
 """The largest number of samples of one launch, which bounds the memory of Mitsuba's own integrators."""
@@ -99,7 +99,7 @@ def same_by_bdpt(build: Callable[[int], SceneDict], name: str) -> Truth:
 def known(value: float, name: str) -> Truth:
     """The truth of a scene whose pixels and channels all have one value."""
 
-    def images(scene: HardScene, effort: Effort, seed: int) -> Images:  # noqa: ARG001 - the face of all truths
+    def images(scene: HardScene, effort: Effort, seed: int) -> Images:
         return np.full((1, effort.size, effort.size, 3), value)
 
     return Truth(name, images)
@@ -108,7 +108,7 @@ def known(value: float, name: str) -> Truth:
 def known_on_plane(radiance: Callable[[Any], Any], name: str) -> Truth:
     """The truth of the plane z = 0, seen by the scene's camera; ``radiance`` maps points on it, [N, 3], to [N]."""
 
-    def images(scene: HardScene, effort: Effort, seed: int) -> Images:  # noqa: ARG001
+    def images(scene: HardScene, effort: Effort, seed: int) -> Images:
         sensor = load(scene.build(effort.size)).sensors()[0]
         n = effort.size * GRID
         at = (np.arange(n, dtype=np.float32) + 0.5) / n

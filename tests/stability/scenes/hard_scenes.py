@@ -13,7 +13,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from bench.stability.scenes.case import SceneDict
+from tests.stability.scenes.case import SceneDict
 
 
 def camera(size: int, origin: list[float], target: list[float], fov: float, **more: Any) -> SceneDict:

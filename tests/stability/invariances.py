@@ -18,13 +18,13 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from bench.stability.runner import ROUNDING, SIGNIFICANCE, plus_minus
-from bench.stability.scenes import hard_scenes
-from bench.stability.scenes.cameras import scaled
-from bench.stability.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
-from bench.stability.scenes.truths import TRUTH_SEEDS, load, render
-from bench.stability.weights import weight_check
 from photonfarm.core.statistics import BlockTest, block_z_test
+from tests.stability.runner import ROUNDING, SIGNIFICANCE, plus_minus
+from tests.stability.scenes import hard_scenes
+from tests.stability.scenes.cameras import scaled
+from tests.stability.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
+from tests.stability.scenes.truths import TRUTH_SEEDS, load, render
+from tests.stability.weights import weight_check
 
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
 LONG = Effort(size=32, blocks=8, seeds=16, spp=128, truth_spp=512, resolution=0.005)
@@ -63,7 +63,7 @@ class Invariance:
     @property
     def command(self) -> str:
         """The command that runs it again."""
-        return f"python -m bench.stability --invariances {self.name}" + " --quick" * (not self.long)
+        return f"python -m tests.stability --invariances {self.name}" + " --quick" * (not self.long)
 
     def run(self) -> InvarianceResult:
         """Render what the check needs, and judge it."""

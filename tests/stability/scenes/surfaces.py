@@ -8,12 +8,12 @@ from dataclasses import replace
 import mitsuba as mi
 import numpy as np
 
-from bench.stability.scenes import hard_scenes
-from bench.stability.scenes.case import LONG, QUICK, HardScene, SceneDict
-from bench.stability.scenes.closed_form import point_in_sphere
-from bench.stability.scenes.hard_scenes import bumps, grey, lit_room, rectangle
-from bench.stability.scenes.meshes import smooth_ball
-from bench.stability.scenes.truths import PATH
+from tests.stability.scenes import hard_scenes
+from tests.stability.scenes.case import LONG, QUICK, HardScene, SceneDict
+from tests.stability.scenes.closed_form import point_in_sphere
+from tests.stability.scenes.hard_scenes import bumps, grey, lit_room, rectangle
+from tests.stability.scenes.meshes import smooth_ball
+from tests.stability.scenes.truths import PATH
 
 
 def glass_plate(size: int) -> SceneDict:

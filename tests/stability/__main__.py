@@ -1,7 +1,7 @@
 """Renders the 36 rows of hard scenes with `bdpt` and compares each with its truth; writes and prints the report.
 
     make stability ARGS="--quick --only 13 25-hundred-lights"
-    python -m bench.stability [--only 13 25-hundred-lights] [--settings 1,1 0,0] [--seed 0] [--quick] [--threads 1]
+    python -m tests.stability [--only 13 25-hundred-lights] [--settings 1,1 0,0] [--seed 0] [--quick] [--threads 1]
         [--out stability] [--invariances [counts additive-many-lights …]]
 
 Without --quick this is the long version. After all scenes (no --only, no --settings), or alone with --invariances, it
@@ -20,15 +20,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.stability.scenes.case import BdptSettings
+from tests.stability.scenes.case import BdptSettings
 
 if TYPE_CHECKING:
-    from bench.stability.invariances import Invariance
+    from tests.stability.invariances import Invariance
 
 
 def main(arguments: Sequence[str]) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m bench.stability", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog="python -m tests.stability", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", nargs="+", action="extend", default=[], help="rows (1 … 36) or scenes")
     parser.add_argument("--settings", nargs="+", type=settings, default=[], help="connections,light_ratio[,guided]")
@@ -42,7 +42,7 @@ def main(arguments: Sequence[str]) -> int:
     from photonfarm.renderer.scene import backend
 
     backend.load(options.threads)
-    from bench.stability import invariances, report, rows
+    from tests.stability import invariances, report, rows
 
     try:
         checks = invariances.chosen(options.invariances or [], long=not options.quick)
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str]) -> int:
         failures=options.out / "failures",
         log=lambda line: print(line, file=sys.stderr, flush=True),
     )
-    command = shlex.join(["python", "-m", "bench.stability", *arguments])
+    command = shlex.join(["python", "-m", "tests.stability", *arguments])
     report.write(found, options.out, command)
     print(report.markdown(found, command))
     held = bool(options.only or options.settings) or hold(checks)
@@ -76,7 +76,7 @@ def settings(text: str) -> BdptSettings:
 
 def hold(checks: Sequence[Invariance]) -> bool:
     """Run the checks, print their table; whether all of them hold."""
-    from bench.stability import invariances
+    from tests.stability import invariances
 
     found = []
     for check in checks:

@@ -10,18 +10,18 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from bench.stability.scenes import hard_scenes
-from bench.stability.scenes.case import BdptSettings, SceneDict
-from bench.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
-from bench.stability.scenes.truths import load
-from bench.stability.weights import oracle
-from bench.stability.weights.joined_paths import Pinhole, TechniqueCounts, walk, weights_of
-from bench.stability.weights.oracle import Mask, OraclePaths
-from bench.stability.weights.oracle_paths import stored, usefulness
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, Usefulness
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.bdpt.lights.emission import read_lights
+from tests.stability.scenes import hard_scenes
+from tests.stability.scenes.case import BdptSettings, SceneDict
+from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
+from tests.stability.scenes.truths import load
+from tests.stability.weights import oracle
+from tests.stability.weights.joined_paths import Pinhole, TechniqueCounts, walk, weights_of
+from tests.stability.weights.oracle import Mask, OraclePaths
+from tests.stability.weights.oracle_paths import stored, usefulness
 
 TOLERANCE = 1e-3
 """The tolerance for the sum of a path's weights, and for each weight relative to the oracle's."""

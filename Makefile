@@ -76,7 +76,7 @@ $(VENV)/.bench-ready: $(DEV)
 
 bench-render: $(VENV)/.bench-ready
 
-# bench-moved-lamps is the module bench.trainer.moved_lamps: whichever room of bench/ has it.
+# bench-train-step is the module bench.trainer.train_step: whichever room of bench/ has it.
 bench-%: $(DEV)
 	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))
 

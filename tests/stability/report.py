@@ -82,7 +82,7 @@ def write(report: StabilityReport, out: Path, command: str) -> None:
     (out / "stability.md").write_text(markdown(report, command), encoding="utf-8")
     (out / "stability.json").write_text(as_json(report, command), encoding="utf-8")
     if report.pictures:
-        sheet(report.pictures).save(out / "stability.png")
+        sheet(report.pictures).quantize(256).save(out / "stability.png", optimize=True)
 
 
 def as_json(report: StabilityReport, command: str) -> str:

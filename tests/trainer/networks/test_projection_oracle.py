@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from projection_oracle import first_met, in_image, sees, triangles
 
-from bench.trainer.projection_oracle import first_met, in_image, sees, triangles
 from photonfarm.core.records import STATIC, Geometry
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from projection_oracle import in_camera, sees, triangles
 from read_batches import batch_of
 
-from bench.trainer.projection_oracle import in_camera, sees, triangles
 from photonfarm.core.records import F32
 from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer

@@ -76,13 +76,13 @@ $(VENV)/.bench-ready: $(DEV)
 
 bench-render: $(VENV)/.bench-ready
 
-# bench-moved-lamps is the module bench.trainer.moved_lamps: whichever room of bench/ has it.
+# bench-train-step is the module bench.trainer.train_step: whichever room of bench/ has it.
 bench-%: $(DEV)
 	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))
 
 # The integrator on 36 rows of hard scenes, each against its truth: make stability ARGS="--quick --only 13".
 stability: $(DEV)
-	$(BIN)/python -m bench.stability $(ARGS)
+	$(BIN)/python -m tests.stability $(ARGS)
 
 # Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
 experiments-%: $(DEV)

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bench.farm.account import planned
-from bench.farm.workers import make_sample
 from bench.harness.processes import Processes, answer
 from photonfarm.core.processes import tie
 from photonfarm.farm.redis_server import EmbeddedRedis
@@ -67,6 +66,19 @@ def cost_of_company(one: ConcurrentWork, two: ConcurrentWork) -> float:
     """Processor time of two at work over that of one, for the pieces of work that both have done."""
     same = one.cpu_s.keys() & two.cpu_s.keys()
     return sum(two.cpu_s[number] for number in same) / sum(one.cpu_s[number] for number in same)
+
+
+def make_sample(scene: Any, number: int) -> None:
+    """All that a worker renders for one sample; sample n is the same in every process."""
+    from photonfarm.scene.modification import sample_modification
+    from photonfarm.scene.view import sample_view
+
+    modification = sample_modification(scene.spec, 0, number)
+    view = sample_view(scene.spec, modification.key(scene.spec.radiance_id), 0, 0)
+    scene.apply(modification)
+    scene.buffers(view)
+    scene.photons(number)
+    scene.render_halves(view, (2 * number, 2 * number + 1))
 
 
 def farm(folder: Path, options: argparse.Namespace, count: int) -> ConcurrentWork:

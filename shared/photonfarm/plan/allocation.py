@@ -34,7 +34,7 @@ from photonfarm.plan.sample_costs import SampleCosts
 
 KAPPA = 0.34
 """κ, how much of the noise the network averages away over pixels and views: fitted to `light_transport`, preset
-`small`, in two rooms by bench/studies/noise_budget.py. Its 95 % range is 1.6 and less, down to the end of what was
+`small`, in two rooms (docs/results/noise_budget.md). Its 95 % range is 1.6 and less, down to the end of what was
 searched.
 """
 

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import ValidationError
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-PAGE = "docs/results/firefly.md"
+PAGE = "docs/results/networks.md"
 """The source of the figures below: a pixel of mean 0.90 with rare bright samples."""
 
 

@@ -112,7 +112,7 @@ def ends_of_jobs(scene: SceneStore) -> Sequence[Sequence[End]]:
     """Every worker's, in order, by the times of the markers and what is in them."""
     found: dict[str, list[End]] = {}
     for job in scene.committed_jobs():
-        placed = scene.storage.local(markers.name_of(scene.name, job)).stat().st_mtime
+        placed = scene.storage.local(markers.marker_name(scene.name, job)).stat().st_mtime
         figures = scene.marker(job)["figures"]
         found.setdefault(figures["worker"], []).append(End(placed, job, figures["core_s"]))
     return [sorted(ends) for ends in found.values()]

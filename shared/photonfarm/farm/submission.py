@@ -26,11 +26,11 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
-from photonfarm.store.model.lease import at_work
+from photonfarm.store.model.lease import announce_work
 from photonfarm.store.model.plans import StoredPlan, content, load_all
 from photonfarm.store.model.scene_store import SCENES, stored_spec
 from photonfarm.store.read.find import scene_named
-from photonfarm.store.read.other_scenes import first_plan_note, other_scenes, with_same_radiance
+from photonfarm.store.read.other_scenes import describe_scenes, find_same_radiance, note_first_plan
 
 MOST_NAMED = 4096
 """The largest number of configurations that a message proposes."""
@@ -223,15 +223,15 @@ def submit(
     """
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
-    other = scene_named(opened, halves_from) if halves_from else with_same_radiance(opened, named.spec)
+    other = scene_named(opened, halves_from) if halves_from else find_same_radiance(opened, named.spec)
     before = stored_spec(opened.storage, named.spec.scene_id)
-    with at_work(opened.storage, named.spec.scene_id, "submit", log.warning):
+    with announce_work(opened.storage, named.spec.scene_id, "submit", log.warning):
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten
     queued = _queue(opened, redis_url, retry=retry or anew)
     return Submission(
         planned.scene_id, planned.plan, planned.new, planned.known, queued,
-        note=first_plan_note(opened, named.spec) if planned.plan == 0 else None,
+        note=note_first_plan(opened, named.spec) if planned.plan == 0 else None,
         halves_from=other if planned.new else None,
         replaced=None if before is None else _describe_replaced(before, named.spec),
         scenes=named.scenes,
@@ -264,9 +264,9 @@ def top_up(
     if scene_id not in opened.scene_ids():
         raise SpecError(
             f"{named.name}: {store} has no samples of scene {scene_id} that could be topped up; "
-            f"{other_scenes(opened, named.spec)}; `photonfarm submit` plans the first ones"
+            f"{describe_scenes(opened, named.spec)}; `photonfarm submit` plans the first ones"
         )
-    with at_work(opened.storage, scene_id, "top-up", log.warning):
+    with announce_work(opened.storage, scene_id, "top-up", log.warning):
         planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
     queued = None if dry_run else _queue(opened, redis_url, retry=retry)
     return TopUpSubmission(

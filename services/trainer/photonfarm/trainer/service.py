@@ -18,8 +18,8 @@ from photonfarm.scene.spec import Film
 from photonfarm.scene.spec_loading import load_spec, scene_folder
 from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
-from photonfarm.store.model.scene_store import held as scenes_held
-from photonfarm.store.read.other_scenes import other_scenes
+from photonfarm.store.model.scene_store import list_scenes as scenes_held
+from photonfarm.store.read.other_scenes import describe_scenes
 from photonfarm.trainer.runs.run_folder import held, note_scene_folder
 from photonfarm.trainer.runs.run_progress import RunProgress, followed
 from photonfarm.trainer.runs.settings import TrainSettings, settings_of
@@ -172,7 +172,7 @@ def _lacks(store: Store, scene_id: str, spec: SceneSpec | None) -> str:
     """What of a scene is waited for, in words."""
     if store.has_scene(scene_id):
         return "of which nothing is rendered yet"
-    others = other_scenes(store, spec) if spec else scenes_held(store.storage)
+    others = describe_scenes(store, spec) if spec else scenes_held(store.storage)
     return f"which {store.storage.where} does not hold yet; {others}"
 
 

@@ -17,14 +17,14 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.check.content_check import SIGNIFICANCE, CheckTotals, HalvesResult, HalvesTest
 from photonfarm.store.check.job_check import CheckTarget
 from photonfarm.store.check.job_pool import JobPool
-from photonfarm.store.check.plan_check import PlanCheck, jobs_to_render, unplanned_files
+from photonfarm.store.check.plan_check import PlanCheck, find_unplanned_files, jobs_to_render
 from photonfarm.store.check.plan_repair import PlanRepair
 from photonfarm.store.check.repeated_seeds import equal_samples
 from photonfarm.store.format import markers
 from photonfarm.store.io.storage import TMP, Storage
 from photonfarm.store.model import plans
 from photonfarm.store.model.findings import Cause, Finding, FindingGroup, Findings, Remedy
-from photonfarm.store.model.lease import Claim, OnWait, lease
+from photonfarm.store.model.lease import Claim, OnWait, hold_lease
 from photonfarm.store.model.quarantine import Quarantine, was_set_aside
 from photonfarm.store.model.scene_store import SCENES, read_spec, scene_ids
 from photonfarm.store.model.store import Store
@@ -149,7 +149,7 @@ class _SceneChecking:
                 with self._alone():
                     aside = ["spec"] if quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
             return self._report(None, aside)
-        committed = markers.jobs(self._storage, self._name)
+        committed = markers.list_jobs(self._storage, self._name)
         inputs, done = self._plans(spec, quarantine)
         self._add(inputs.check_base(committed))
         scene = None
@@ -164,7 +164,7 @@ class _SceneChecking:
         return self._report(spec.name, done)
 
     def _alone(self) -> contextlib.AbstractContextManager[Claim]:
-        return lease(self._storage, self._scene_id, "store check --repair", self._on_wait)
+        return hold_lease(self._storage, self._scene_id, "store check --repair", self._on_wait)
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
         """Check the plans, before the jobs, which need them; also returns what was written again."""
@@ -210,7 +210,7 @@ class _SceneChecking:
             for part in pool.totals:
                 total.add(part)
         self._on_progress(called, len(committed), len(committed), total.size_bytes)
-        self._add(unplanned_files(scene))
+        self._add(find_unplanned_files(scene))
 
     def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
         """The findings, with another cause for equal halves that were equal again after being rendered again."""
@@ -229,7 +229,7 @@ class _SceneChecking:
     def _marker(self, job: int) -> bytes:
         """The marker that findings of a job refer to; raises FileNotFoundError if it was set aside in the meantime."""
         if job not in self._markers:  # found when all samples were looked at
-            self._markers[job] = self._storage.read(markers.name_of(self._name, job))
+            self._markers[job] = self._storage.read(markers.marker_name(self._name, job))
         return self._markers[job]
 
     def _add(self, found: Iterator[Finding] | list[Finding]) -> None:
@@ -256,7 +256,7 @@ class _SceneChecking:
         if why := self._findings.of(Cause.BASE):
             if quarantine.base(self._name, why):
                 aside.append("base")
-            committed = markers.jobs(self._storage, self._name)
+            committed = markers.list_jobs(self._storage, self._name)
             jobs = jobs_to_render(scene.plans) if scene is not None and scene.plans else set()
             if scene is not None and jobs and committed >= jobs:
                 # nothing is missing, and only a job that is rendered writes the base
@@ -269,7 +269,7 @@ class _SceneChecking:
         files = set(scene.files_of(job).values())
         try:
             marker = self._marker(job)
-            files.update(markers.files(marker, scene.name, job))
+            files.update(markers.parse_files(marker, scene.name, job))
         except FileNotFoundError:  # it is missing by now
             return False
         except CorruptError:

@@ -79,7 +79,7 @@ class PlanCheck:
             yield Finding(Cause.PLAN, findings.MISSING, self._id, file=f"{folder}/zarr.json")
             return
         try:
-            group, about = plans.opened(self._storage, folder)
+            group, about = plans.open_plan(self._storage, folder)
         except StoreError as error:
             yield Finding(Cause.PLAN, str(error).partition(": ")[2], self._id, file=f"{folder}/zarr.json")
             return
@@ -106,7 +106,7 @@ class PlanCheck:
 
     def _references(self, found: list[StoredPlan]) -> Iterator[Finding]:
         """Find rows and jobs out of sequence, and samples that refer to rows that hold nothing."""
-        modification, view = _stacked(found)
+        modification, view = _stack(found)
         first_job = 0
         for plan in found:
             used = plan.rows.sample_modification != UNUSED
@@ -129,7 +129,7 @@ class PlanCheck:
 
     def _keys(self, found: list[StoredPlan]) -> Iterator[Finding]:
         """Find samples whose content key does not match their content, or belongs to another sample as well."""
-        modification, view = _stacked(found)
+        modification, view = _stack(found)
         for plan in found:
             rows = plan.rows
             used = np.flatnonzero(rows.sample_modification != UNUSED)
@@ -201,7 +201,7 @@ def declaration(group: Any, name: str) -> str:
     return ""
 
 
-def _stacked(found: list[StoredPlan]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _stack(found: list[StoredPlan]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The modification vectors (R, G, 4) and view vectors (R, 6) of all rows of a scene."""
     return (
         np.concatenate([plan.rows.modification for plan in found]),
@@ -224,7 +224,7 @@ def _base_references(geometry: Geometry, cloud: BasePointCloud, groups: int) -> 
     return ""
 
 
-def unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
+def find_unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
     """Yield files of jobs that are not committed, and files that are not ours."""
     left: dict[int, str] = {}
     foreign = [
@@ -240,7 +240,7 @@ def unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
                 foreign.append(f"{folder}/{name}")
             else:
                 left.setdefault(job, f"{folder}/{name}")
-    for job in sorted(left.keys() - markers.jobs(scene.storage, scene.name)):  # now: a worker may have been at it
+    for job in sorted(left.keys() - markers.list_jobs(scene.storage, scene.name)):  # now: a worker may have been at it
         yield scene.finding(Cause.NO_MARKER, job, "not a sample yet", left[job])
     yield from (Finding(Cause.FOREIGN_FILE, "left alone", scene.scene_id, file=file) for file in foreign)
 

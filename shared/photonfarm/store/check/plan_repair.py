@@ -60,7 +60,7 @@ class PlanRepair:
         """
         before = plans.load_all(self._storage, self._scene, [], until=number)
         folder = plans.folder(self._scene, number)
-        _, about = plans.opened(self._storage, folder)
+        _, about = plans.open_plan(self._storage, folder)
         rows = self._rows(folder, about, before)
         self._compare(folder, rows, about.first_job * about.shard_rows)
         found = {str(finding.file).removeprefix(f"{folder}/").partition("/")[0] for finding in why}
@@ -87,7 +87,7 @@ class PlanRepair:
             if isinstance(about.request, Joined):
                 rows = expand_samples(self._samples(folder, about, about.request, before), **numbers).rows
             else:
-                rows = plans.expanded(self._spec, about.request, before, **numbers).rows
+                rows = plans.expand_again(self._spec, about.request, before, **numbers).rows
         except (SpecError, ValueError) as error:
             raise self._hopeless(folder, f"its request cannot be expanded: {error}") from error
         if rows is None or len(rows.sample_key) != about.jobs * about.shard_rows:
@@ -125,8 +125,8 @@ class PlanRepair:
             read["sample_modification"]
             & read["sample_view"]
             & read["sample_pass"]
-            & _known(rows.sample_modification, read["modification"], first_row)
-            & _known(rows.sample_view, read["view"], first_row)
+            & _read_known(rows.sample_modification, read["modification"], first_row)
+            & _read_known(rows.sample_view, read["view"], first_row)
         )
         if not settled.all():
             raise self._hopeless(folder, "too little of it can be read to tell that its request gives the same")
@@ -168,7 +168,7 @@ def _is_whole(content: bytes) -> bool:
     return crc_of(content[:-_CRC_BYTES]) == content[-_CRC_BYTES:]
 
 
-def _known(references: NDArray[np.int64], own: Mask, first_row: int) -> Mask:
+def _read_known(references: NDArray[np.int64], own: Mask, first_row: int) -> Mask:
     """Whether the rows (R,) that samples refer to are known: they were read, are of older plans, or are unused."""
     known = references < first_row
     known[~known] = own[references[~known] - first_row]

@@ -294,16 +294,16 @@ NOISY_GUIDES = ("direct", "gloss", "point_light")
 """The guides that are sampled, with seeds of their own; they are rounded."""
 
 
-def as_array(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
+def scale_to_array(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
     """The array that a sample goes to, and its values: scaled, or unscaled if float16 cannot hold them."""
     with np.errstate(over="ignore", under="ignore"):
         scaled = radiance * np.float32(2.0**exponent)
     return ("radiance", scaled) if stays_finite(scaled, np.dtype(np.float16)) else ("radiance_wide", radiance)
 
 
-def as_stored(radiance: F32, exponent: int) -> F32:
+def round_as_stored(radiance: F32, exponent: int) -> F32:
     """Radiance as readers give it once it is stored: rounded to float16 at the store's scale, if that can hold it."""
-    name, values = as_array(radiance, exponent)
+    name, values = scale_to_array(radiance, exponent)
     return (
         values if name == "radiance_wide" else values.astype(np.float16).astype(np.float32) * np.float32(2.0**-exponent)
     )
@@ -321,7 +321,7 @@ def stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
     return -end < float(values.min()) and float(values.max()) < end
 
 
-def rounded(values: NDArray[Any]) -> F32:
+def round_to_8_bits(values: NDArray[Any]) -> F32:
     """Numbers rounded to 8 significant bits, to nearest with ties to even; noisy values need no more.
 
     The two lower bytes are then 0 and take no room once compressed. Finite values must not be within 0.4 % of the

@@ -26,9 +26,9 @@ from photonfarm.store.format.shards import (
     NOISY_GUIDES,
     Shard,
     ShardWriter,
-    as_array,
     encode,
-    rounded,
+    round_to_8_bits,
+    scale_to_array,
     stays_finite,
 )
 from photonfarm.store.io.storage import Storage, discard, renew_copy
@@ -141,7 +141,7 @@ class JobWriter:
     def radiance(self, row: int, halves: F32) -> None:
         """Add the half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
         self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
-        self._put(row, *as_array(halves, self._scene.spec.radiance_exponent))
+        self._put(row, *scale_to_array(halves, self._scene.spec.radiance_exponent))
 
     def view(self, row: int, buffers: ViewBuffers, guides: Guides, visibility: Visibility) -> None:
         """Add a new view row: its buffers, its guides, and which points and photons it sees."""
@@ -149,7 +149,7 @@ class JobWriter:
         for name, values in arrays_of(buffers).items():
             self._put(row, name, values)
         for name, values in arrays_of(guides).items():
-            self._put(row, name, rounded(values) if name in NOISY_GUIDES else values)
+            self._put(row, name, round_to_8_bits(values) if name in NOISY_GUIDES else values)
         self._put_bits(row, "point_seen", visibility.points)
         self._put_bits(row, "photon_seen", visibility.photons)
 
@@ -241,7 +241,7 @@ class JobWriter:
                     continue
                 placed = self._place(described, figures)
                 if self._scene.is_forgotten(self._rows):  # while this process was suspended: nothing here is the plan's
-                    for name in (*map(self._file, described), markers.name_of(self._scene.name, self._rows.job)):
+                    for name in (*map(self._file, described), markers.marker_name(self._scene.name, self._rows.job)):
                         self._storage.delete(name)
                     return False
                 if (placed and alone) or self._is_marker_right(clock):
@@ -282,7 +282,7 @@ class JobWriter:
 
     def _place(self, described: Mapping[str, Mapping[str, Any]], figures: Figures) -> bool:
         files = {self._file(name): about for name, about in described.items()}
-        return markers.place(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
+        return markers.place_marker(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
 
     def _is_marker_right(self, clock: Clock) -> bool:
         """Whether the job's marker, ours or not, matches the files that are there; one that does not is set aside.
@@ -290,12 +290,12 @@ class JobWriter:
         A file that the marker does not name does no harm: it is from a late writer whose render needed float32. Of the
         two arrays only `radiance` would then be read instead of `radiance_wide`.
         """
-        name = markers.name_of(self._scene.name, self._rows.job)
+        name = markers.marker_name(self._scene.name, self._rows.job)
         try:
             marker = self._storage.read(name)
         except FileNotFoundError:  # another writer has set it aside
             return False
-        named = markers.parse(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
+        named = markers.parse_marker(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
         wrong = self._mismatched(named)
         renewed = [renew_copy(self._storage, self._file(name)) for name in wrong]  # all of them, damaged or not
         if any(renewed):

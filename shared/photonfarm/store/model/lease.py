@@ -52,7 +52,7 @@ class LeasedError(IncompleteError):
     """Somebody has the scene for itself at the moment."""
 
 
-def leases(storage: Storage) -> dict[str, str]:
+def read_leases(storage: Storage) -> dict[str, str]:
     """Sentences that somebody has a scene for itself, by scene id; costs one listing. Raises StoreError."""
     with store_errors("look for leases", storage.where):
         ids = [name.removesuffix(".json") for name in storage.names(LEASES) if name.endswith(".json")]
@@ -61,7 +61,7 @@ def leases(storage: Storage) -> dict[str, str]:
 
 
 @contextmanager
-def at_work(storage: Storage, scene_id: str, what: str, on_wait: OnWait | None = None) -> Iterator[None]:
+def announce_work(storage: Storage, scene_id: str, what: str, on_wait: OnWait | None = None) -> Iterator[None]:
     """Announce that this process is at work in a scene, so that a lease waits for the end of the block.
 
     `what` is in words: "worker w1 at job 12". Where the store cannot be written to, nothing is announced. If
@@ -70,7 +70,7 @@ def at_work(storage: Storage, scene_id: str, what: str, on_wait: OnWait | None =
     name = f"{LEASES}/{scene_id}/{uuid.uuid4().hex}.json"
     said = ""
     while True:
-        with _announced(storage, name, what):
+        with _announce(storage, name, what):
             with store_errors("look for a lease", storage.where):
                 holder = _holder(storage, scene_id)
             if holder is None:
@@ -86,7 +86,7 @@ def at_work(storage: Storage, scene_id: str, what: str, on_wait: OnWait | None =
 
 
 @contextmanager
-def lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterator[Claim]:
+def hold_lease(storage: Storage, scene_id: str, what: str, on_wait: OnWait) -> Iterator[Claim]:
     """Have a scene alone: wait for others' leases and for all who are at work in it, and hold it during the block.
 
     `what` is in words: "store check --repair". Raises StoreError.
@@ -208,7 +208,7 @@ class Claim:
                     self._storage.delete(self._name)
 
 
-def _announced(storage: Storage, name: str, what: str) -> AbstractContextManager[None]:
+def _announce(storage: Storage, name: str, what: str) -> AbstractContextManager[None]:
     file = Claim(storage, name, what)
     try:
         with store_errors("announce work in a scene", storage.where):

@@ -143,7 +143,7 @@ def content(plans: list[StoredPlan]) -> PlannedContent:
     return PlannedContent((plan.first_row, plan.rows) for plan in plans)
 
 
-def expanded(
+def expand_again(
     spec: SceneSpec, request: Request | TopUp | Joined, before: list[StoredPlan], *, first_job: int, shard_rows: int
 ) -> Expansion:
     """The rows of a request that the earlier plans do not have: a function of these, the same each time.
@@ -251,7 +251,7 @@ def _counted(storage: Storage, scene: str, names: list[str], loaded: int) -> int
 def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     """A plan; raises CorruptError if it is missing or not as it was written."""
     name = folder(scene, number)
-    group, about = opened(storage, name)
+    group, about = open_plan(storage, name)
     with _unreadable(storage, name, rewritten(about.request)):
         rows = PlannedRows(*(_input(storage, name, group, each) for each in INPUTS))
     named = int(np.count_nonzero(rows.sample_modification != UNUSED))
@@ -264,7 +264,7 @@ def rewritten(request: Request | TopUp | Joined) -> str:
     return findings.rejoin(request.store) if isinstance(request, Joined) else findings.REWRITE
 
 
-def opened(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
+def open_plan(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
     """The group of the plan in a folder, and its attributes; raises CorruptError unless they are as written."""
     from photonfarm.store.format.metadata import open_group
 
@@ -276,7 +276,7 @@ def opened(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
 def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]:
     """An array of inputs; one of vectors has the columns that this program knows, in their order."""
     values = schema.read_input(storage, f"{folder}/{name}", group[name])
-    return schema.known_columns(name, values, group[name].attrs) if name in schema.FIELDS else values
+    return schema.select_columns(name, values, group[name].attrs) if name in schema.FIELDS else values
 
 
 @contextlib.contextmanager

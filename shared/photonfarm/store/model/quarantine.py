@@ -41,7 +41,7 @@ class Quarantine:
         False if its marker is not `marker` any more: the job was committed anew since that was read. Raises StoreError.
         """
         with store_errors(f"set job {job} aside", self._storage.where):
-            name = markers.name_of(scene, job)
+            name = markers.marker_name(scene, job)
             if read_or_none(self._storage, name) != marker:
                 return False
             there = [file for file in files if self._storage.exists(file)]
@@ -132,11 +132,11 @@ def was_set_aside(storage: Storage, scene: str, job: int, marker: bytes) -> bool
 
     If so, the job has been rendered again with the same result. Raises CorruptError for an invalid marker.
     """
-    name, now = markers.name_of(scene, job), markers.files(marker, scene, job)
+    name, now = markers.marker_name(scene, job), markers.parse_files(marker, scene, job)
     for number in storage.names(QUARANTINE):
         folder = f"{QUARANTINE}/{number}"
         try:
-            then = markers.files(storage.read(f"{folder}/{name}"), scene, job)
+            then = markers.parse_files(storage.read(f"{folder}/{name}"), scene, job)
         except (FileNotFoundError, NotADirectoryError, CorruptError):
             continue
         if then == now and all(storage.exists(f"{folder}/{file}") for file in then):

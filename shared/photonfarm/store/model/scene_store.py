@@ -114,18 +114,18 @@ class SceneStore:
         invalid request or number of rows, and CorruptError if a plan is missing.
         """
         while True:
-            last = max(markers.jobs(self.storage, self.name), default=-1)
+            last = max(markers.list_jobs(self.storage, self.name), default=-1)
             found = self.plans()  # after the markers: each one's plan is there by now
             rows_per_job = self._shard_rows(found, shard_rows, usual_rows)
             first_job = found[-1].end_job if found else 0
             if last >= first_job:
                 raise CorruptError(
-                    f"{self.storage.where}/{markers.name_of(self.name, last)}: no plan has this job, and a new plan "
-                    "would take its number; `photonfarm store check` reports whether the last plan is missing"
+                    f"{self.storage.where}/{markers.marker_name(self.name, last)}: no plan has this job, and a new "
+                    "plan would take its number; `photonfarm store check` reports whether the last plan is missing"
                 )
             numbers = {"first_job": first_job, "shard_rows": rows_per_job}
             if samples is None:
-                expansion = plans.expanded(self.spec, request, found, **numbers)
+                expansion = plans.expand_again(self.spec, request, found, **numbers)
             else:
                 expansion = expand_samples(samples(plans.content(found)), **numbers)
             if expansion.rows is None or dry_run:
@@ -172,7 +172,7 @@ class SceneStore:
 
     def committed_jobs(self) -> set[int]:
         """The jobs that have their marker."""
-        return markers.jobs(self.storage, self.name)
+        return markers.list_jobs(self.storage, self.name)
 
     def missing_jobs(self, *, followed: bool = False) -> list[int]:
         """The jobs that are planned and not committed, in order.
@@ -204,11 +204,11 @@ class SceneStore:
 
     def is_committed(self, job: int) -> bool:
         """Whether a job has its marker."""
-        return self.storage.exists(markers.name_of(self.name, job))
+        return self.storage.exists(markers.marker_name(self.name, job))
 
     def marker(self, job: int) -> dict[str, Any]:
         """The marker of a committed job: its files and its figures."""
-        return markers.read(self.storage, self.name, job)
+        return markers.read_marker(self.storage, self.name, job)
 
     def progress(self, *, followed: bool = False) -> Progress:
         """The scene's progress; costs one listing of the markers.
@@ -268,7 +268,7 @@ def is_there(storage: Storage, scene_id: str) -> bool:
     return False
 
 
-def held(storage: Storage) -> str:
+def list_scenes(storage: Storage) -> str:
     """The scenes that are there, by name and id, in words."""
     named = []
     for scene_id in scene_ids(storage):
@@ -292,7 +292,7 @@ def read_spec(storage: Storage, scene_id: str) -> SceneSpec:
         spec = SceneSpec.model_validate_json(storage.read(name))
     except FileNotFoundError as error:
         if not is_there(storage, scene_id):
-            raise StoreError(f"{storage.where}: holds no scene {scene_id}; {held(storage)}") from error
+            raise StoreError(f"{storage.where}: holds no scene {scene_id}; {list_scenes(storage)}") from error
         if storage.exists(name):  # a submission has begun the scene in the meantime
             return read_spec(storage, scene_id)
         raise CorruptError(
@@ -339,7 +339,7 @@ def _exponent_of_plans(storage: Storage, scene: str) -> int | None:
     numbers = range(plans.count(storage, scene))
     for number in numbers:
         with contextlib.suppress(CorruptError):
-            return plans.opened(storage, plans.folder(scene, number))[1].radiance_exponent
+            return plans.open_plan(storage, plans.folder(scene, number))[1].radiance_exponent
     if numbers:
         raise CorruptError(f"{storage.where}/{scene}: the spec is lost, and no plan can be read; {findings.RESTORE}")
     return None

@@ -65,7 +65,7 @@ def scene_status(scene: SceneStore) -> SceneStatus:
     """The status of one scene, as `store_status` has it; raises StoreError if it cannot be read."""
     progress = scene.progress()
     committed = sorted(scene.committed_jobs())  # before the plans: each one's plan is there by now
-    jobs, withdrawn, sums = scene.jobs(), scene.withdrawn_jobs(), _summed(scene.marker, committed)
+    jobs, withdrawn, sums = scene.jobs(), scene.withdrawn_jobs(), _sum_all(scene.marker, committed)
     if sums.error is not None and not isinstance(sums.error, CorruptError):
         check_format(scene.storage)
     return SceneStatus(
@@ -105,7 +105,7 @@ Read = Callable[[int], dict[str, Any]]
 """A function that reads the marker of a job."""
 
 
-def _summed(read: Read, committed: list[int]) -> _Sums:
+def _sum_all(read: Read, committed: list[int]) -> _Sums:
     """Sums over the markers of many jobs, read several at a time."""
     blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
     sums = _Sums()

@@ -21,7 +21,7 @@ from photonfarm.plan.request import UNUSED
 from photonfarm.store.format import markers
 from photonfarm.store.io.storage import put_json
 from photonfarm.store.model import plans
-from photonfarm.store.model.lease import OnWait, lease
+from photonfarm.store.model.lease import OnWait, hold_lease
 from photonfarm.store.model.plans import StoredPlan
 from photonfarm.store.model.scene_store import SCENES, SceneStore, is_there
 from photonfarm.store.model.store import FAILURES_FOLDER, Store
@@ -48,7 +48,7 @@ def withdraw(scene: SceneStore, number: int | None = None, *, on_wait: OnWait = 
     there, and where samples of a later plan refer to its rows. It waits with `on_wait` for the scene's lease.
     """
     storage = scene.storage
-    with lease(storage, scene.scene_id, "store withdraw", on_wait), store_errors("withdraw a plan", storage.where):
+    with hold_lease(storage, scene.scene_id, "store withdraw", on_wait), store_errors("withdraw a plan", storage.where):
         return _withdraw(scene, number)
 
 
@@ -121,11 +121,11 @@ def forget(store: Store, scene_id: str, *, on_wait: OnWait = lambda _: None) -> 
     What a repair has set aside of it stays in the quarantine.
     """
     storage, folder = store.storage, f"{SCENES}/{scene_id}"
-    taken = lease(storage, scene_id, "store forget", on_wait)
+    taken = hold_lease(storage, scene_id, "store forget", on_wait)
     with taken as held, store_errors("forget a scene", storage.where):
         if not is_there(storage, scene_id):
             raise StoreError(f"{storage.where}: holds no scene {scene_id}")
-        jobs = len(markers.jobs(storage, folder))
+        jobs = len(markers.list_jobs(storage, folder))
         below = f"{folder}/{plans.PLANS}"
         put_json(storage, {"jobs": jobs}, f"{below}/{plans.FORGOTTEN}{uuid4().hex}.json")
         numbers = reversed(range(plans.count(storage, folder)))

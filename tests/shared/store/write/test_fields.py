@@ -44,7 +44,9 @@ def test_a_plan_that_lacks_a_field_has_it_at_rest(scene: SceneStore, monkeypatch
 def test_columns_are_found_by_name_in_any_order() -> None:
     known: Any = schema.FIELDS["modification"]
     values = np.arange(8, dtype=np.float32).reshape(1, 2, 4)
-    np.testing.assert_array_equal(schema.by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values)
+    np.testing.assert_array_equal(
+        schema.select_by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values
+    )
 
 
 def test_a_field_of_a_newer_program_is_refused(scene: SceneStore) -> None:

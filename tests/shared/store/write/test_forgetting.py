@@ -96,7 +96,7 @@ def test_a_writer_that_slept_through_it_commits_nothing_of_what_it_rendered(
     scene: SceneStore, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
     scene.plan(Request(modifications=6))
-    given, place = samples.outputs(scene, 2), markers.place
+    given, place = samples.outputs(scene, 2), markers.place_marker
 
     def late(*about: Any) -> bool:
         monkeypatch.undo()
@@ -104,7 +104,7 @@ def test_a_writer_that_slept_through_it_commits_nothing_of_what_it_rendered(
         return place(*about)
 
     if when == "before the marker":
-        monkeypatch.setattr(markers, "place", late)
+        monkeypatch.setattr(markers, "place_marker", late)
         assert not samples.commit(scene, 2, given)
         again = Store(scene.storage.where).scene(scene.scene_id)
     else:

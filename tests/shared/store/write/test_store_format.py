@@ -302,7 +302,7 @@ def read_marker(root: Path, content: str | bytes) -> dict[str, Any]:
     (root / "scenes/s/committed/000000000000.json").write_bytes(
         content.encode() if isinstance(content, str) else content
     )
-    return markers.read(LocalStorage(root), "scenes/s", 0)
+    return markers.read_marker(LocalStorage(root), "scenes/s", 0)
 
 
 @pytest.mark.parametrize(
@@ -361,4 +361,4 @@ def test_only_names_of_twelve_digits_are_markers(tmp_path: Path) -> None:
     )
     for name in names:
         (folder / name).write_text("{}")
-    assert markers.jobs(LocalStorage(tmp_path), "scenes/s") == {7}
+    assert markers.list_jobs(LocalStorage(tmp_path), "scenes/s") == {7}

@@ -16,7 +16,7 @@ from photonfarm.plan.top_up import TopUp
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
-from photonfarm.store.model.lease import at_work
+from photonfarm.store.model.lease import announce_work
 from photonfarm.store.model.status import scene_status
 from photonfarm.store.model.withdrawal import withdraw
 
@@ -85,7 +85,7 @@ def test_the_job_in_hand_is_waited_for_and_stays(scene: SceneStore) -> None:
     taken, waited = threading.Event(), threading.Event()
 
     def work() -> None:
-        with at_work(scene.storage, scene.scene_id, "worker w1 at job 1"):
+        with announce_work(scene.storage, scene.scene_id, "worker w1 at job 1"):
             taken.set()
             assert waited.wait(20)
             assert samples.commit(scene, 1, samples.outputs(scene, 1))

@@ -29,7 +29,7 @@ from photonfarm.scene.spec_loading import scene_folder
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers
-from photonfarm.store.format.shards import as_stored
+from photonfarm.store.format.shards import round_as_stored
 from photonfarm.store.read.find import Query, SceneMatch, is_spec_file, scene_or_spec
 
 SUFFIXES = (".npz", ".exr", ".png")
@@ -205,7 +205,7 @@ def _planned(stored: SceneStore, row: int) -> tuple[Modification, View, int]:
 
 def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparison:
     """The comparison of both halves with those in a row; what is rendered is rounded as the store rounds."""
-    here = as_stored(halves, stored.spec.radiance_exponent)
+    here = round_as_stored(halves, stored.spec.radiance_exponent)
     difference = here.astype(np.float64) - there
     test = block_z_test(_interleaved(here), _interleaved(there), blocks=4)
     root = float(np.sqrt(np.mean(there.astype(np.float64) ** 2)))

@@ -54,7 +54,7 @@ class _Figures(_Stored):
 
 class _Marker(_Stored):
     job: Annotated[int, Field(ge=0)]
-    parse_files: dict[_ShardName, _File] = Field(min_length=1)  # by path below the scene's folder
+    files: dict[_ShardName, _File] = Field(min_length=1)  # by path below the scene's folder
     figures: _Figures
 
 

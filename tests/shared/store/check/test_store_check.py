@@ -125,7 +125,7 @@ def test_a_marker_of_a_job_that_no_plan_has_is_found_and_set_aside(store: Store,
 
 def test_a_value_that_is_not_finite_is_found(store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """No writer of ours stores one."""
-    monkeypatch.setattr("photonfarm.store.model.commit.as_array", lambda halves, _: ("radiance", halves))
+    monkeypatch.setattr("photonfarm.store.model.commit.scale_to_array", lambda halves, _: ("radiance", halves))
     monkeypatch.setattr("photonfarm.store.model.commit.stays_finite", lambda *_: True)
 
     def poison(given: Any) -> None:

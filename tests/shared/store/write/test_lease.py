@@ -23,8 +23,8 @@ SCENE = "0123456789abcdef0123456789abcdef"
 AT_WORK = """
 import sys, time
 from photonfarm.store import Store
-from photonfarm.store.model.lease import at_work
-with at_work(Store(sys.argv[1]).storage, sys.argv[2], "worker w1 at job 12"):
+from photonfarm.store.model.lease import announce_work
+with announce_work(Store(sys.argv[1]).storage, sys.argv[2], "worker w1 at job 12"):
     print("in", flush=True)
     sys.stdin.readline()
 """

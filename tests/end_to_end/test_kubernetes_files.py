@@ -1,12 +1,11 @@
-"""The files for Kubernetes, read as YAML: they agree with the compose file, the code, and each other.
+"""What the chart renders, read as YAML: it agrees with the compose file, the code, and itself.
 
-The files of deploy/kustomize are what the chart renders, so these tests need no tool of Kubernetes;
-tests/end_to_end/test_kubernetes.py asks those.
+`chart_rendered.yaml` holds what `helm template` prints, so these tests need no Helm. Where there is Helm,
+test_kubernetes.py compares the file with the chart.
 """
 
 import json
 import re
-import runpy
 import tomllib
 from collections.abc import Iterator
 from itertools import pairwise
@@ -21,16 +20,11 @@ from photonfarm.farm.running_farm import METRICS_PORT
 from photonfarm.queue.rq_adapter import open_queue
 
 ROOT = Path(__file__).parents[2]
-CHART, KUSTOMIZE = ROOT / "deploy/helm/photonfarm", ROOT / "deploy/kustomize"
+CHART = ROOT / "deploy/helm/photonfarm"
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 
-DOCUMENTS: list[dict[str, Any]] = [
-    document
-    for path in sorted(KUSTOMIZE.glob("*/*.yaml"))
-    if path.name != "kustomization.yaml"
-    for document in yaml.safe_load_all(path.read_text())
-]
+DOCUMENTS: list[dict[str, Any]] = [*yaml.safe_load_all(Path(__file__).with_name("chart_rendered.yaml").read_text())]
 
 
 def pod_of(document: dict[str, Any]) -> dict[str, Any] | None:
@@ -40,7 +34,13 @@ def pod_of(document: dict[str, Any]) -> dict[str, Any] | None:
     return spec.get("template")
 
 
-PODS = {document["metadata"]["name"]: pod for document in DOCUMENTS if (pod := pod_of(document)) is not None}
+def name_of(document: dict[str, Any]) -> str:
+    """The name of a document; of a Job without the digest of what it runs."""
+    name: str = document["metadata"]["name"]
+    return re.sub(r"-[0-9a-f]{8}$", "", name) if document["kind"] == "Job" else name
+
+
+PODS = {name_of(document): pod for document in DOCUMENTS if (pod := pod_of(document)) is not None}
 
 
 def containers() -> Iterator[tuple[str, dict[str, Any]]]:
@@ -50,7 +50,7 @@ def containers() -> Iterator[tuple[str, dict[str, Any]]]:
 
 def named(kind: str, name: str) -> dict[str, Any]:
     """One document."""
-    (found,) = [d for d in DOCUMENTS if (d["kind"], d["metadata"]["name"]) == (kind, name)]
+    (found,) = [d for d in DOCUMENTS if (d["kind"], name_of(d)) == (kind, name)]
     return found
 
 
@@ -63,18 +63,14 @@ def test_the_images_are_those_of_the_compose_file_in_a_registry_that_nobody_has(
     ours = {service["image"] for service in COMPOSE["services"].values()}
     assert {container["image"] for _, container in containers()} == {f"localhost/{image}:{VERSION}" for image in ours}
     assert yaml.safe_load((CHART / "Chart.yaml").read_text())["appVersion"] == VERSION
-    renamed = yaml.safe_load((KUSTOMIZE / "kustomization.yaml").read_text())["images"]
-    assert {(image["name"], image["newTag"]) for image in renamed} == {(f"localhost/{i}", VERSION) for i in ours}
 
 
 def test_every_command_and_probe_of_photonfarm_has_a_verb_and_options_that_there_are(parse) -> None:
     lines = [container["command"] for _, container in containers()]
     probes = [c[probe] for _, c in containers() for probe in c if probe.endswith("Probe")]
     lines += [probe["exec"]["command"] for probe in probes if "exec" in probe]
-    for patch in yaml.safe_load((KUSTOMIZE / "kustomization.yaml").read_text())["patches"]:
-        lines += [operation["value"] for operation in yaml.safe_load(patch["patch"])]
     ours = [line[1:] for line in lines if line[0] == "photonfarm"]
-    assert len(ours) == len(PODS) - 1 + 2 + 1  # all but Redis, two probes and a patch
+    assert len(ours) == len(PODS) - 1 + 2  # all but Redis, and two probes
     for arguments in ours:
         parse(arguments)
 
@@ -139,7 +135,8 @@ def test_the_network_policies_cover_every_pod_and_let_the_farm_reach_nothing_but
     assert "egress" not in redis
     assert "ingress" not in farm
     (entry,) = redis["ingress"]
-    assert [peer["podSelector"] for peer in entry["from"]] == [farm["podSelector"]]
+    keda = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "keda"}}}
+    assert entry["from"] == [{"podSelector": farm["podSelector"]}, keda]
     to_redis, names = farm["egress"]
     assert to_redis["to"] == [{"podSelector": redis["podSelector"]}]
     assert {port["port"] for port in names["ports"]} == {53}
@@ -205,24 +202,3 @@ def keys_of_schema(schema: dict[str, Any], root: dict[str, Any], before: str = "
     for key, value in schema["properties"].items():
         found |= keys_of_schema(value, root, f"{before}{key}.") if "properties" in value else {before + key}
     return found
-
-
-def test_podman_gets_pods_whose_volumes_are_their_own_and_whose_ports_nobody_reaches() -> None:
-    convert = runpy.run_path(str(ROOT / "scripts/podman_pods.py"))["podman_documents"]
-    left_out: list[str] = []
-    made = list(convert(DOCUMENTS, left_out))
-    pods = {document["metadata"]["name"]: document["spec"] for document in made if document["kind"] == "Pod"}
-    assert set(pods) == {
-        *(f"photonfarm-{part}" for part in ("metrics", "plan-first", "redis", "renderer-0", "renderer-1", "trainer"))
-    }
-    assert [document["kind"] for document in made if document["kind"] != "Pod"] == ["PersistentVolumeClaim"]
-    assert {name.partition("/")[0] for name in left_out} == {
-        "CronJob", "NetworkPolicy", "ScaledObject", "Service", "TriggerAuthentication",
-    }  # fmt: skip
-    own = [volume["name"] for spec in pods.values() for volume in spec["volumes"] if "emptyDir" in volume]
-    assert len(own) == len(set(own)) == len(pods) + 1  # a /tmp each, and Redis's journal
-    for spec in pods.values():
-        (container,) = spec["containers"]
-        assert "ports" not in container
-        assert {mount["name"] for mount in container["volumeMounts"]} == {v["name"] for v in spec["volumes"]}
-    assert [pods[f"photonfarm-{part}"]["restartPolicy"] for part in ("redis", "trainer")] == ["Always", "OnFailure"]

@@ -1,9 +1,7 @@
 #!/usr/bin/env python3
 """Writes docs/cli.md, every verb of `photonfarm` with its options, from the commands themselves.
 
-    python scripts/cli_page.py
-
-A test compares the page with what this makes, so run it after any change of a verb, an option or a help text.
+`make docs` runs it before it builds the site; the page is not committed.
 """
 
 from __future__ import annotations

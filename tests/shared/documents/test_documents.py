@@ -4,7 +4,9 @@ import functools
 import re
 import runpy
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any, get_args
 
 import click
 import pytest
@@ -15,6 +17,7 @@ from photonfarm.cli.settings import file_defaults
 from photonfarm.core import errors
 from photonfarm.scene import spec as scene_spec
 from photonfarm.scene.free_space import FreeSpace
+from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Occlusion, TrainSettings
 
 ROOT = Path(__file__).parents[3]
 DOCS = ROOT / "docs"
@@ -101,6 +104,53 @@ def test_the_page_of_the_scene_spec_lists_every_key_and_its_default(section: str
             assert told[name] == str(field.default).lower(), name
         elif isinstance(field.default, int | float):
             assert float(told[name]) == field.default, name
+
+
+def rows(page: str, columns: int) -> Iterator[list[str]]:
+    """The cells of the rows that begin with a key, in tables of so many columns."""
+    for line in (DOCS / page).read_text().splitlines():
+        cells = line.strip("| ").split(" | ")
+        if line.startswith("| `") and len(cells) == columns:
+            yield cells
+
+
+def value_of(settings: TrainSettings, key: str) -> object:
+    """A setting, or one of the network."""
+    return getattr(settings if key in TrainSettings.model_fields else settings.network, key)
+
+
+def as_written(value: object) -> str:
+    """A setting's value as the page has it."""
+    if value is None:
+        return "–"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if value in (1 / 8, 1 / 16):
+        return f"1/{1 / value:.0f}"  # type: ignore[operator]
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def test_the_page_of_the_settings_of_training_lists_every_key_with_its_values_in_two_presets() -> None:
+    listed = {cells[0].strip("`"): cells[1:3] for cells in rows("training-settings.md", 4) if cells[0].count("`") == 2}
+    assert set(listed) - {*get_args(Architecture)} == set(KEYS)
+    for key in KEYS:
+        assert listed[key] == [as_written(value_of(PRESETS[name](), key)) for name in ("small", "paper-dynamic")], key
+
+
+def test_the_page_of_the_settings_of_training_says_in_what_the_other_presets_differ() -> None:
+    listed = {cells[0].strip("`"): cells[1] for cells in rows("training-settings.md", 3)}
+    for name in PRESETS.keys() - {"small", "paper-dynamic"}:
+        pairs = {key: as_written(value_of(PRESETS[name](), key)) for key in KEYS}
+        differing = {key for key in KEYS if pairs[key] != as_written(value_of(PRESETS["paper-dynamic"](), key))}
+        assert {*listed[name].split(", ")} == {f"`{key} = {pairs[key]}`" for key in differing}
+
+
+@pytest.mark.parametrize("kind", [Architecture, Loss, Occlusion])
+def test_the_page_of_the_settings_of_training_names_every_network_loss_and_rule(kind: Any) -> None:
+    page = (DOCS / "training-settings.md").read_text()
+    firsts = " ".join(line.partition(" | ")[0] for line in page.splitlines() if line.startswith("| `"))
+    for name in get_args(kind):
+        assert f"`{name}`" in firsts or f"`_{name.rpartition('_')[2]}`" in firsts, name
 
 
 def test_the_page_of_the_configuration_lists_every_variable_and_exit_code() -> None:

@@ -163,6 +163,12 @@ def test_the_page_of_the_configuration_lists_every_variable_and_exit_code() -> N
     assert codes <= {int(code) for code in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
 
 
+def test_the_page_of_the_configuration_lists_every_extra() -> None:
+    section = (DOCS / "configuration.md").read_text().partition("\n## Extras\n")[2].partition("\n## ")[0]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(re.findall(r"^\| `(\w+)` \|", section, re.MULTILINE)) == set(extras)
+
+
 def test_the_example_of_a_configuration_file_is_one(tmp_path: Path) -> None:
     (example,) = re.findall(r"```toml\n(.*?)```", (DOCS / "configuration.md").read_text(), re.DOTALL)
     (tmp_path / "photonfarm.toml").write_text(example)

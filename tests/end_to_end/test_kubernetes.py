@@ -88,16 +88,16 @@ def validated() -> Callable[[str], None]:
     return validate
 
 
-def rendered(helm: Tool, values: dict[str, Any], release: str = "photonfarm") -> str:
+def render(helm: Tool, values: dict[str, Any], release: str = "photonfarm") -> str:
     """What the chart makes of values."""
     given = json.dumps(values)
     return helm("template", release, CHART, "--namespace", "photonfarm", "--values", "-", given=given).stdout
 
 
-def documents(text: str) -> dict[tuple[str, str], dict[str, Any]]:
+def parse_documents(text: str) -> dict[tuple[str, str], dict[str, Any]]:
     """The documents of a text by kind and name."""
-    found = [document for document in yaml.safe_load_all(text) if document]
-    return {(document["kind"], document["metadata"]["name"]): document for document in found}
+    parsed = [document for document in yaml.safe_load_all(text) if document]
+    return {(document["kind"], document["metadata"]["name"]): document for document in parsed}
 
 
 # ---------------------------------------------------------------------------------------------------------------- Helm
@@ -109,10 +109,10 @@ def test_the_chart_passes_lint_and_the_schemas_of_kubernetes(
 ) -> None:
     (tmp_path / "values.yaml").write_text(json.dumps(VALUES[about]))
     helm("lint", "--strict", CHART, "--values", tmp_path / "values.yaml")
-    text = rendered(helm, VALUES[about])
+    text = render(helm, VALUES[about])
     validated(text)
     assert not re.findall(r"^ +$", text, re.MULTILINE)
-    for (kind, name), document in documents(text).items():
+    for (kind, name), document in parse_documents(text).items():
         assert len(name) <= 63, kind
         assert document["metadata"]["labels"]["app.kubernetes.io/instance"] == "photonfarm"
 
@@ -125,23 +125,23 @@ def test_wrong_values_are_refused_by_their_name(helm: Tool, named: str) -> None:
 
 
 def test_a_store_in_a_bucket_needs_no_volume_but_that_of_the_run_and_a_way_out(helm: Tool) -> None:
-    found = documents(rendered(helm, VALUES["bucket"]))
-    renderer = found["Deployment", "photonfarm-renderer"]["spec"]["template"]["spec"]
+    documents = parse_documents(render(helm, VALUES["bucket"]))
+    renderer = documents["Deployment", "photonfarm-renderer"]["spec"]["template"]["spec"]
     assert not [volume for volume in renderer["volumes"] if "persistentVolumeClaim" in volume]
     (container,) = renderer["containers"]
     assert container["envFrom"] == [{"secretRef": {"name": "keys"}}]
     variables = {variable["name"]: variable["value"] for variable in container["env"]}
     assert (variables["PHOTONFARM_STORE"], variables["PHOTONFARM_CACHE"]) == ("s3://farm/store", "/cache")
-    out = found["NetworkPolicy", "photonfarm-farm"]["spec"]["egress"]
+    out = documents["NetworkPolicy", "photonfarm-farm"]["spec"]["egress"]
     assert [rule for rule in out if "to" not in rule] == [{"ports": [{"protocol": "TCP", "port": 443}]}]
-    without = documents(rendered(helm, {**VALUES["bucket"], "trainer": {"enabled": False}}))
-    assert ("PersistentVolumeClaim", "photonfarm-data") in found
+    without = parse_documents(render(helm, {**VALUES["bucket"], "trainer": {"enabled": False}}))
+    assert ("PersistentVolumeClaim", "photonfarm-data") in documents
     assert ("PersistentVolumeClaim", "photonfarm-data") not in without
 
 
 def test_gpus_are_asked_for_and_several_of_them_train_by_torchrun(helm: Tool, parse) -> None:
-    found = documents(rendered(helm, VALUES["GPUs"]))
-    (renderer,) = found["Deployment", "photonfarm-renderer"]["spec"]["template"]["spec"]["containers"]
+    documents = parse_documents(render(helm, VALUES["GPUs"]))
+    (renderer,) = documents["Deployment", "photonfarm-renderer"]["spec"]["template"]["spec"]["containers"]
     assert renderer["resources"]["limits"] == {"memory": "9Gi", "nvidia.com/gpu": 1}
     variables = {variable["name"]: variable["value"] for variable in renderer["env"]}
     assert variables["PHOTONFARM_DEVICE"] == "cuda"
@@ -150,7 +150,7 @@ def test_gpus_are_asked_for_and_several_of_them_train_by_torchrun(helm: Tool, pa
     may = [sorted(given["NVIDIA_DRIVER_CAPABILITIES"].split(",")) for given in (with_card, variables)]
     assert may[0] == may[1]
     assert with_card["OPTIX_CACHE_PATH"] == variables["OPTIX_CACHE_PATH"]
-    ((_, job),) = [item for item in found.items() if item[0][0] == "Job"]
+    ((_, job),) = [item for item in documents.items() if item[0][0] == "Job"]
     spec = job["spec"]["template"]["spec"]
     assert spec["runtimeClassName"] == "nvidia"
     (trainer,) = spec["containers"]
@@ -163,7 +163,7 @@ def test_gpus_are_asked_for_and_several_of_them_train_by_torchrun(helm: Tool, pa
 def test_a_job_that_is_changed_has_another_name_and_one_that_is_not_keeps_it(helm: Tool) -> None:
     def jobs(**plan: Any) -> set[str]:
         values = {"plans": [{"name": "first", "spec": "room", **plan}]}
-        return {name for kind, name in documents(rendered(helm, values)) if kind == "Job"}
+        return {name for kind, name in parse_documents(render(helm, values)) if kind == "Job"}
 
     assert jobs() == jobs()
     (plan,) = jobs() - jobs(args=["--views", "2"])

@@ -1,4 +1,4 @@
-"""The sample store: Zarr v3 and JSON in a folder, written once and never changed. ARCHITECTURE.md has the layout."""
+"""The sample store: Zarr v3 and JSON in a folder, written once and never changed: docs/store-format.md."""
 
 from photonfarm.store.model.commit import Figures, JobWriter
 from photonfarm.store.model.plans import JobRows, SampleRow

@@ -173,8 +173,8 @@ def paper(**changes: object) -> TrainSettings:
     """The supplement to the letter, as far as it goes: `paper_dynamic` without our changes to the network.
 
     Positions have no octaves, projection uses the rule on the depth buffer [S 1.2], maxima are absolute [S Fig. 1], the
-    loss is linear [S 3.2], and a run never goes back. docs/training.md lists the remaining choices of ours, with
-    reasons.
+    loss is linear [S 3.2], and a run never goes back. docs/training-settings.md lists the remaining choices of ours,
+    with reasons.
     """
     network = NetworkSettings(points=16384, octaves=0, occlusion="window", maxima="absolute")
     return TrainSettings.model_validate({"network": network, "recover": False, **changes})

@@ -45,10 +45,9 @@ test-compose: $(DEV)
 test-slurm: $(DEV)
 	PHOTONFARM_TEST_SLURM=1 $(BIN)/python -m pytest -s tests/end_to_end/test_slurm.py
 
-# The chart and the kustomize files, validated by helm and kubectl and run for real by Podman (docs/kubernetes.md); what
-# is not found is skipped.
+# The chart, rendered by helm and held against the schemas of Kubernetes (docs/kubernetes.md); skipped without helm.
 test-kubernetes: $(VENV)/.kubernetes-ready
-	PHOTONFARM_TEST_KUBERNETES=1 $(BIN)/python -m pytest -sv tests/end_to_end/test_kubernetes.py tests/end_to_end/test_kubernetes_files.py
+	$(BIN)/python -m pytest -v tests/end_to_end/test_kubernetes.py tests/end_to_end/test_kubernetes_files.py
 
 $(VENV)/.kubernetes-ready: $(DEV)
 	$(PIP) --group kubernetes
@@ -76,13 +75,13 @@ $(VENV)/.bench-ready: $(DEV)
 
 bench-render: $(VENV)/.bench-ready
 
-# bench-moved-lamps is the module bench.trainer.moved_lamps: whichever room of bench/ has it.
+# bench-train-step is the module bench.trainer.train_step: whichever room of bench/ has it.
 bench-%: $(DEV)
 	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))
 
 # The integrator on 36 rows of hard scenes, each against its truth: make stability ARGS="--quick --only 13".
 stability: $(DEV)
-	$(BIN)/python -m bench.stability $(ARGS)
+	$(BIN)/python -m tests.stability $(ARGS)
 
 # Every experiment of experiments/, from nothing to its report; goes on where it was interrupted.
 experiments-%: $(DEV)

@@ -1,1 +1,1 @@
-"""Benchmarks and studies, whose pages lie in docs/results; each is run as a module from the repository's root."""
+"""Benchmarks that are run again, each a part of a page of docs/results; run as modules from the repository's root."""

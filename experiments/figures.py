@@ -5,9 +5,9 @@
 
 Reads WORK/NAME/report/ of experiments that have run. Of each static room it leaves NAME.png: what was trained on,
 prediction, reference and difference [S Figs. 3, 4]. Of the others it leaves NAME-time-METRIC.svg, error over the time
-of a frame [S Figs. 5, 6]; NAME-predictions.png, predictions of several networks above their errors [S Fig. 7]; and
-NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not run or whose
-report is an earlier version's.
+of a frame [S Figs. 5, 6], by MSE and MSSIM; NAME-predictions.png, predictions of several networks above their errors
+[S Fig. 7]; and NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not
+run or whose report is an earlier version's.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from experiments.experiment import HERE, Experiment
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.pictures import Picture
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, GAP, LINE
-from photonfarm.trainer.predict.animation import read_png, write_png
+from photonfarm.trainer.predict.animation import read_png
 from photonfarm.trainer.report.views import OVERVIEW, colour_difference
 from photonfarm.trainer.report.worst_cases import name_kinds as worst_view
 
@@ -41,7 +41,7 @@ ROOMS = [
     "fixed-living-room",
     "fixed-veach-ajar",
 ]
-METRICS = ("mse", "mssim", "fid", *(f"feature-l1-{layer}" for layer in range(4)))
+METRICS = ("mse", "mssim")
 COMPARED = (
     "oidn 1/1",
     "light_transport_photons",
@@ -55,6 +55,7 @@ COMPARED = (
 BEFORE, AFTER = "light_transport_photons", "guided_transport"
 VIEWS = 3  # at most, of the first ones
 SIZE = 256  # px of a tile
+COLOURS = 256  # of a figure, which takes a third of the bytes so
 TEXT, TEXT_LINE = 24, 30  # px of letters, and from one line of text to the next
 REFERENCE = "reference"
 
@@ -160,12 +161,17 @@ def _wrap(head: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list
 def make_figures(name: str, report: Report, out: Path) -> None:
     """The figures of one room."""
     if Experiment.load(name, "small").part == "static":
-        shutil.copy(report.folder / OVERVIEW, out / f"{name}.png")
+        save(read_png(report.folder / OVERVIEW), out / f"{name}.png")
         return
     for metric in METRICS:
         shutil.copy(report.folder / f"time-{metric}.svg", out / f"{name}-time-{metric}.svg")
-    write_png(draw_predictions(report), out / f"{name}-predictions.png")
-    write_png(draw_worst_cases(report), out / f"{name}-worst.png")
+    save(draw_predictions(report), out / f"{name}-predictions.png")
+    save(draw_worst_cases(report), out / f"{name}-worst.png")
+
+
+def save(figure: Picture, path: Path) -> None:
+    """Write a PNG of few colours: small, as the documentation keeps it."""
+    Image.fromarray(figure).quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
 def main() -> int:

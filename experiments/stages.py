@@ -20,7 +20,7 @@ from bench.harness import results
 from experiments.experiment import Experiment, Run
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.files import write_whole
-from photonfarm.core.processes import command, tied
+from photonfarm.core.processes import command, tie
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format.markers import COMMITTED
@@ -230,7 +230,7 @@ class Stages:
         began = time.monotonic()
         verb = command(*map(str, arguments))
         with log.open("ab") as output:
-            code = subprocess.run(tied(verb), stdout=output, stderr=subprocess.STDOUT, check=False).returncode
+            code = subprocess.run(tie(verb), stdout=output, stderr=subprocess.STDOUT, check=False).returncode
         if code:
             last = log.read_text(errors="replace").strip().splitlines()[-1:]
             raise StageError(f"{self.experiment.name}: {stage} ended with exit code {code}; {log} says: {last}")

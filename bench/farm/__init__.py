@@ -1,1 +1,1 @@
-"""What workers, queue and plans cost, and what they withstand."""
+"""What workers and queue cost, and what they withstand."""

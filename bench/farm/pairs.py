@@ -16,9 +16,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bench.farm.account import planned
-from bench.farm.workers import make_sample
 from bench.harness.processes import Processes, answer
-from photonfarm.core.processes import tied
+from photonfarm.core.processes import tie
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.scene.spec_loading import load_spec
@@ -69,6 +68,19 @@ def cost_of_company(one: ConcurrentWork, two: ConcurrentWork) -> float:
     return sum(two.cpu_s[number] for number in same) / sum(one.cpu_s[number] for number in same)
 
 
+def make_sample(scene: Any, number: int) -> None:
+    """All that a worker renders for one sample; sample n is the same in every process."""
+    from photonfarm.scene.modification import sample_modification
+    from photonfarm.scene.view import sample_view
+
+    modification = sample_modification(scene.spec, 0, number)
+    view = sample_view(scene.spec, modification.key(scene.spec.radiance_id), 0, 0)
+    scene.apply(modification)
+    scene.buffers(view)
+    scene.photons(number)
+    scene.render_halves(view, (2 * number, 2 * number + 1))
+
+
 def farm(folder: Path, options: argparse.Namespace, count: int) -> ConcurrentWork:
     """Jobs of a number of workers in the steady state."""
     folder = Path(tempfile.mkdtemp(dir=folder))
@@ -77,7 +89,7 @@ def farm(folder: Path, options: argparse.Namespace, count: int) -> ConcurrentWor
         told = {"PHOTONFARM_STORE": str(folder / "store"), "PHOTONFARM_REDIS_URL": redis.url}
         verb = [sys.executable, "-m", "photonfarm.cli", "work", "--until-complete", "--quiet", "--name"]
         running = [
-            subprocess.Popen(tied([*verb, f"worker-{i}"]), env={**os.environ, **told}, stdin=subprocess.DEVNULL)
+            subprocess.Popen(tie([*verb, f"worker-{i}"]), env={**os.environ, **told}, stdin=subprocess.DEVNULL)
             for i in range(count)
         ]
         codes = [process.wait() for process in running]
@@ -100,7 +112,7 @@ def ends_of_jobs(scene: SceneStore) -> Sequence[Sequence[End]]:
     """Every worker's, in order, by the times of the markers and what is in them."""
     found: dict[str, list[End]] = {}
     for job in scene.committed_jobs():
-        placed = scene.storage.local(markers.name_of(scene.name, job)).stat().st_mtime
+        placed = scene.storage.local(markers.marker_name(scene.name, job)).stat().st_mtime
         figures = scene.marker(job)["figures"]
         found.setdefault(figures["worker"], []).append(End(placed, job, figures["core_s"]))
     return [sorted(ends) for ends in found.values()]

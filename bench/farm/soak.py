@@ -79,7 +79,7 @@ def main() -> int:
         found = soak.Soak(Path(folder), jobs=jobs, workers=options.workers, pause_s=PAUSE_S, seed=options.seed).run(
             wanted, pace_s=PACE_S, long_outage_s=outage_s
         )
-    results.write("soak", page(found, options.workers, outage_s), asdict(found), options.out)
+    results.write("soak", page(found, options.workers, outage_s), asdict(found), options.out, page="farm")
     for difference in found.differences:
         print(difference, file=sys.stderr)
     return 1 if found.differences else 0

@@ -27,7 +27,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
 from photonfarm.store.format.schema import RowKind, output_arrays
-from photonfarm.store.format.shards import NOISY_GUIDES, encode, rounded
+from photonfarm.store.format.shards import NOISY_GUIDES, encode, round_to_8_bits
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
 
@@ -224,7 +224,9 @@ def view_row(buffers: ViewBuffers, visibility: Visibility) -> dict[str, Any]:
 
 
 def _guides(guides: Guides) -> dict[str, Any]:
-    return {name: rounded(values) if name in NOISY_GUIDES else values for name, values in arrays_of(guides).items()}
+    return {
+        name: round_to_8_bits(values) if name in NOISY_GUIDES else values for name, values in arrays_of(guides).items()
+    }
 
 
 def _radiance(halves: F32, spec: SceneSpec) -> Mapping[str, F32]:

@@ -1,4 +1,4 @@
-"""What all benchmarks do alike: their options, and their page docs/results/NAME.md with NAME.json, signed."""
+"""What all benchmarks do alike: their options, and their part of a page of docs/results with NAME.json, signed."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import platform
+import re
 import shlex
 import statistics
 import subprocess
@@ -28,17 +29,29 @@ def parser(about: str | None) -> argparse.ArgumentParser:
 
 
 def write(name: str, text: str, values: dict[str, Any], out: Path, page: str = "") -> None:
-    """Save the page of bench/*/NAME.py, signed in its last line, and its figures; both are named NAME or `page`."""
+    """Save the part of bench/*/NAME.py, signed in its last line, in NAME.md or PAGE.md; its figures in NAME.json."""
     document = {"command": command(name), "commit": commit(), "machine": machine(), **values}
-    save(page or name, f"{text}\n\n{footer(name)}", document, out)
+    save(page or name, f"{text}\n\n{footer(name)}", document, out, stem=name)
 
 
-def save(stem: str, text: str, document: dict[str, Any], out: Path) -> None:
-    """Write a page and its figures into a folder as STEM.md and STEM.json; print the page."""
+def save(page: str, text: str, document: dict[str, Any], out: Path, stem: str = "") -> None:
+    """Write a part of PAGE.md into a folder, and its figures as STEM.json (PAGE.json); print the part.
+
+    A page may hold several parts, each below a title of its own (`# …`). The part with this title is replaced, else the
+    text is put at the end; the others stay.
+    """
     out.mkdir(parents=True, exist_ok=True)
-    (out / f"{stem}.md").write_text(text + "\n", encoding="utf-8")
-    (out / f"{stem}.json").write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+    file = out / f"{page}.md"
+    parts = _parts(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    parts |= _parts(text)
+    file.write_text("\n\n".join(parts.values()) + "\n", encoding="utf-8")
+    (out / f"{stem or page}.json").write_text(json.dumps(document) + "\n", encoding="utf-8")
     print(text)
+
+
+def _parts(text: str) -> dict[str, str]:
+    """The parts of a page by their titles, in order."""
+    return {part.partition("\n")[0]: part.strip() for part in re.split(r"^(?=# )", text, flags=re.MULTILINE) if part}
 
 
 def command(name: str) -> str:

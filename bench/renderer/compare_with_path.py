@@ -2,7 +2,7 @@
 
     python -m bench.renderer.compare_with_path [--scene cornell glass_caustic kitchen] [--out DIR] [--pictures DIR]
 
-A scene is a name of `bench.stability.scenes.hard_scenes`, a folder under $PHOTONFARM_SCENES, or a path of a
+A scene is a name of `tests.stability.scenes.hard_scenes`, a folder under $PHOTONFARM_SCENES, or a path of a
 Mitsuba XML file. Per scene, independent renders of either integrator are compared: block z-test (16×16 blocks), ratio
 of the means. Verdict: |z| < 4.5 in every block, and means within 0.5 % (or within 3 standard errors where these are
 wider, marked «noisy»). Exit code 0 if every scene passes, 1 otherwise, 2 if a scene is unknown

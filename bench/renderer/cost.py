@@ -177,7 +177,7 @@ def main() -> int:
     backend.load(threads=1)
     import mitsuba as mi
 
-    from bench.stability.scenes.hard_scenes import HARD_SCENES
+    from tests.stability.scenes.hard_scenes import HARD_SCENES
 
     if options.scene not in HARD_SCENES:
         parser.error(f"--scene {options.scene}: is none of {', '.join(sorted(HARD_SCENES))}")

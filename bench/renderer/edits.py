@@ -220,7 +220,7 @@ def main() -> int:
     measured = [measure(name, options.modifications, options.warm_up) for name in options.spec]
     text = page([line(*found) for found in measured], options.modifications, options.warm_up)
     values = {"warm_up": options.warm_up, "specs": [summary(*found, options.modifications) for found in measured]}
-    results.write("edits", text, values, options.out)
+    results.write("edits", text, values, options.out, page="cost")
     return int(any(figures.new_after for _, figures in measured))
 
 

@@ -259,7 +259,7 @@ def main() -> int:
             print(f"rays: {error}", file=sys.stderr)
             return 2
         gc.collect()
-    results.write("rays", page(rows, options), {"rows": [asdict(row) for row in rows]}, options.out)
+    results.write("rays", page(rows, options), {"rows": [asdict(row) for row in rows]}, options.out, page="cost")
     return 0
 
 

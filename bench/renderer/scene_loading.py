@@ -35,7 +35,7 @@ def scene_loaders() -> dict[str, Callable[[int], Any]]:
     """Name → function of the image size that loads the scene. Other packages' scenes are added here."""
     import mitsuba as mi
 
-    from bench.stability.scenes.hard_scenes import HARD_SCENES
+    from tests.stability.scenes.hard_scenes import HARD_SCENES
 
     def loader(build: Callable[[int], Any]) -> Callable[[int], Any]:
         return lambda size: mi.load_dict(build(size), optimize=False)

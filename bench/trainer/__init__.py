@@ -1,1 +1,1 @@
-"""What networks cost, and what they learn."""
+"""What a training step costs, and which optimiser is best."""

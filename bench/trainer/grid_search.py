@@ -33,7 +33,7 @@ from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.keys import Key, make_key
 from photonfarm.core.models import sentences
 from photonfarm.core.processes import Stop
-from photonfarm.core.statistics import Estimate, group_means, stated
+from photonfarm.core.statistics import Estimate, format_estimate, group_means
 from photonfarm.plan.hold_out import rows_held_out, units_of
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, Store
@@ -133,7 +133,7 @@ def table(cells: Sequence[Cell]) -> str:
     rows = []
     for cell in ranked:
         behind = _stated(cell.behind(ranked[0])) if cell.per_unit and cell is not ranked[0] else ""
-        picked = stated(cell.rank, None) if cell.picked_by else ""
+        picked = format_estimate(cell.rank, None) if cell.picked_by else ""
         rows.append([*map(str, cell.changes.values()), picked, _stated(cell.error), behind])
     return format_markdown_table([*keys, "picked by", "held-out error", "more than the best"], rows)
 
@@ -173,7 +173,7 @@ def _name(changes: Mapping[str, Any]) -> str:
 
 
 def _stated(estimate: Estimate | None) -> str:
-    return "diverged" if estimate is None else stated(estimate.mean, estimate.standard_error)
+    return "diverged" if estimate is None else format_estimate(estimate.mean, estimate.standard_error)
 
 
 # ------------------------------------------------------------------------------------------------------------- one cell

@@ -27,7 +27,7 @@ from photonfarm.core.records import arrays_of
 from photonfarm.data import Scene, open_scene
 from photonfarm.plan.hold_out import are_held_out
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.store.format.shards import NOISY_GUIDES, round_to_8_bits
 from photonfarm.store.read.find import Query, find_samples
 
 
@@ -213,7 +213,9 @@ def test_guides_come_with_samples_unless_the_scene_is_opened_without(tmp_path: P
     for row in (4, 5):
         sample = scene[row]
         for name, values in arrays_of(samples.guides(written.spec, row)).items():
-            np.testing.assert_array_equal(getattr(sample, name), rounded(values) if name in NOISY_GUIDES else values)
+            np.testing.assert_array_equal(
+                getattr(sample, name), round_to_8_bits(values) if name in NOISY_GUIDES else values
+            )
             np.testing.assert_array_equal(getattr(sample, name), getattr(sample.guides, name))
     assert scene.torch()[5]["direct"].shape == (8, 8, 3)
     assert without[5].guides is None

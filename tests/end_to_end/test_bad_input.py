@@ -14,7 +14,7 @@ import pytest
 
 from photonfarm.cli.main import main
 from photonfarm.core.errors import SpecError
-from photonfarm.farm.submission import check_hold_out, chosen_hold_out, submit
+from photonfarm.farm.submission import check_hold_out, choose_hold_out, submit
 from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs.render import ShardRenderer
@@ -182,7 +182,7 @@ def test_up_counts_what_is_planned_already_when_it_checks_the_hold_out(here, tmp
 @pytest.mark.parametrize("count", range(2, 14))
 def test_up_holds_out_enough_of_a_small_plan(tmp_path: Path, spec: str, count: int) -> None:
     loaded, wanted = load_spec(spec), Request(modifications=count)
-    share = chosen_hold_out(loaded, tmp_path / "none", wanted)
+    share = choose_hold_out(loaded, tmp_path / "none", wanted)
     check_hold_out(loaded, tmp_path / "none", share, wanted)
     with contextlib.suppress(SpecError):
         check_hold_out(loaded, tmp_path / "none", HOLD_OUT, wanted)

@@ -1,12 +1,11 @@
-"""The files for Kubernetes, read as YAML: they agree with the compose file, the code, and each other.
+"""What the chart renders, read as YAML: it agrees with the compose file, the code, and itself.
 
-The files of deploy/kustomize are what the chart renders, so these tests need no tool of Kubernetes;
-tests/end_to_end/test_kubernetes.py asks those.
+`chart_rendered.yaml` holds what `helm template` prints, so these tests need no Helm. Where there is Helm,
+test_kubernetes.py compares the file with the chart.
 """
 
 import json
 import re
-import runpy
 import tomllib
 from collections.abc import Iterator
 from itertools import pairwise
@@ -21,37 +20,38 @@ from photonfarm.farm.running_farm import METRICS_PORT
 from photonfarm.queue.rq_adapter import open_queue
 
 ROOT = Path(__file__).parents[2]
-CHART, KUSTOMIZE = ROOT / "deploy/helm/photonfarm", ROOT / "deploy/kustomize"
+CHART = ROOT / "deploy/helm/photonfarm"
 COMPOSE = yaml.safe_load((ROOT / "docker-compose.yml").read_text())
 VERSION = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
 
-DOCUMENTS: list[dict[str, Any]] = [
-    document
-    for path in sorted(KUSTOMIZE.glob("*/*.yaml"))
-    if path.name != "kustomization.yaml"
-    for document in yaml.safe_load_all(path.read_text())
-]
+DOCUMENTS: list[dict[str, Any]] = [*yaml.safe_load_all(Path(__file__).with_name("chart_rendered.yaml").read_text())]
 
 
-def pod_of(document: dict[str, Any]) -> dict[str, Any] | None:
+def find_pod(document: dict[str, Any]) -> dict[str, Any] | None:
     """The template of a document's pods."""
     spec = document.get("spec", {})
     spec = spec["jobTemplate"]["spec"] if document["kind"] == "CronJob" else spec
     return spec.get("template")
 
 
-PODS = {document["metadata"]["name"]: pod for document in DOCUMENTS if (pod := pod_of(document)) is not None}
+def get_name(document: dict[str, Any]) -> str:
+    """The name of a document; of a Job without the digest of what it runs."""
+    name: str = document["metadata"]["name"]
+    return re.sub(r"-[0-9a-f]{8}$", "", name) if document["kind"] == "Job" else name
 
 
-def containers() -> Iterator[tuple[str, dict[str, Any]]]:
+PODS = {get_name(document): pod for document in DOCUMENTS if (pod := find_pod(document)) is not None}
+
+
+def list_containers() -> Iterator[tuple[str, dict[str, Any]]]:
     """Every container, with the name of what runs it."""
     return ((name, container) for name, pod in PODS.items() for container in pod["spec"]["containers"])
 
 
-def named(kind: str, name: str) -> dict[str, Any]:
+def find(kind: str, name: str) -> dict[str, Any]:
     """One document."""
-    (found,) = [d for d in DOCUMENTS if (d["kind"], d["metadata"]["name"]) == (kind, name)]
-    return found
+    (document,) = [d for d in DOCUMENTS if (d["kind"], get_name(d)) == (kind, name)]
+    return document
 
 
 def test_there_are_the_parts_of_the_farm_and_no_others() -> None:
@@ -61,20 +61,17 @@ def test_there_are_the_parts_of_the_farm_and_no_others() -> None:
 
 def test_the_images_are_those_of_the_compose_file_in_a_registry_that_nobody_has() -> None:
     ours = {service["image"] for service in COMPOSE["services"].values()}
-    assert {container["image"] for _, container in containers()} == {f"localhost/{image}:{VERSION}" for image in ours}
+    images = {container["image"] for _, container in list_containers()}
+    assert images == {f"localhost/{image}:{VERSION}" for image in ours}
     assert yaml.safe_load((CHART / "Chart.yaml").read_text())["appVersion"] == VERSION
-    renamed = yaml.safe_load((KUSTOMIZE / "kustomization.yaml").read_text())["images"]
-    assert {(image["name"], image["newTag"]) for image in renamed} == {(f"localhost/{i}", VERSION) for i in ours}
 
 
 def test_every_command_and_probe_of_photonfarm_has_a_verb_and_options_that_there_are(parse) -> None:
-    lines = [container["command"] for _, container in containers()]
-    probes = [c[probe] for _, c in containers() for probe in c if probe.endswith("Probe")]
+    lines = [container["command"] for _, container in list_containers()]
+    probes = [c[probe] for _, c in list_containers() for probe in c if probe.endswith("Probe")]
     lines += [probe["exec"]["command"] for probe in probes if "exec" in probe]
-    for patch in yaml.safe_load((KUSTOMIZE / "kustomization.yaml").read_text())["patches"]:
-        lines += [operation["value"] for operation in yaml.safe_load(patch["patch"])]
     ours = [line[1:] for line in lines if line[0] == "photonfarm"]
-    assert len(ours) == len(PODS) - 1 + 2 + 1  # all but Redis, two probes and a patch
+    assert len(ours) == len(PODS) - 1 + 2  # all but Redis, and two probes
     for arguments in ours:
         parse(arguments)
 
@@ -96,7 +93,7 @@ def test_variables_are_those_of_the_compose_file_and_on_the_page_of_the_configur
         **COMPOSE["services"]["renderer"]["environment"],
         "PHOTONFARM_REDIS_URL": "redis://photonfarm-redis:6379/0",
     }
-    for name, container in containers():
+    for name, container in list_containers():
         variables = {variable["name"]: variable["value"] for variable in container["env"] if "value" in variable}
         assert variables == ({"REDIS_DATA": "/queue"} if name == "photonfarm-redis" else wanted)
     in_templates = "".join(path.read_text() for path in (CHART / "templates").iterdir())
@@ -126,9 +123,9 @@ def test_a_pod_is_nobody_in_particular_and_writes_to_nothing_but_its_volumes(nam
 
 
 def test_the_network_policies_cover_every_pod_and_let_the_farm_reach_nothing_but_redis_and_names() -> None:
-    redis, farm = (named("NetworkPolicy", f"photonfarm-{part}")["spec"] for part in ("redis", "farm"))
+    redis, farm = (find("NetworkPolicy", f"photonfarm-{part}")["spec"] for part in ("redis", "farm"))
     component = "app.kubernetes.io/component"
-    metrics = named("NetworkPolicy", "photonfarm-metrics")["spec"]
+    metrics = find("NetworkPolicy", "photonfarm-metrics")["spec"]
     covered = farm["podSelector"]["matchExpressions"][0]["values"]
     labels = {name: pod["metadata"]["labels"] for name, pod in PODS.items()}
     assert {label[component] for label in labels.values()} == {"redis", *covered}
@@ -139,7 +136,8 @@ def test_the_network_policies_cover_every_pod_and_let_the_farm_reach_nothing_but
     assert "egress" not in redis
     assert "ingress" not in farm
     (entry,) = redis["ingress"]
-    assert [peer["podSelector"] for peer in entry["from"]] == [farm["podSelector"]]
+    keda = {"namespaceSelector": {"matchLabels": {"kubernetes.io/metadata.name": "keda"}}}
+    assert entry["from"] == [{"podSelector": farm["podSelector"]}, keda]
     to_redis, names = farm["egress"]
     assert to_redis["to"] == [{"podSelector": redis["podSelector"]}]
     assert {port["port"] for port in names["ports"]} == {53}
@@ -152,7 +150,10 @@ def test_the_network_policies_cover_every_pod_and_let_the_farm_reach_nothing_but
 
 def test_metrics_are_answered_by_the_names_that_a_prometheus_of_the_cluster_asks_by(parse) -> None:
     """The server answers to no other name: by the Service's, or the pod's address where pods are found one by one."""
-    service, (container,) = named("Service", "photonfarm-metrics"), PODS["photonfarm-metrics"]["spec"]["containers"]
+    service, (container,) = (
+        find("Service", "photonfarm-metrics"),
+        PODS["photonfarm-metrics"]["spec"]["containers"],
+    )
     arguments = container["command"][1:]
     parse(arguments)
     names = {value for option, value in pairwise(arguments) if option == "--name"}
@@ -167,13 +168,13 @@ def test_metrics_are_answered_by_the_names_that_a_prometheus_of_the_cluster_asks
 
 def test_keda_watches_the_queue_and_the_started_jobs_of_the_redis_that_there_is(connection: Redis) -> None:
     scaled, access = (
-        named(*of) for of in (("ScaledObject", "photonfarm-renderer"), ("TriggerAuthentication", "photonfarm-redis"))
+        find(*of) for of in (("ScaledObject", "photonfarm-renderer"), ("TriggerAuthentication", "photonfarm-redis"))
     )
     jobs = open_queue(connection)
     watched = [trigger["metadata"]["listName"] for trigger in scaled["spec"]["triggers"]]
     assert watched == [jobs.key, jobs.started_job_registry.key]
-    assert named("Deployment", scaled["spec"]["scaleTargetRef"]["name"])
-    service = named("Service", "photonfarm-redis")
+    assert find("Deployment", scaled["spec"]["scaleTargetRef"]["name"])
+    service = find("Service", "photonfarm-redis")
     for trigger in scaled["spec"]["triggers"]:
         assert trigger["metadata"]["address"] == "photonfarm-redis.photonfarm.svc:6379"
         assert trigger["authenticationRef"]["name"] == access["metadata"]["name"]
@@ -181,48 +182,27 @@ def test_keda_watches_the_queue_and_the_started_jobs_of_the_redis_that_there_is(
     keys = {entry["parameter"]: entry["key"] for entry in access["spec"]["secretTargetRef"]}
     assert keys == {"username": "username", "password": "redis_password"}
     assert scaled["spec"]["minReplicaCount"] == 0
-    assert named("CronJob", "photonfarm-reconcile"), "nothing would wake the workers again"
+    assert find("CronJob", "photonfarm-reconcile"), "nothing would wake the workers again"
 
 
 def test_every_value_has_a_schema_and_every_schema_a_value() -> None:
     values = yaml.safe_load((CHART / "values.yaml").read_text())
     schema = json.loads((CHART / "values.schema.json").read_text())
-    assert keys_of_schema(schema, schema) - {"global"} == keys_of(values)
+    assert list_schema_keys(schema, schema) - {"global"} == list_keys(values)
 
 
-def keys_of(values: dict[str, Any], before: str = "") -> set[str]:
+def list_keys(values: dict[str, Any], before: str = "") -> set[str]:
     """The dotted keys of values, as deep as they are the chart's."""
-    found = set()
+    keys = set()
     for key, value in values.items():
         free = key in {"resources", "nodeSelector"}
-        found |= keys_of(value, f"{before}{key}.") if isinstance(value, dict) and not free else {before + key}
-    return found
+        keys |= list_keys(value, f"{before}{key}.") if isinstance(value, dict) and not free else {before + key}
+    return keys
 
 
-def keys_of_schema(schema: dict[str, Any], root: dict[str, Any], before: str = "") -> set[str]:
+def list_schema_keys(schema: dict[str, Any], root: dict[str, Any], before: str = "") -> set[str]:
     """The same of the schema; what lies below a reference is not the chart's."""
-    found = set()
+    keys = set()
     for key, value in schema["properties"].items():
-        found |= keys_of_schema(value, root, f"{before}{key}.") if "properties" in value else {before + key}
-    return found
-
-
-def test_podman_gets_pods_whose_volumes_are_their_own_and_whose_ports_nobody_reaches() -> None:
-    convert = runpy.run_path(str(ROOT / "scripts/podman_pods.py"))["podman_documents"]
-    left_out: list[str] = []
-    made = list(convert(DOCUMENTS, left_out))
-    pods = {document["metadata"]["name"]: document["spec"] for document in made if document["kind"] == "Pod"}
-    assert set(pods) == {
-        *(f"photonfarm-{part}" for part in ("metrics", "plan-first", "redis", "renderer-0", "renderer-1", "trainer"))
-    }
-    assert [document["kind"] for document in made if document["kind"] != "Pod"] == ["PersistentVolumeClaim"]
-    assert {name.partition("/")[0] for name in left_out} == {
-        "CronJob", "NetworkPolicy", "ScaledObject", "Service", "TriggerAuthentication",
-    }  # fmt: skip
-    own = [volume["name"] for spec in pods.values() for volume in spec["volumes"] if "emptyDir" in volume]
-    assert len(own) == len(set(own)) == len(pods) + 1  # a /tmp each, and Redis's journal
-    for spec in pods.values():
-        (container,) = spec["containers"]
-        assert "ports" not in container
-        assert {mount["name"] for mount in container["volumeMounts"]} == {v["name"] for v in spec["volumes"]}
-    assert [pods[f"photonfarm-{part}"]["restartPolicy"] for part in ("redis", "trainer")] == ["Always", "OnFailure"]
+        keys |= list_schema_keys(value, root, f"{before}{key}.") if "properties" in value else {before + key}
+    return keys

@@ -47,7 +47,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["train", "--help"], HEAVY | {"numpy", "redis", "rq"}),
         (["scene", "plan", "--help"], HEAVY | {"numpy", "redis", "rq", "pydantic"}),
         (["scene", "show", "room"], HEAVY | {"redis", "rq"}),
-        (["status"], HEAVY - {"zarr"} | {"redis", "rq", "awscrt"}),  # nothing listens there
+        (["status"], HEAVY - {"zarr"} | {"redis", "rq"}),  # nothing listens there
         (["store", "find"], HEAVY - {"zarr"} | {"redis", "rq"}),
         (["submit", "room", "--dry-run", "--no-measure"], HEAVY - {"zarr"}),
     ],

@@ -17,7 +17,7 @@ import zarr
 
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.format.markers import name_of
+from photonfarm.store.format.markers import marker_name
 
 CHILD = """
 import os, sys
@@ -127,7 +127,7 @@ class Watcher:
 
 def marker_of(scene: SceneStore, job: int) -> bytes:
     """A job's marker, byte for byte: it names the worker and the seconds, in which two commits of a job differ."""
-    return scene.storage.read(name_of(scene.name, job))
+    return scene.storage.read(marker_name(scene.name, job))
 
 
 def differences(scene: SceneStore, clean: Path, journal: Journal, watcher: Watcher) -> list[str]:

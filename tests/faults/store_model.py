@@ -13,7 +13,7 @@ from photonfarm.plan.request import UNUSED, PlannedContent, Request, expand, sam
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, SceneStore
-from photonfarm.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.store.format.shards import NOISY_GUIDES, round_to_8_bits
 
 # ------------------------------------------------------------------------------ what is rendered: a function of content
 
@@ -162,7 +162,7 @@ def compare(reader: SceneReader, row: int, model: Model) -> bytes:
     for name, values in arrays_of(buffers_of(model.spec, modification, view)).items():
         np.testing.assert_array_equal(getattr(sample.buffers, name), values, name)
     for name, values in arrays_of(guides_of(model.spec, modification, view)).items():
-        expected = rounded(values) if name in NOISY_GUIDES else values
+        expected = round_to_8_bits(values) if name in NOISY_GUIDES else values
         np.testing.assert_array_equal(getattr(sample.guides, name), expected, name)
     if model.spec.photons.paths:
         stored = arrays_of(reader.read_photons(row))

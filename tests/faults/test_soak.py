@@ -10,7 +10,7 @@ import soaking
 
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.format.markers import name_of
+from photonfarm.store.format.markers import marker_name
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 
@@ -34,7 +34,7 @@ def replace_marker(scene: SceneStore, folder: Path) -> None:
     """Act as a commit would that ignores the one before it."""
     part = scene.storage.part()
     part.write_text(json.dumps({**scene.marker(0), "figures": {**scene.marker(0)["figures"], "worker": "second"}}))
-    scene.storage.adopt(part, name_of(scene.name, 0), replace=True)
+    scene.storage.adopt(part, marker_name(scene.name, 0), replace=True)
 
 
 def say_a_second_commit(scene: SceneStore, folder: Path) -> None:
@@ -55,7 +55,7 @@ def leave_a_part(scene: SceneStore, folder: Path) -> None:
 
 
 def take_a_marker(scene: SceneStore, folder: Path) -> None:
-    scene.storage.local(name_of(scene.name, 1)).unlink()
+    scene.storage.local(marker_name(scene.name, 1)).unlink()
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from photonfarm.plan.request import Request
 from photonfarm.queue import connect, reconcile
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
-from photonfarm.store.write.lease import leases
+from photonfarm.store.model.lease import read_leases
 
 pytestmark = pytest.mark.skipif(not Path("/proc").is_dir(), reason="finds the workers' children through /proc")
 
@@ -134,7 +134,7 @@ def test_a_farm_whose_store_is_mended_undone_and_joined_under_load_has_everythin
             worker.send_signal(signal.SIGTERM)
         assert [worker.wait(60) for worker in workers] == [0, 0, 0]
     assert all(load.done[name] for name in ("repair", "withdraw", "join", "forget")), load.done
-    assert leases(load.store.storage) == {}
+    assert read_leases(load.store.storage) == {}
     report = check_store(Store(load.store.root), when="now")
     assert report.exit_code == 0, report
     for spec in load.specs:

@@ -83,6 +83,7 @@ class Scene:
     def everything(self):
         found = {}
         if (self.folder / "base/zarr.json").exists():
+            check_metadata(self.folder / "base")
             for group in ("geometry", "cloud"):
                 for array in arrays_in(self.folder / "base" / group):
                     found[f"base/{group}/{array.name}"] = self.read(array)
@@ -160,6 +161,7 @@ class Plan:
         self.folder = folder
         self.attributes = attributes = document(folder / "zarr.json")["attributes"]
         assert (attributes["format"], attributes["version"], attributes["parts"]) == ("photonfarm store", 5, 2)
+        check_metadata(folder)
         withdrawn = folder.with_name(f"{folder.name}.withdrawn.json")
         self.withdrawn = document(withdrawn)["jobs"] if withdrawn.exists() else []
         self.shard_rows = attributes["shard_rows"]
@@ -180,6 +182,15 @@ def arrays_in(folder: Path):
 
 def crc32c(data: bytes) -> bytes:
     return int(google_crc32c.value(data)).to_bytes(4, "little")
+
+
+def check_metadata(folder: Path):
+    """Checks each zarr.json of a group against the group's checksums."""
+    for name, checksum in document(folder / "zarr.json")["attributes"]["checksums"].items():
+        content = (folder / name).read_bytes()
+        if name == "zarr.json":
+            content = content.replace(f'"zarr.json": "{checksum}"'.encode(), b'"zarr.json": "00000000"')
+        assert crc32c(content).hex() == checksum
 
 
 def checksum_of_shard(data: bytes, shard_rows: int) -> str:

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from photonfarm.core.processes import tied
+from photonfarm.core.processes import tie
 
 KEYS = {"AWS_ACCESS_KEY_ID": "photonfarm", "AWS_SECRET_ACCESS_KEY": "not-a-secret", "AWS_REGION": "us-east-1"}
 PORTS = ("master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port", "filer.port.grpc",
@@ -52,7 +52,7 @@ def running(folder: Path, bind: str = "127.0.0.1") -> Iterator[int]:
         "s3.port.lance": 0, "filer.localSocket": folder / "filer", "s3.localSocket": folder / "s3",
     }  # fmt: skip
     command = [weed, "-logtostderr=true", "server", "-s3", *(f"-{name}={value}" for name, value in options.items())]
-    with (folder / "log").open("wb") as log, subprocess.Popen(tied(command), stdout=log, stderr=log) as process:
+    with (folder / "log").open("wb") as log, subprocess.Popen(tie(command), stdout=log, stderr=log) as process:
         try:
             wait_until_up(ports["s3.port"], process, folder / "log")
             yield ports["s3.port"]

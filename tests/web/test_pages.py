@@ -173,8 +173,8 @@ def test_pictures_are_the_stored_images_at_the_specs_exposure(server: PageServer
     sample, base = samples.reader_of(scene).read(4), f"/sample/{scene.scene_id}/4"
     for name, radiance in (("a", sample.radiance[0]), ("b", sample.radiance[1]), ("mean", sample.radiance.mean(0))):
         assert np.array_equal(picture(server, f"{base}/{name}.png"), pictures.display(radiance, 0.7)), name
-    assert np.array_equal(picture(server, f"{base}/albedo.png"), pictures.of_albedo(sample.buffers.albedo))
-    assert np.array_equal(picture(server, f"{base}/normal.png"), pictures.of_normal(sample.buffers.normal))
+    assert np.array_equal(picture(server, f"{base}/albedo.png"), pictures.draw_albedo(sample.buffers.albedo))
+    assert np.array_equal(picture(server, f"{base}/normal.png"), pictures.draw_normal(sample.buffers.normal))
     assert np.array_equal(picture(server, f"{base}/noise.png"), images.draw_noise(sample.radiance))
     assert picture(server, f"{base}/thumbnail.jpg").shape == (8, 16, 3)
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 STYLES = {
     "path": ("tab:gray", "o", "path"),
@@ -15,6 +18,8 @@ STYLES = {
     "pyluxcore": ("tab:green", "v", "pyluxcore BIDIR"),
 }
 """Colour, marker and name of each method."""
+
+COLOURS = 64  # of the picture: lines and letters need no more
 
 
 def save(result: dict[str, Any], path: Path, clock: str) -> None:
@@ -42,7 +47,9 @@ def save(result: dict[str, Any], path: Path, clock: str) -> None:
     axes[0].set_ylabel("relMSE")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=len(STYLES), fontsize=8)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=100, metadata={"Software": None})
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=100, metadata={"Software": None})
+    Image.open(drawn).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
     plt.close(figure)
 
 

@@ -205,7 +205,7 @@ def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
 
     opened = Store(store)
     with queue.connect(redis_url) as connection:
-        show.queued(queue.reconcile(opened, connection), as_json)
+        show.print_queued(queue.reconcile(opened, connection), as_json)
 
 
 @click.command("redis")
@@ -254,8 +254,8 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
 
     Ctrl-C stops it within seconds; the same command goes on from there.
     """
-    from photonfarm.cli.show_up import FarmTalk
-    from photonfarm.farm.devices import AUTO, CPU, DEVICE_VARIABLE, cards_here, of_workers
+    from photonfarm.cli.show_watch import FarmTalk
+    from photonfarm.farm.devices import AUTO, CPU, DEVICE_VARIABLE, cards_here, worker_devices
     from photonfarm.farm.up import WORKERS, run_farm, trainer_arguments
 
     try:
@@ -264,7 +264,7 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
             trainer = {name: options[name] for name in ("run", "train_steps")}
             arguments = trainer_arguments(spec, hold_out=options["hold_out"] or HOLD_OUT, **trainer)
             _check_arguments(arguments, "torch", "train", "--train-steps 0 renders only")
-        devices = of_workers(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())
+        devices = worker_devices(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())
         options["workers"] = options["workers"] or (WORKERS if devices == (CPU,) else len(devices))
         run_farm(spec, store, request, FarmTalk(), devices=devices, **options)
     except KeyboardInterrupt:

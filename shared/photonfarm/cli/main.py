@@ -33,7 +33,7 @@ _BARE = {"store": "Look into the sample store, check it, and repair it."}
 
 
 @cache
-def _installed() -> dict[str, EntryPoint]:
+def _find_verbs() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
@@ -47,7 +47,7 @@ class Suggesting(click.Group):
         name = args[0]
         if self.get_command(ctx, name) is None and not ctx.resilient_parsing:
             near = difflib.get_close_matches(name, self.list_commands(ctx))
-            near += [known.replace(".", " ") for known in sorted(_installed()) if known.endswith(f".{name}")]
+            near += [known.replace(".", " ") for known in sorted(_find_verbs()) if known.endswith(f".{name}")]
             hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
             raise click.UsageError(f"No such command {name!r}.{hint}", ctx)
         return super().resolve_command(ctx, args)
@@ -58,16 +58,16 @@ class Umbrella(Suggesting):
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """The installed verbs."""
-        return sorted({name.partition(".")[0] for name in _installed()})
+        return sorted({name.partition(".")[0] for name in _find_verbs()})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """The verb, imported only now."""
         if cmd_name not in self.list_commands(ctx):
             return None
-        entry = _installed().get(cmd_name)
+        entry = _find_verbs().get(cmd_name)
         command = None if entry is None else entry.load()
         prefix = f"{cmd_name}."
-        below = {name.removeprefix(prefix): sub for name, sub in _installed().items() if name.startswith(prefix)}
+        below = {name.removeprefix(prefix): sub for name, sub in _find_verbs().items() if name.startswith(prefix)}
         return Extended(cmd_name, command, below) if below else command
 
 
@@ -134,11 +134,11 @@ def umbrella(ctx: click.Context, config: Path) -> None:
     if named or config.is_file():
         ctx.default_map = file_defaults(config, options_by_command(umbrella))
     if ctx.get_parameter_source("config") is ParameterSource.COMMANDLINE:
-        ctx.with_resource(_told_to_child_processes(config))
+        ctx.with_resource(_tell_child_processes(config))
 
 
 @contextmanager
-def _told_to_child_processes(config: Path) -> Iterator[None]:
+def _tell_child_processes(config: Path) -> Iterator[None]:
     """Name the configuration file in our environment, so that verbs that this verb starts read the same one."""
     before = os.environ.get(CONFIG_VARIABLE)
     os.environ[CONFIG_VARIABLE] = str(config.absolute())

@@ -80,9 +80,9 @@ def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
         _refuse_password(url)
     if (file := password_file()) is None:
         return url
-    from photonfarm.queue import with_password_of
+    from photonfarm.queue import add_password
 
-    return with_password_of(file, url)
+    return add_password(file, url)
 
 
 def optional_redis_option(help_text: str) -> Callable[[Command], Command]:

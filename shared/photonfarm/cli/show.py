@@ -12,7 +12,7 @@ from rich import markup
 from rich.console import Console
 from rich.table import Table
 
-from photonfarm.core.waiting import in_words
+from photonfarm.core.waiting import format_span
 from photonfarm.scene.spec import SceneSpec, shape_ids
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
 
 
-def queued(jobs: int, as_json: bool) -> None:
+def print_queued(jobs: int, as_json: bool) -> None:
     """Print how many jobs `reconcile` has queued."""
     if as_json:
         print_json({"queued": jobs})
@@ -134,7 +134,7 @@ def _cost(result: DryRun) -> None:
         click.echo(size)
         return
     cores = "1 core" if result.cores == 1 else f"{result.cores} cores"
-    click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {in_words(result.wall_s)} on the {cores} here")
+    click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {format_span(result.wall_s)} on the {cores} here")
     if result.planned:
         click.echo(_suggestion(result))
 

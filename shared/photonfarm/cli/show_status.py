@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photonfarm.cli.show import print_json, print_table
-from photonfarm.core.waiting import in_words
+from photonfarm.core.waiting import format_span
 from photonfarm.farm.running_farm import RunningFarm
 from photonfarm.farm.status import RECENT_S, NoQueue, StoreQueue, idle, lost_plan, unread_markers
 from photonfarm.farm.training import TrainingProgress
@@ -93,8 +93,8 @@ def _without_redis(missing: int, since_commit_s: float | None) -> str:
         return "none is needed: all that is planned is there"
     if since_commit_s is not None and since_commit_s <= RECENT_S:
         return (
-            f"none is known here, but a job was committed {in_words(since_commit_s)} ago, so workers without Redis may "
-            f"be at work (`work --share`, `slurm`); {missing} samples are missing"
+            f"none is known here, but a job was committed {format_span(since_commit_s)} ago, so workers without Redis "
+            f"may be at work (`work --share`, `slurm`); {missing} samples are missing"
         )
     return f"no farm is at work here; `photonfarm up` goes on with the {missing} samples that are missing"
 
@@ -107,11 +107,11 @@ def _known_queue(found: StoreQueue, scenes: Sequence[SceneStatus], store: str | 
     click.echo(
         f"queue: {status.queued} queued, {status.running} running, {status.workers} workers, {failed} failed"
         + (f", of which {aside} are set aside until `photonfarm submit --retry`" if aside else "")
-        + (f"; about {in_words(left)} left for {missing} samples" if left else "")
+        + (f"; about {format_span(left)} left for {missing} samples" if left else "")
     )
     for name, activity in sorted(status.activities.items()):
         click.echo(f"  worker {name} {activity}")
-    for line in idle(status, {scene.scene_id: scene.name for scene in scenes}):
+    for line in idle(status, {scene.scene_id: scene.name for scene in scenes}, missing):
         click.echo(f"  {line}")
     _failures("", causes, store)
 

@@ -20,10 +20,10 @@ from photonfarm.core.waiting import SILENCE_S
 from photonfarm.farm.join import JoinedScene, OnProgress
 from photonfarm.store import Store
 from photonfarm.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
+from photonfarm.store.model.findings import Finding, FindingGroup, Remedy
+from photonfarm.store.model.withdrawal import Forgotten, Withdrawal
 from photonfarm.store.read.find import FoundSample, Matches
 from photonfarm.store.read.merge import WrittenView
-from photonfarm.store.write.findings import Finding, FindingGroup, Remedy
-from photonfarm.store.write.withdrawal import Forgotten, Withdrawal
 
 
 @contextlib.contextmanager
@@ -76,7 +76,9 @@ def check(report: StoreReport, as_json: bool) -> None:
     if report.parts:
         click.echo(f"tmp: {report.parts} unfinished files; workers sweep those of the dead")
     if report.quarantine:
-        click.echo(f"set aside to {report.quarantine}, with a record of why; workers render what is missing now")
+        click.echo(
+            f"set aside to {report.quarantine}, with a record of why; workers render the jobs that are missing now"
+        )
     wrong = sum(_wrong(scene) for scene in report.scenes)
     if not wrong:
         click.echo("nothing is wrong")
@@ -138,7 +140,7 @@ def _group(group: FindingGroup) -> dict[str, Any]:
 # ----------------------------------------------------------------------------------------------------------------- find
 
 
-def found(matches: Matches, store: str | Path, as_json: bool) -> None:
+def print_matches(matches: Matches, store: str | Path, as_json: bool) -> None:
     """Print samples: what they show, where their values are stored, and commands to read and render one."""
     if as_json:
         samples = [{**_fields(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
@@ -158,14 +160,14 @@ def _fields(sample: FoundSample) -> dict[str, Any]:
     return {name.removesuffix("_"): value for name, value in asdict(sample).items()}
 
 
-def merged(view: WrittenView) -> None:
+def print_merged(view: WrittenView) -> None:
     """Print a line about a merged view."""
     passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
     error = f"standard error of a value {view.standard_error:.2g} (RMS)"
     click.echo(f"{view.file}: {passes}, mean {view.mean:.4g}, {error}")
 
 
-def merged_document(views: Iterable[WrittenView]) -> None:
+def print_merged_document(views: Iterable[WrittenView]) -> None:
     """Print merged views as JSON."""
     print_json([asdict(view) for view in views])
 
@@ -212,7 +214,7 @@ def copying() -> Iterator[OnProgress]:
         yield lambda scene, done, total: show(scene, done, total, 0)
 
 
-def joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
+def print_joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
     """Print what a join has copied, scene by scene."""
     if as_json:
         print_json([asdict(scene) for scene in scenes])
@@ -228,12 +230,12 @@ def joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
 # ------------------------------------------------------------------------------------------- withdraw, forget, waiting
 
 
-def waiting(sentence: str) -> None:
+def print_waiting(sentence: str) -> None:
     """Print whom a verb waits for."""
     click.echo(sentence, err=True)
 
 
-def contents(store: Store, scene_id: str) -> str:
+def describe_contents(store: Store, scene_id: str) -> str:
     """What there is of a scene, in words."""
     try:
         scene = store.scene(scene_id)
@@ -244,7 +246,7 @@ def contents(store: Store, scene_id: str) -> str:
     return f"scene {scene_id} ({scene.spec.name}), of which {rendered},"
 
 
-def forgotten(result: Forgotten, as_json: bool) -> None:
+def print_forgotten(result: Forgotten, as_json: bool) -> None:
     """Print that a scene is forgotten."""
     if as_json:
         print_json(asdict(result))
@@ -253,7 +255,7 @@ def forgotten(result: Forgotten, as_json: bool) -> None:
     click.echo(f"scene {result.scene_id} is forgotten, with {jobs}")
 
 
-def withdrawn(result: Withdrawal, as_json: bool) -> None:
+def print_withdrawn(result: Withdrawal, as_json: bool) -> None:
     """Print what a withdrawal has forgotten, and what stays."""
     if as_json:
         print_json(asdict(result))
@@ -261,5 +263,6 @@ def withdrawn(result: Withdrawal, as_json: bool) -> None:
     kept = f", {result.kept} stay planned, as rendered ones show their views or configurations" if result.kept else ""
     jobs = "1 job" if result.jobs == 1 else f"{result.jobs} jobs"
     forgotten = f"{result.samples} samples in {jobs} are forgotten" if result.jobs else "nothing is left to withdraw"
-    said = f"{forgotten}; {result.rendered} are rendered and stay{kept}"
+    left = "" if result.jobs else f"; {result.left}"
+    said = f"{forgotten}; {result.rendered} are rendered and stay{kept}{left}"
     click.echo(f"plan {result.plan} of scene {result.scene_id} ({result.name}): {said}")

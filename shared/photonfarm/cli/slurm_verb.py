@@ -20,7 +20,7 @@ from photonfarm.cli.options import (
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from photonfarm.farm.slurm.scripts import Surroundings
+    from photonfarm.farm.slurm import Surroundings
     from photonfarm.farm.submission import Submission
     from photonfarm.plan.request import Request
     from photonfarm.scene.spec_loading import NamedSpec
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 def _limit(ctx: click.Context, param: click.Parameter, text: str | None) -> str | None:  # noqa: ARG001
     from photonfarm.core.errors import SpecError
-    from photonfarm.farm.slurm.scripts import LEAST_LIMIT_S, limit_s
+    from photonfarm.farm.slurm import LEAST_LIMIT_S, limit_s
 
     try:
         if text is not None and limit_s(text) < LEAST_LIMIT_S:
@@ -115,7 +115,7 @@ def slurm(
 
     Exit code 9: sbatch is not here, or refuses.
     """
-    from photonfarm.farm.slurm.launch import check_slurm, launch
+    from photonfarm.farm.slurm import check_slurm, launch
     from photonfarm.scene.spec_loading import NamedSpec
 
     if options["train"] and len(specs) > 1:
@@ -127,7 +127,7 @@ def slurm(
         click.echo("\n".join(scripts.values()), nl=False)
         return
     check_slurm()
-    planned = _planned(named, store, queue_url, request, shard_rows, options)
+    planned = _plan(named, store, queue_url, request, shard_rows, options)
     started = launch(scripts, options["logs"].absolute())
     if as_json:
         from photonfarm.cli import show
@@ -139,7 +139,7 @@ def slurm(
         click.echo(f"job {started.trainer}: the trainer, which begins once the first worker has")
 
 
-def _planned(
+def _plan(
     named: Sequence[NamedSpec],
     store: str | Path,
     queue_url: str | None,
@@ -161,9 +161,9 @@ def _planned(
         found = planned[-1]
         click.echo(f"scene {found.scene_id}: {found.planned} samples planned, {found.planned_before} before", err=True)
     if queue_url is not None:
-        from photonfarm.queue import with_password_of
+        from photonfarm.queue import add_password
 
-        url = with_password_of(password_file(), queue_url)
+        url = add_password(password_file(), queue_url)
         queue_missing(Store(store), url, retry=options["retry"])
     return planned
 
@@ -172,8 +172,7 @@ def _scripts(
     named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, options: dict[str, Any]
 ) -> dict[str, str]:
     """The scripts by their names."""
-    from photonfarm.farm.slurm.launch import TRAINER, WORKERS
-    from photonfarm.farm.slurm.scripts import Resources, trainer_script, worker_script
+    from photonfarm.farm.slurm import TRAINER, WORKERS, Resources, trainer_script, worker_script
 
     at = _surroundings(named, store, queue_url, options["logs"])
     words = [_word(spec.name) for spec in named]
@@ -191,7 +190,7 @@ def _scripts(
 
 
 def _surroundings(named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, logs: Path) -> Surroundings:
-    from photonfarm.farm.slurm.scripts import Surroundings
+    from photonfarm.farm.slurm import Surroundings
 
     place = str(store.absolute()) if isinstance(store, Path) else store
     scenes = dict.fromkeys(spec.scenes for spec in named if spec.scenes)
@@ -199,11 +198,11 @@ def _surroundings(named: Sequence[NamedSpec], store: str | Path, queue_url: str 
     variables = {"PHOTONFARM_CONFIG": config, "PHOTONFARM_REDIS_PASSWORD_FILE": str(file) if file else None}
     absolute = tuple((name, str(Path(path).absolute())) for name, path in variables.items() if path)
     return Surroundings(
-        Path.cwd(), logs.absolute(), place, queue_url is not None, _to_be_written(queue_url), tuple(scenes), absolute
+        Path.cwd(), logs.absolute(), place, queue_url is not None, _url_of_script(queue_url), tuple(scenes), absolute
     )
 
 
-def _to_be_written(queue_url: str | None) -> str | None:
+def _url_of_script(queue_url: str | None) -> str | None:
     """The URL of Redis for a script; None if it holds a password, which the environment or configuration has."""
     if queue_url is None:
         return None

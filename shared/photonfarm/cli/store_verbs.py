@@ -21,8 +21,10 @@ def scene_option(command: click.decorators.FC) -> click.decorators.FC:
 @store_option
 @scene_option
 @click.option("--repair", is_flag=True, help="Set what is damaged aside, to be written again.")
+@click.option("--joined-from", metavar="OTHER", help="With --repair: the store, a folder or bucket, from which damaged "
+              "plans of a join are written again.")  # fmt: skip
 @json_option
-def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> None:
+def check(store: str | Path, scene: str | None, repair: bool, joined_from: str | None, as_json: bool) -> None:
     """Read everything that is stored, and say what is wrong with it; without --repair nothing is written.
 
     Every checksum, every file that a marker names, every number: NaN, infinite, black, repeated seeds, halves A and B
@@ -30,8 +32,9 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
 
     --repair moves damaged jobs to the store's folder `quarantine`, each with a record of why, so that workers find them
     missing and render them again. Damaged inputs of a plan it copies there, and writes them again from the plan's
-    request. It only moves files; in a bucket, a move is a copy and then a delete. For that it has the scene for itself:
-    it waits for the jobs in hand, and workers and trainers of the scene wait for it.
+    request; those of a `store join` from the store that was joined, which --joined-from names, and which is only read.
+    It only moves files; in a bucket, a move is a copy and then a delete. For that it has the scene for itself: it waits
+    for the jobs in hand, and workers and trainers of the scene wait for it.
 
     Exit codes: 0 nothing is wrong, 7 what was wrong has been set aside, and is written again or will be by the workers,
     4 something is wrong (also where --repair does not help, which the text says).
@@ -41,6 +44,8 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
     from photonfarm.store.check.check import check_store
     from photonfarm.store.read.find import scene_named
 
+    if joined_from and not repair:
+        raise click.UsageError("--joined-from: only --repair writes plans again; give both")
     opened = Store(store)
     scene_id = None if scene is None else scene_named(opened, scene)
     with show_store.progress() as on_progress:
@@ -49,8 +54,9 @@ def check(store: str | Path, scene: str | None, repair: bool, as_json: bool) -> 
             scene_id,
             when=datetime.now(UTC).isoformat(timespec="seconds"),
             repair=repair,
+            joined_from=Store(joined_from) if joined_from else None,
             on_progress=on_progress,
-            on_wait=show_store.waiting,
+            on_wait=show_store.print_waiting,
         )
     show_store.check(report, as_json)
     sys.exit(report.exit_code)
@@ -92,7 +98,7 @@ def find(
     opened = Store(store)
     query = Query.of(modification=modification, view=view, sample=sample, row=row, job=job, tolerance=tolerance)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
-    show_store.found(find_samples(opened, ids, query, limit=limit), store, as_json)
+    show_store.print_matches(find_samples(opened, ids, query, limit=limit), store, as_json)
 
 
 @click.command()
@@ -136,9 +142,9 @@ def merge(
     for each in write_views(merged, out):
         written.append(each)
         if not as_json:
-            show_store.merged(each)
+            show_store.print_merged(each)
     if as_json:
-        show_store.merged_document(written)
+        show_store.print_merged_document(written)
     if not written:
         if not find_samples(opened, ids, query, limit=1).count:
             raise StoreError("no sample that is planned fits; `photonfarm store find` shows what there is")
@@ -166,14 +172,16 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
     from photonfarm.farm.join import join as joined
 
     with show_store.copying() as on_progress:
-        result = joined(store, other, scene, on_progress=on_progress, on_wait=show_store.waiting)
-    show_store.joined(result, as_json)
+        result = joined(store, other, scene, on_progress=on_progress, on_wait=show_store.print_waiting)
+    show_store.print_joined(result, as_json)
 
 
 @click.command()
 @store_option
 @click.option("--scene", metavar="ID", required=True, help="The scene: its id, how it begins, or its name.")
-@click.option("--plan", type=click.IntRange(0), help="The plan's number.  [default: the last one]")
+@click.option(
+    "--plan", type=click.IntRange(0), help="The plan's number.  [default: the last one with samples to forget]"
+)
 @json_option
 def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> None:
     """Forget what a plan holds and nobody has rendered; what is rendered stays.
@@ -183,12 +191,12 @@ def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> 
     """
     from photonfarm.cli import show_store
     from photonfarm.store import Store
+    from photonfarm.store.model.withdrawal import withdraw as withdrawn
     from photonfarm.store.read.find import scene_named
-    from photonfarm.store.write.withdrawal import withdraw as withdrawn
 
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
-    show_store.withdrawn(withdrawn(stored, plan, on_wait=show_store.waiting), as_json)
+    show_store.print_withdrawn(withdrawn(stored, plan, on_wait=show_store.print_waiting), as_json)
 
 
 @click.command()
@@ -204,15 +212,15 @@ def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
     """
     from photonfarm.cli import show_store
     from photonfarm.store import Store
+    from photonfarm.store.model.withdrawal import forget as forgotten
     from photonfarm.store.read.find import scene_named
-    from photonfarm.store.write.withdrawal import forget as forgotten
 
     opened = Store(store)
     scene_id = scene_named(opened, scene)
     if not yes:
-        question = f"Delete {show_store.contents(opened, scene_id)} of {store}?"
+        question = f"Delete {show_store.describe_contents(opened, scene_id)} of {store}?"
         if not sys.stdin.isatty():
             raise click.UsageError(f"{question} Without a terminal to ask, --yes is required.")
         if not click.confirm(question, err=True):
             raise click.ClickException("nothing is deleted")
-    show_store.forgotten(forgotten(opened, scene_id, on_wait=show_store.waiting), as_json)
+    show_store.print_forgotten(forgotten(opened, scene_id, on_wait=show_store.print_waiting), as_json)

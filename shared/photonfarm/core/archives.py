@@ -1,7 +1,9 @@
-"""NumPy archives by which one service hands arrays to another: a file is there whole or not at all.
+"""NumPy archives by which one service hands arrays to another, and OpenEXR images; a file is there whole or not at all.
 
 The costs of a frame's parts, and what kind of surface each pixel shows, are such an archive: the renderer measures, and
-reports read it without a renderer. Shape letters: N rows of the store, H W image, T timed frames, K sizes of image.
+reports read it without a renderer. Images have a layer for each array, without loss; they need the package OpenEXR.
+
+Shape letters: N rows of the store, H W image, T timed frames, K sizes of image.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ def write_arrays(file: Path, arrays: Mapping[str, NDArray[Any]], what: str) -> N
 
 
 @contextmanager
-def stored_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
+def read_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArray[Any]]]:
     """The arrays of a file by name, each read at its first use.
 
     Raises StoreError if the file is missing, unreadable or damaged, and if the code inside the `with` raises KeyError,
@@ -120,6 +122,38 @@ class FrameCosts:
     @classmethod
     def read(cls, file: Path) -> Self:
         """Read what `write` stored; raises StoreError for anything else."""
-        with stored_arrays(file, "frame costs", "measure-frames") as stored:
+        with read_arrays(file, "frame costs", "measure-frames") as stored:
             arrays: dict[str, Any] = {each.name: stored[each.name] for each in fields(cls)}
             return cls(**{**arrays, "scene_id": str(arrays["scene_id"])})
+
+
+def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
+    """Write an image with layers by name, (H, W, 3) or (H, W), float16 or float32; "" is the one shown first.
+
+    Channels are R, G, B of colours, X, Y, Z of normals, Z of depths, and V of other single values. Raises StoreError
+    if OpenEXR is not installed, or the disk refuses.
+    """
+    try:
+        import OpenEXR
+    except ModuleNotFoundError as error:
+        raise StoreError(f"{file}: needs the package OpenEXR; pip install 'photonfarm[export]'") from error
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
+    with store_errors("write an image", file), whole_file(file) as part:
+        try:
+            with OpenEXR.File(header, _channels(layers)) as image:
+                image.write(str(part))
+        except RuntimeError as error:  # OpenEXR's own, which names the cause
+            raise OSError(None, str(error), str(file)) from error
+
+
+def _channels(layers: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
+    found: dict[str, NDArray[Any]] = {}
+    for layer, values in layers.items():
+        if values.ndim == 3:
+            names = "XYZ" if "normal" in layer else "RGB"
+            parts = {name: values[..., i] for i, name in enumerate(names)}
+        else:
+            parts = {"Z" if "depth" in layer else "V": values}
+        contiguous = {name: np.ascontiguousarray(part) for name, part in parts.items()}  # OpenEXR minds no strides
+        found |= {f"{layer}.{name}" if layer else name: part for name, part in contiguous.items()}
+    return found

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 Probability = Annotated[float, Field(ge=0, le=1)]
 
 
-def _named(name: str) -> str:
+def _check_name(name: str) -> str:
     """The name; refuses what could not be a part of a file's name, or of a command line, everywhere."""
     if re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}", name):
         return name
@@ -25,7 +25,7 @@ def _named(name: str) -> str:
     )
 
 
-Name = Annotated[str, AfterValidator(_named)]
+Name = Annotated[str, AfterValidator(_check_name)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
 Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -62,7 +62,7 @@ def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None)
         elif fault["type"] == "extra_forbidden":
             yield f"{key}: unknown key; nearest: {nearest(str(fault['loc'][-1]), known)}"
         else:
-            yield f"{key} = {_shortened(repr(fault['input']))}: {rule}"
+            yield f"{key} = {_shorten(repr(fault['input']))}: {rule}"
 
 
 _RULES = {
@@ -102,7 +102,7 @@ def _key(place: tuple[int | str, ...], document: Any) -> str:
     return words.removeprefix(".")
 
 
-def _shortened(text: str) -> str:
+def _shorten(text: str) -> str:
     return text if len(text) <= INPUT_SHOWN else f"{text[:INPUT_SHOWN]}…"
 
 
@@ -114,7 +114,7 @@ def differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "
     """The values that differ, (then, now), by key; a key within another one as OUTER.INNER, an entry by its name."""
     found: Changes = {}
     for key in {**before, **now}:
-        then, value = _by_name(before.get(key)), _by_name(now.get(key))
+        then, value = _table_by_name(before.get(key)), _table_by_name(now.get(key))
         if isinstance(then, Mapping) and isinstance(value, Mapping):
             found |= differing(then, value, f"{inside}{key}.")
         elif then != value:
@@ -122,7 +122,7 @@ def differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "
     return found
 
 
-def _by_name(value: Any) -> Any:
+def _table_by_name(value: Any) -> Any:
     """A list of tables that all have names as one table of them; anything else as it is."""
     if isinstance(value, list) and value and all(isinstance(each, Mapping) and "name" in each for each in value):
         return {each["name"]: each for each in value}

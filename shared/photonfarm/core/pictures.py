@@ -39,24 +39,24 @@ def display(radiance: F32, exposure: float) -> Picture:
     return _bytes(display_values(exposure * np.nan_to_num(radiance)))
 
 
-def of_albedo(albedo: F32) -> Picture:
+def draw_albedo(albedo: F32) -> Picture:
     """Reflectance (H, W, 3) in [0, 1], gamma 2.2."""
     return _bytes(display_values(albedo))
 
 
-def of_normal(normal: F32) -> Picture:
+def draw_normal(normal: F32) -> Picture:
     """World normals (H, W, 3) as colours: −1…1 becomes 0…255."""
     return _bytes(0.5 + 0.5 * np.clip(normal, -1, 1))
 
 
-def of_depth(depth: F32) -> Picture:
+def draw_depth(depth: F32) -> Picture:
     """Depth (H, W) in greys, near bright; 0 (nothing hit) is black."""
     hit = depth > 0
     far = np.percentile(depth[hit], 99) if hit.any() else 1.0
     return _bytes(np.repeat((hit * (1 - 0.9 * np.clip(depth / far, 0, 1)))[..., None], 3, axis=2))
 
 
-def reduced(image: NDArray[V], most: int) -> NDArray[V]:
+def reduce_image(image: NDArray[V], most: int) -> NDArray[V]:
     """An image (H, W, C) of at most `most` pixels along each side: means over blocks, less a rest at the edges."""
     by = -(-max(image.shape[:2]) // most)
     if by == 1:
@@ -71,7 +71,7 @@ def data_uri(picture: Picture, most: int | None = None) -> str:
     from PIL import Image
 
     stream = io.BytesIO()
-    shown = picture if most is None else reduced(picture, most)
+    shown = picture if most is None else reduce_image(picture, most)
     kind = "PNG" if shown.shape[1] <= EXACT else "WEBP"
     Image.fromarray(shown).save(stream, kind, quality=90)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(stream.getvalue()).decode()}"
@@ -84,7 +84,7 @@ def _bytes(unit: NDArray[np.floating]) -> Picture:
 HERE = Path(__file__).parent
 
 
-def rendered(template: Path, **values: Any) -> str:
+def render_page(template: Path, **values: Any) -> str:
     """The page of a template; `page.html.j2`, which it may extend, lies beside this module. Text is escaped."""
     environment = Environment(
         loader=FileSystemLoader([template.parent, HERE]), autoescape=True, undefined=StrictUndefined,

@@ -28,13 +28,13 @@ os.execv(sys.argv[2], sys.argv[2:])
 """
 
 
-def tied(command: Sequence[str]) -> list[str]:
+def tie(command: Sequence[str]) -> list[str]:
     """The command, wrapped so that on Linux it gets SIGTERM when this process ends; the main thread must start it."""
     return [sys.executable, "-c", _LAUNCH, str(os.getpid()), *command]
 
 
 @contextmanager
-def ended_by_ctrl_c() -> Iterator[None]:
+def end_on_ctrl_c() -> Iterator[None]:
     """Let Ctrl-C end this process at once, also inside native code, until which Python's own handler would wait.
 
     For work that keeps nothing before its end; anywhere but in the main thread it changes nothing.
@@ -68,7 +68,7 @@ def loading() -> Iterator[None]:
 
 
 @contextmanager
-def repeating(every_s: float, do: Callable[[], object]) -> Iterator[None]:
+def repeat(every_s: float, do: Callable[[], object]) -> Iterator[None]:
     """Do something every few seconds, in a thread of its own, until the block ends."""
     ended = threading.Event()
 

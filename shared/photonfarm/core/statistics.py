@@ -132,7 +132,7 @@ class Estimate:
         return cls(float(np.mean(per_sample)), error, count)
 
 
-def stated(mean: float, standard_error: float | None) -> str:
+def format_estimate(mean: float, standard_error: float | None) -> str:
     """An estimate in words: "0.12345 ± 0.00678", without the error if it is None; large numbers get few digits."""
     values = [mean] if standard_error is None else [mean, standard_error]
     return " ± ".join(f"{value:.5f}" if abs(value) < 1e5 else f"{value:.3g}" for value in values)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import TracebackType
 from typing import Self
 
-from photonfarm.core.processes import repeating
+from photonfarm.core.processes import repeat
 
 SILENCE_S = 5.0
 """The longest time without a line."""
@@ -27,7 +27,7 @@ class WorkLog:
         self._what, self._begun = "", time.monotonic()
         self._said = self._begun
         self._how_far: Callable[[], str] | None = None
-        self._watching = repeating(silence_s / 10, self._repeat)
+        self._watching = repeat(silence_s / 10, self._repeat)
 
     def __enter__(self) -> Self:
         """Begin to watch for silence."""
@@ -54,7 +54,7 @@ class WorkLog:
 
 
 @contextmanager
-def waiting(log: Log, what: str, silence_s: float = SILENCE_S) -> Iterator[None]:
+def tell_waiting(log: Log, what: str, silence_s: float = SILENCE_S) -> Iterator[None]:
     """Say what is done, and every few seconds for how long it has been, until the block ends."""
     with WorkLog(log, silence_s) as work:
         work.begin(what)
@@ -109,10 +109,10 @@ class Steps:
         far = f"{self._done} of {self.total}"
         if (left_s := self.left_s) is None:
             return far
-        return f"{far}, {'about' if self._done > self._slow else 'at most'} {in_words(left_s)} left"
+        return f"{far}, {'about' if self._done > self._slow else 'at most'} {format_span(left_s)} left"
 
 
-def in_words(seconds: float) -> str:
+def format_span(seconds: float) -> str:
     """A span of time as people say it: 45 s, 12 min, 3.4 h, 2.1 days."""
     if seconds < 100:
         return f"{max(seconds, 0):.0f} s"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core.errors import IncompleteError, SpecError
-from photonfarm.core.waiting import waiting
+from photonfarm.core.waiting import tell_waiting
 from photonfarm.export import card, folder, manifest
 from photonfarm.export.card import Exported
 from photonfarm.export.columns import GUIDES, Column, Contents, format_ranges, list_columns, parse_buffers, parse_ranges
@@ -98,7 +98,7 @@ def _take_snapshot(
     store: str | Path, stored: SceneStore, settings: ExportSettings, log: Callable[[str], None]
 ) -> Snapshot:
     guides = not set(GUIDES).isdisjoint(settings.buffers)
-    with waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
+    with tell_waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
         snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
     log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete")
     return snapshot
@@ -139,7 +139,7 @@ class _Export:
             self._form.write(part.file, self._samples(snapshot, part), self._contents)
             written_bytes += part.file.stat().st_size
         rows = [*there, *new]
-        with waiting(self._log, f"describing {len(rows)} samples"):
+        with tell_waiting(self._log, f"describing {len(rows)} samples"):
             self._finish(snapshot, rows)
         shared = len(self._configurations)
         return Result(str(self._out), snapshot.spec.scene_id, len(rows), len(new), len(planned), written_bytes, shared)

@@ -19,9 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from photonfarm.core.archives import write_arrays
+from photonfarm.core.archives import write_arrays, write_layers
 from photonfarm.core.errors import StoreError, store_errors
-from photonfarm.core.exr import write_layers
 from photonfarm.core.files import whole_file, write_whole
 from photonfarm.export.card import Exported, write_croissant
 from photonfarm.export.columns import HALVES, Column, Contents, parse_rows

@@ -15,7 +15,7 @@ import click
 from photonfarm.cli.options import json_option, store_option
 from photonfarm.cli.show import print_json
 from photonfarm.core.formatting import format_bytes
-from photonfarm.core.waiting import in_words
+from photonfarm.core.waiting import format_span
 from photonfarm.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
@@ -136,7 +136,7 @@ def show_progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
             speed = f"{rate:.0f}/s, {rate * size_bytes / done / 1e6:.0f} MB/s"
             bars.update(bar, completed=done, total=total, rate=speed, visible=True)
             if not console.is_terminal and (now - last > LINE_S or done == total):
-                last, left = now, in_words((total - done) / rate)
+                last, left = now, format_span((total - done) / rate)
                 console.print(f"{done}/{total} samples, {speed}, {left} left", highlight=False)
 
         def say(line: str) -> None:

@@ -10,7 +10,7 @@ from photonfarm.store import SceneStore, Store
 from photonfarm.store.read.find import Query, find_samples
 
 
-def named_configuration(store: Store, scene: SceneStore, text: str | None) -> Modification:
+def find_configuration(store: Store, scene: SceneStore, text: str | None) -> Modification:
     """The configuration of `--modification VECTOR|KEY`, as `store find` takes it; without a text, the scene at rest.
 
     Raises SpecError for a vector of another number of groups, StoreError for a key that is in no plan.

@@ -79,7 +79,7 @@ class Cards:
         return self.cards[number]
 
 
-def of_workers(name: str, cards: Cards) -> tuple[str, ...]:
+def worker_devices(name: str, cards: Cards) -> tuple[str, ...]:
     """The devices that several workers take in turn: of `auto` and `cuda` every card, otherwise the one named.
 
     Raises BackendError as `Cards.card` does.
@@ -89,7 +89,7 @@ def of_workers(name: str, cards: Cards) -> tuple[str, ...]:
     return tuple(f"{CUDA}:{card.number}" for card in cards.cards) if name in (AUTO, CUDA) else (name,)
 
 
-def shown_alone(card: Card) -> str:
+def visible_device(card: Card) -> str:
     """The value of CUDA_VISIBLE_DEVICES that leaves this card alone, within what it leaves already."""
     visible = [each.strip() for each in os.environ.get(VISIBLE_VARIABLE, "").split(",") if each.strip()]
     return visible[card.number] if card.number < len(visible) else str(card.number)
@@ -98,7 +98,7 @@ def shown_alone(card: Card) -> str:
 @cache
 def cards_here() -> Cards:
     """The cards of this machine; they are looked for once in a process."""
-    if (missing := _unopened("cuda")) is not None:
+    if (missing := _find_unopened("cuda")) is not None:
         return Cards(trouble=f"there is no NVIDIA driver ({missing}; {_CONTAINER.format('compute')})")
     command, environment = [sys.executable, "-m", __name__], {**os.environ, ORDER_VARIABLE: ORDER}
     try:
@@ -109,7 +109,7 @@ def cards_here() -> Cards:
         return Cards(trouble=f"the NVIDIA driver did not list its cards ({' '.join(str(error).split())})")
 
 
-def listed() -> Cards:
+def list_cards() -> Cards:
     """The cards of this machine, asked for in this process, which then cannot choose among them any more."""
     library = ctypes.CDLL(_path("cuda"))
     failed = library.cuInit(0)
@@ -120,7 +120,7 @@ def listed() -> Cards:
     library.cuDeviceGetCount(ctypes.byref(count))
     cards = tuple(_card(library, number) for number in range(count.value))
     cuda = version.value // 10
-    return Cards(cards, _driver_version(), cuda, _trouble(len(cards), cuda, _unopened("optix")))
+    return Cards(cards, _driver_version(), cuda, _trouble(len(cards), cuda, _find_unopened("optix")))
 
 
 def _trouble(cards: int, cuda: int, no_optix: str | None) -> str:
@@ -174,7 +174,7 @@ def _path(library: str) -> str:
     return os.environ.get(variable) or name
 
 
-def _unopened(library: str) -> str | None:
+def _find_unopened(library: str) -> str | None:
     """Why a library of the driver cannot be opened; None if it can."""
     try:
         ctypes.CDLL(_path(library))
@@ -184,4 +184,4 @@ def _unopened(library: str) -> str | None:
 
 
 if __name__ == "__main__":
-    json.dump(asdict(listed()), sys.stdout)
+    json.dump(asdict(list_cards()), sys.stdout)

@@ -67,7 +67,7 @@ def rehearse(
     With `measure`, also its cost, and how the same cost would be spent best; `log` is called with the reason if the
     cost is unknown. Raises SpecError and StoreError as `submit` does.
     """
-    found = _counted(named.spec, request, store, shard_rows)
+    found = _count(named.spec, request, store, shard_rows)
     if not (measure and found.planned):
         return found
     try:
@@ -75,10 +75,10 @@ def rehearse(
     except BackendError as error:
         log(f"cost and time are not known: {error}")
         return found
-    return _priced(found, named.spec, request, costs)
+    return _price(found, named.spec, request, costs)
 
 
-def _counted(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
+def _count(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
     """What would be planned, and its size."""
     if is_vacant(store):
         new, known, extent = wanted.samples, 0, wanted.extent(loaded)
@@ -112,7 +112,7 @@ def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
         raise BackendError(f"`photonfarm {name}` said {error}") from error
 
 
-def _priced(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
+def _price(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
     """What would be planned, with its cost, and the suggestion.
 
     There is no suggestion if some samples of the request are planned already: another half_spp makes another scene, in
@@ -126,7 +126,7 @@ def _priced(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts)
     asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
     if static:
         asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
-    reduction, better = CostModel.of(costs, static=static).improved(asked)
+    reduction, better = CostModel.of(costs, static=static).improve(asked)
     if reduction < WORTH_A_CHANGE:
         return replace(timed, reduction=reduction)
     modifications, views = (None, None) if static else (better.modifications, better.views)

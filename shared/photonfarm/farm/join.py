@@ -16,9 +16,9 @@ from photonfarm.core.keys import Key
 from photonfarm.plan.joined import Joined, samples_to_join
 from photonfarm.plan.request import PlannedContent, SamplesToPlan
 from photonfarm.store import Figures, JobRows, SceneReader, SceneStore, Store
+from photonfarm.store.model import plans
+from photonfarm.store.model.lease import OnWait, hold_lease
 from photonfarm.store.read.find import scene_named
-from photonfarm.store.write import plans
-from photonfarm.store.write.lease import OnWait, lease
 
 OnProgress = Callable[[str, int, int], object]
 """Called with a scene's name, and how many of how many jobs are copied."""
@@ -57,7 +57,7 @@ def join(
     only = None if scene is None else scene_named(source, scene)
     joined = []
     for there in source.scenes(only):
-        with lease(target.storage, there.scene_id, "store join", on_wait):
+        with hold_lease(target.storage, there.scene_id, "store join", on_wait):
             joined.append(_join_scene(target, source, there, on_progress))
     return joined
 

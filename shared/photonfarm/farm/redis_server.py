@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import IO, NoReturn, Self
 
 from photonfarm.core.errors import QueueError
-from photonfarm.core.processes import tied
+from photonfarm.core.processes import tie
 from photonfarm.queue import connect
 
 START_S = 20.0
@@ -111,7 +111,7 @@ class EmbeddedRedis:
         return self._lock
 
     def _start(self, lock: IO[bytes]) -> subprocess.Popen[bytes]:
-        command = tied([str(server_binary())])
+        command = tie([str(server_binary())])
         for setting, value in self._settings().items():
             command += [f"--{setting}", value]  # the server quotes it, also a path with blanks
         with (self.folder / "redis.log").open("ab") as log:

@@ -36,7 +36,7 @@ class RunningFarm:
 
 
 @contextlib.contextmanager
-def announced(store: Store, *, redis_url: str, run: Path | None, web: str | None) -> Iterator[None]:
+def announce(store: Store, *, redis_url: str, run: Path | None, web: str | None) -> Iterator[None]:
     """Announce this process's farm until the block ends; a disk that refuses that is no reason not to render."""
     farm = RunningFarm(os.getpid(), process_space(), redis_url, str(run.absolute()) if run else None, web)
     file = _file(store)

@@ -17,8 +17,8 @@ from photonfarm.core.errors import CorruptError, QueueError, StoreError, store_e
 from photonfarm.store import SceneStatus, Store
 from photonfarm.store.format.markers import COMMITTED
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write.scene_store import SCENES
-from photonfarm.store.write.store import FAILURES_FOLDER
+from photonfarm.store.model.scene_store import SCENES
+from photonfarm.store.model.store import FAILURES_FOLDER
 
 if TYPE_CHECKING:
     from photonfarm.queue import Failure, FailureCause, QueueStatus
@@ -61,7 +61,7 @@ def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
 
     The queue's packages are loaded only where there is something to ask: they take as long as the rest of `status`.
     """
-    if (refused := _refused(redis_url)) and not store.storage.names(FAILURES_FOLDER):
+    if (refused := _why_refused(redis_url)) and not store.storage.names(FAILURES_FOLDER):
         return NoQueue(refused)
     from photonfarm import queue
 
@@ -70,10 +70,10 @@ def queue_of(store: Store, redis_url: str) -> StoreQueue | NoQueue:
             queue.check_served(connection, store)
             found = queue.queue_status(connection)
     except QueueError as error:
-        return NoQueue(str(error), queue.causes(_kept(store)))
+        return NoQueue(str(error), queue.group_causes(_read_kept_failures(store)))
     failed = {name: failure for name, failure in found.failed.items() if is_missing(store, name)}
-    kept = {name: failure for name, failure in _kept(store).items() if name not in failed}
-    return StoreQueue(found, queue.causes(failed), queue.causes(kept))
+    kept = {name: failure for name, failure in _read_kept_failures(store).items() if name not in failed}
+    return StoreQueue(found, queue.group_causes(failed), queue.group_causes(kept))
 
 
 def queue_now(store: Store, redis_url: str) -> StoreQueue | NoQueue:
@@ -100,7 +100,7 @@ def since_commit_s(store: Store) -> float | None:
     return max(0.0, time.time() - max(times)) if times else None
 
 
-def _refused(redis_url: str) -> str | None:
+def _why_refused(redis_url: str) -> str | None:
     """Why there is no Redis, if nothing listens at a port or socket of this machine; None if its client must tell."""
     url = urlsplit(redis_url)
     try:
@@ -118,12 +118,12 @@ def _refused(redis_url: str) -> str | None:
     return None
 
 
-def _kept(store: Store) -> dict[str, Failure]:
+def _read_kept_failures(store: Store) -> dict[str, Failure]:
     """The failures that the store has kept, of jobs that are still missing."""
     from photonfarm import queue
 
     with store_errors("look for failures", store.storage.where):
-        return queue.kept_failures(store, lambda name: is_missing(store, name))
+        return queue.read_kept_failures(store, lambda name: is_missing(store, name))
 
 
 def is_missing(store: Store, name: str) -> bool:
@@ -195,19 +195,21 @@ def waits(
     `names` are those of the store's scenes, by their ids, and `missing` samples are planned and not committed.
     """
     if isinstance(queue, StoreQueue):
-        yield from idle(queue.status, names)
-        yield from (Wait("job_failed", len(cause.jobs), failed(cause)) for cause in queue.causes)
-        if missing and not queue.status.workers:
-            why = f"{missing} samples wait for a worker: none is alive; `photonfarm work` starts one"
-            yield Wait("no_worker", missing, why)
+        yield from idle(queue.status, names, missing)
+        yield from (Wait("job_failed", len(cause.jobs), describe_failed(cause)) for cause in queue.causes)
     for training in trainings:
         if training.phase == WAITS:
             why = f"{training.run}: the trainer {WAITS}" + ("" if missing else ", and all that are planned are there")
             yield Wait("trainer_waits", 1, why)
 
 
-def idle(found: QueueStatus, names: Mapping[str, str]) -> Iterator[Wait]:
-    """Yield why scenes are not rendered, by the workers' reports."""
+def idle(found: QueueStatus, names: Mapping[str, str], missing: int) -> Iterator[Wait]:
+    """Yield why scenes are not rendered, by the workers' reports; and that none is there for `missing` samples."""
+    if missing and not found.workers:
+        why = (
+            f"{missing} samples wait for a worker: none is alive; `photonfarm work` starts one, which also queues them"
+        )
+        yield Wait("no_worker", missing, why)
     for scene_id, reasons in found.left.items():
         if scene_id in names:
             reason = next(iter(reasons.values()))
@@ -223,7 +225,7 @@ def idle(found: QueueStatus, names: Mapping[str, str]) -> Iterator[Wait]:
         yield Wait("worker_paused", sum(map(len, more)), f"and {len(more)} reasons more")
 
 
-def failed(cause: FailureCause) -> str:
+def describe_failed(cause: FailureCause) -> str:
     """How many jobs failed, and why."""
     aside = f", {cause.set_aside} of them set aside until `photonfarm submit --retry`" if cause.set_aside else ""
     return f"{len(cause.jobs)} job{'s' * (len(cause.jobs) != 1)} failed{aside}: {cause.cause}"

@@ -26,10 +26,11 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
+from photonfarm.store.model.lease import announce_work
+from photonfarm.store.model.plans import StoredPlan, content, load_all
+from photonfarm.store.model.scene_store import SCENES, stored_spec
 from photonfarm.store.read.find import scene_named
-from photonfarm.store.read.other_scenes import first_plan_note, other_scenes, with_same_radiance
-from photonfarm.store.write.lease import at_work
-from photonfarm.store.write.plans import StoredPlan, content
+from photonfarm.store.read.other_scenes import describe_scenes, find_same_radiance, note_first_plan
 
 MOST_NAMED = 4096
 """The largest number of configurations that a message proposes."""
@@ -48,7 +49,7 @@ def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Re
         raise SpecError(fault)
 
 
-def chosen_hold_out(spec: SceneSpec, store: str | Path, request: Request) -> float:
+def choose_hold_out(spec: SceneSpec, store: str | Path, request: Request) -> float:
     """The share to hold out where a user names none: the default, or just enough for one of what a small plan has.
 
     Raises SpecError if there is only one configuration (in a static scene, view).
@@ -115,18 +116,16 @@ def _units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> set[Ke
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:
         wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
-    planned = _planned(spec, plans, wanted)
+    planned = _plan_views(spec, plans, wanted)
     return set(units_of(planned, np.arange(len(planned.view_row))))
 
 
 def _plans(spec: SceneSpec, store: str | Path) -> list[StoredPlan]:
     """The plans of a scene; none if the store does not have it."""
-    if not is_vacant(store) and spec.scene_id in (opened := Store(store)).scene_ids():
-        return opened.scene(spec.scene_id).plans()
-    return []
+    return [] if is_vacant(store) else load_all(Store(store).storage, f"{SCENES}/{spec.scene_id}", [])
 
 
-def _planned(spec: SceneSpec, plans: list[StoredPlan], wanted: Request) -> PlannedViews:
+def _plan_views(spec: SceneSpec, plans: list[StoredPlan], wanted: Request) -> PlannedViews:
     """The views of a scene's plans and of a request."""
     known = content(plans)
     first_job, shard_rows = (plans[-1].end_job, plans[0].shard_rows) if plans else (0, SHARD_ROWS)
@@ -224,22 +223,22 @@ def submit(
     """
     opened = Store(store, create=True)
     usual = rows_per_job(named.spec, request, workers)
-    other = scene_named(opened, halves_from) if halves_from else with_same_radiance(opened, named.spec)
-    before = opened.scene(named.spec.scene_id).spec if opened.has_scene(named.spec.scene_id) else None
-    with at_work(opened.storage, named.spec.scene_id, "submit", log.warning):
+    other = scene_named(opened, halves_from) if halves_from else find_same_radiance(opened, named.spec)
+    before = stored_spec(opened.storage, named.spec.scene_id)
+    with announce_work(opened.storage, named.spec.scene_id, "submit", log.warning):
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten
-    queued = _queued(opened, redis_url, retry=retry or anew)
+    queued = _queue(opened, redis_url, retry=retry or anew)
     return Submission(
         planned.scene_id, planned.plan, planned.new, planned.known, queued,
-        note=first_plan_note(opened, named.spec) if planned.plan == 0 else None,
+        note=note_first_plan(opened, named.spec) if planned.plan == 0 else None,
         halves_from=other if planned.new else None,
-        replaced=None if before is None else _replaced(before, named.spec),
+        replaced=None if before is None else _describe_replaced(before, named.spec),
         scenes=named.scenes,
     )  # fmt: skip
 
 
-def _replaced(there: SceneSpec, here: SceneSpec) -> str | None:
+def _describe_replaced(there: SceneSpec, here: SceneSpec) -> str | None:
     """What a stored spec has lost to a submitted one of the same ids, in words; None if they agree."""
     then, now = (spec.model_dump(mode="json", exclude={"scene", "stored_exponent"}) for spec in (there, here))
     changes = differing(then, now)
@@ -265,11 +264,11 @@ def top_up(
     if scene_id not in opened.scene_ids():
         raise SpecError(
             f"{named.name}: {store} has no samples of scene {scene_id} that could be topped up; "
-            f"{other_scenes(opened, named.spec)}; `photonfarm submit` plans the first ones"
+            f"{describe_scenes(opened, named.spec)}; `photonfarm submit` plans the first ones"
         )
-    with at_work(opened.storage, scene_id, "top-up", log.warning):
+    with announce_work(opened.storage, scene_id, "top-up", log.warning):
         planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
-    queued = None if dry_run else _queued(opened, redis_url, retry=retry)
+    queued = None if dry_run else _queue(opened, redis_url, retry=retry)
     return TopUpSubmission(
         planned.scene_id,
         planned.plan,
@@ -282,7 +281,7 @@ def top_up(
     )
 
 
-def _queued(store: Store, redis_url: str | None, *, retry: bool | str) -> int | None:
+def _queue(store: Store, redis_url: str | None, *, retry: bool | str) -> int | None:
     """The number of jobs that are queued now; None without Redis. Workers that have none learn it from the store."""
     if retry is True:
         with store_errors("note a retry", store.storage.where):

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.core.errors import SpecError, StoreError
-from photonfarm.core.statistics import stated
-from photonfarm.core.waiting import in_words
+from photonfarm.core.statistics import format_estimate
+from photonfarm.core.waiting import format_span
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import Store
 
@@ -59,12 +59,12 @@ class TrainingProgress:
         if found is None:
             return ""
         samples = "1 sample" if found["held_out"] == 1 else f"{found['held_out']} samples"
-        return f"held-out error {stated(found['error'], found['standard_error'])} on {samples}"
+        return f"held-out error {format_estimate(found['error'], found['standard_error'])} on {samples}"
 
     @property
     def figures(self) -> str:
         """How long training still takes, and its last error, each after a comma."""
-        left = None if self.left_s is None else f"{in_words(self.left_s)} left"
+        left = None if self.left_s is None else f"{format_span(self.left_s)} left"
         return "".join(f", {part}" for part in (left, self.error) if part)
 
     @property
@@ -76,12 +76,12 @@ class TrainingProgress:
     @property
     def line(self) -> str:
         """All of it in words."""
-        steps = counted(self.step, self.steps) if self.steps else str(self.step)
+        steps = count_steps(self.step, self.steps) if self.steps else str(self.step)
         ended = f", ended ({self.ended})" if self.ended else ""
         return f"training {self.run}: step {steps}{self.note}{ended}"
 
 
-def counted(step: int, steps: int) -> str:
+def count_steps(step: int, steps: int) -> str:
     """How many of the wanted steps are done; a run that is asked for fewer than it has keeps those that it has."""
     return f"{step}/{steps}" if step <= steps else f"{step} ({steps} wanted)"
 

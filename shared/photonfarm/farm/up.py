@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Protocol
 
 from photonfarm.core.errors import IncompleteError, SpecError, store_errors
-from photonfarm.core.processes import command, free_port, tied
+from photonfarm.core.processes import command, free_port, tie
 from photonfarm.farm.devices import CPU
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.farm.running_farm import WEB_PORT, announced
+from photonfarm.farm.running_farm import WEB_PORT, announce
 from photonfarm.farm.status import NoQueue, StoreQueue, queue_now, waits
-from photonfarm.farm.submission import check_hold_out, chosen_hold_out, submit, top_up
+from photonfarm.farm.submission import check_hold_out, choose_hold_out, submit, top_up
 from photonfarm.farm.training import RunFolder, TrainingProgress, check_run, hold_out_of
 from photonfarm.plan.hold_out import HOLD_OUT
 from photonfarm.plan.request import Request
@@ -144,7 +144,7 @@ def run_farm(
             verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=share)
         address = stack.enter_context(_pages(store, redis.url, run, talk)) if web else None
         trained = run if train_steps else None
-        stack.enter_context(announced(opened, redis_url=redis.url, run=trained, web=address))
+        stack.enter_context(announce(opened, redis_url=redis.url, run=trained, web=address))
         running = stack.enter_context(_processes(verbs, environment, run, talk))
         preview = ["preview", planned.scene_id, "--out", str(out / "preview.html")]
         try:
@@ -173,7 +173,7 @@ def _checked_hold_out(spec: SceneSpec, store: str | Path, asked: float | None, r
     if asked is not None:
         check_hold_out(spec, store, asked, request)
         return asked
-    share = chosen_hold_out(spec, store, request)
+    share = choose_hold_out(spec, store, request)
     if share != HOLD_OUT:
         talk.say(f"hold-out {share:g}, as {HOLD_OUT:g} would not suit so few configurations")
     return share
@@ -222,7 +222,7 @@ def _processes(
 def _start(arguments: list[str], environment: Mapping[str, str], log: Path) -> Process:
     with log.open("ab") as output:
         return subprocess.Popen(
-            tied(command(*arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output,
+            tie(command(*arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, by us
         )  # fmt: skip

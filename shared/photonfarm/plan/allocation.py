@@ -34,7 +34,7 @@ from photonfarm.plan.sample_costs import SampleCosts
 
 KAPPA = 0.34
 """κ, how much of the noise the network averages away over pixels and views: fitted to `light_transport`, preset
-`small`, in two rooms by bench/studies/noise_budget.py. Its 95 % range is 1.6 and less, down to the end of what was
+`small`, in two rooms (docs/results/noise_budget.md). Its 95 % range is 1.6 and less, down to the end of what was
 searched.
 """
 
@@ -121,7 +121,7 @@ class CostModel:
             raise ValueError(f"budget_s is {budget_s}; one view of 2 spp costs {self.seconds(Allocation(1, 1, 1, 2))}")
         return min(found, key=self.excess)
 
-    def improved(self, asked: Allocation) -> tuple[float, Allocation]:
+    def improve(self, asked: Allocation) -> tuple[float, Allocation]:
         """The share of `asked`'s excess that the best allocation of the same cost saves, ≥ 0, and that allocation."""
         found = self.best(self.seconds(asked))
         return max(0.0, 1 - self.excess(found) / self.excess(asked)), found

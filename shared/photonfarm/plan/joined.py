@@ -5,7 +5,7 @@ Shape letters: M modifications, V views, S samples.
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,21 +29,16 @@ def samples_to_join(other: PlannedContent, rows: NDArray[np.int64], known: Plann
 
     Configurations and views that are known here keep the rows that they have here.
     """
-    keys = _column(other, "sample_key")[rows]
+    keys = other.column("sample_key")[rows]
     new = np.array([key.tobytes() not in known.samples for key in keys], np.bool_)
     rows, keys = rows[new], keys[new]
-    modification_row, of_modification = np.unique(_column(other, "sample_modification")[rows], return_inverse=True)
-    view_row, first, of_view = np.unique(_column(other, "sample_view")[rows], return_index=True, return_inverse=True)
+    modification_row, of_modification = np.unique(other.column("sample_modification")[rows], return_inverse=True)
+    view_row, first, of_view = np.unique(other.column("sample_view")[rows], return_index=True, return_inverse=True)
     modification, view = other.vectors("modification", modification_row), other.vectors("view", view_row)
     here = np.array([known.modifications.get(each, UNUSED) for each in contents(modification)], np.int64)
     seen = view_contents(here[of_modification[first]], view)
     return SamplesToPlan(
         modification, here, view, np.array([known.views.get(each, UNUSED) for each in seen], np.int64),
-        of_modification, of_view, _column(other, "sample_pass")[rows], keys.reshape(-1, KEY_BYTES),
-        _column(other, "modification_density")[modification_row], _column(other, "view_density")[view_row],
+        of_modification, of_view, other.column("sample_pass")[rows], keys.reshape(-1, KEY_BYTES),
+        other.column("modification_density")[modification_row], other.column("view_density")[view_row],
     )  # fmt: skip
-
-
-def _column(of: PlannedContent, name: str) -> NDArray[Any]:
-    """One input of all rows of a scene."""
-    return np.concatenate([getattr(rows, name) for _, rows in of.plans])

@@ -160,6 +160,10 @@ class PlannedContent:
             found.update(data[i : i + KEY_BYTES] for i in range(0, len(data), KEY_BYTES))
         return found
 
+    def column(self, name: str) -> NDArray[Any]:
+        """One input of all rows."""
+        return np.concatenate([getattr(rows, name) for _, rows in self.plans])
+
     def vectors(self, kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
         """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
         first_rows = np.array([first_row for first_row, _ in self.plans])

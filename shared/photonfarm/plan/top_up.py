@@ -56,7 +56,7 @@ class TopUp(Frozen):
         if not re.fullmatch(r"\+?\d{1,10}", spp):
             raise SpecError(f"spp = {spp!r}: write +64 for 64 more samples per pixel, or 256 for 256 in all")
         for condition in where:
-            _parsed(condition)
+            _parse_condition(condition)
         try:
             return cls(spp=int(spp), adds=spp.startswith("+"), where=tuple(where))
         except ValidationError as error:
@@ -80,7 +80,7 @@ def expand_top_up(
     Raises SpecError if nothing is planned or selected, or if it is too much for one request.
     """
     planned = PlannedViews.of(spec, known)
-    views = np.flatnonzero(_selected(planned, request.where))
+    views = np.flatnonzero(_select(planned, request.where))
     views = views[np.lexsort((planned.view_row[views], planned.modification_row[views]))]
     wanted = request.passes(spec)
     have = np.zeros_like(views) if request.adds else np.minimum(planned.passes[views], wanted)
@@ -151,10 +151,10 @@ class PlannedViews:
 # ---------------------------------------------------------------------------------------------------------- conditions
 
 
-def _selected(planned: PlannedViews, where: Sequence[str]) -> Mask:
+def _select(planned: PlannedViews, where: Sequence[str]) -> Mask:
     """Which of the views meet every condition; `views=first:N` counts those that meet all the others."""
     selected = np.ones(len(planned.view_row), np.bool_)
-    parsed = [_parsed(condition) for condition in where]
+    parsed = [_parse_condition(condition) for condition in where]
     for find, value in sorted(parsed, key=lambda condition: condition[0] is _first):  # that one last
         selected &= find(planned, value, selected)
     if not selected.any():
@@ -166,28 +166,28 @@ def _first(planned: PlannedViews, count: int, selected: Mask) -> Mask:  # noqa: 
     return np.cumsum(selected) <= count
 
 
-def _of_plan(planned: PlannedViews, number: int, selected: Mask) -> Mask:  # noqa: ARG001
+def _select_plan(planned: PlannedViews, number: int, selected: Mask) -> Mask:  # noqa: ARG001
     if number >= len(planned.known.plans):
         raise SpecError(f"where plan={number}: the scene has {len(planned.known.plans)} plans, numbered from 0")
     first, rows = planned.known.plans[number]
     return np.isin(planned.view_row, rows.sample_view[rows.sample_view >= first])
 
 
-def _of_rows(planned: PlannedViews, ends: tuple[int, int], selected: Mask) -> Mask:  # noqa: ARG001
+def _select_rows(planned: PlannedViews, ends: tuple[int, int], selected: Mask) -> Mask:  # noqa: ARG001
     shown = planned.sample_view[(planned.sample_row >= ends[0]) & (planned.sample_row <= ends[1])]
     return np.isin(planned.view_row, shown)
 
 
-def _with_modification(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
+def _select_modification(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
     keys = planned.modification_keys(selected)
     return _where(selected, [key.hex().startswith(begin) for key in keys])
 
 
-def _with_view(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
+def _select_view(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
     return _where(selected, [key.hex().startswith(begin) for key in planned.view_keys(selected)])
 
 
-def _held_out(planned: PlannedViews, share: float, selected: Mask) -> Mask:
+def _select_held_out(planned: PlannedViews, share: float, selected: Mask) -> Mask:
     return _where(selected, rows_held_out(planned, selected, share))
 
 
@@ -200,28 +200,28 @@ def _where(selected: Mask, found: list[bool]) -> Mask:
 Condition = tuple[Callable[[PlannedViews, Any, Mask], Mask], Any]
 
 
-def _parsed(condition: str) -> Condition:
+def _parse_condition(condition: str) -> Condition:
     """The function that selects the views of a condition, and its argument; raises SpecError for an unknown one."""
     match condition.split("="):
         case ["views", value] if re.fullmatch(r"first:[1-9]\d{0,8}", value):
             return _first, int(value.removeprefix("first:"))
         case ["plan", value] if re.fullmatch(r"\d{1,6}", value):
-            return _of_plan, int(value)
+            return _select_plan, int(value)
         case ["rows", value] if ends := re.fullmatch(r"(\d{1,12})(?:-(\d{1,12}))?", value):
-            return _of_rows, (int(ends[1]), int(ends[2] or ends[1]))
+            return _select_rows, (int(ends[1]), int(ends[2] or ends[1]))
         case ["modification", value] if re.fullmatch(r"[0-9a-f]{1,32}", value):
-            return _with_modification, value
+            return _select_modification, value
         case ["view", value] if re.fullmatch(r"[0-9a-f]{1,32}", value):
-            return _with_view, value
+            return _select_view, value
         case ["modification" | "view" as kind, value]:
             raise SpecError(
                 f"where {condition!r}: {value!r} is no content key of a {kind}, nor how one begins: 1 to 32 "
                 "hexadecimal digits, a to f in lower case"
             )
         case ["held-out"]:
-            return _held_out, HOLD_OUT
+            return _select_held_out, HOLD_OUT
         case ["held-out", value] if _A_SHARE.fullmatch(value) and 0 < float(value) < 1:
-            return _held_out, float(value)
+            return _select_held_out, float(value)
     raise SpecError(
         f"where {condition!r}: is no condition; allowed are views=first:N, view=KEY, modification=KEY, rows=A-B, "
         "plan=P, held-out and held-out=SHARE"

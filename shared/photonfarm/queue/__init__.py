@@ -11,24 +11,24 @@ rq:photonfarm:consumed:<scene id>       samples of a scene that its trainer has 
 
 from photonfarm.queue.connection import (
     RefusedError,
+    add_password,
     connect,
     has_password,
     queue_error,
     redis_errors,
-    with_password_of,
 )
 from photonfarm.queue.failures import (
     Failure,
     FailureCause,
-    causes,
+    count_failures,
+    group_causes,
     keep_failure,
     keep_retry,
-    kept_failures,
+    read_kept_failures,
     repeating_command,
-    times_failed,
 )
 from photonfarm.queue.job import QUEUE, TRIES, RenderArguments, is_job_name, job_name
-from photonfarm.queue.reconciliation import QUEUE_LIMIT, look, reconcile
+from photonfarm.queue.reconciliation import QUEUE_LIMIT, fill_seldom, reconcile
 from photonfarm.queue.rq_adapter import QueueStatus, queue_status
 from photonfarm.queue.share import Share
 from photonfarm.queue.workers import (
@@ -39,7 +39,7 @@ from photonfarm.queue.workers import (
     beat,
     bury,
     check_served,
-    consumed_samples,
+    read_consumed,
     read_workers,
     release,
     report_consumed,
@@ -61,21 +61,23 @@ __all__ = [
     "RenderArguments",
     "Share",
     "WorkerReport",
+    "add_password",
     "beat",
     "bury",
-    "causes",
     "check_served",
     "connect",
-    "consumed_samples",
+    "count_failures",
+    "fill_seldom",
+    "group_causes",
     "has_password",
     "is_job_name",
     "job_name",
     "keep_failure",
     "keep_retry",
-    "kept_failures",
-    "look",
     "queue_error",
     "queue_status",
+    "read_consumed",
+    "read_kept_failures",
     "read_workers",
     "reconcile",
     "redis_errors",
@@ -84,6 +86,4 @@ __all__ = [
     "report_consumed",
     "serve",
     "take_name",
-    "times_failed",
-    "with_password_of",
 ]

@@ -57,7 +57,7 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
     retry = _retry() if only_s is None else Retry(NoBackoff(), 0)
     try:
         connection = Redis.from_url(
-            _checked(url), socket_timeout=only_s or SOCKET_TIMEOUT_S, socket_connect_timeout=5, retry=retry
+            _check_url(url), socket_timeout=only_s or SOCKET_TIMEOUT_S, socket_connect_timeout=5, retry=retry
         )
     except (ValueError, TypeError):  # their text may hold a piece of the password
         raise QueueError(
@@ -98,7 +98,7 @@ def _reason(error: Exception, url: str) -> str:
     return f"does not let in the user {user} ({reason}); check the password, in the URL or in a {PASSWORD_VARIABLE}"
 
 
-def _checked(url: str) -> str:
+def _check_url(url: str) -> str:
     if url.count("@") > 1 or ("@" in url and "@" not in urlsplit(url).netloc):
         raise ValueError
     return url
@@ -124,7 +124,7 @@ def has_password(url: str) -> bool:
     return ":" in rest.rpartition("@")[0] or "password=" in unquote(rest.partition("?")[2])
 
 
-def with_password_of(file: Path | None, url: str) -> str:
+def add_password(file: Path | None, url: str) -> str:
     """The URL of a TCP port with the password from a file, unless the URL has one; raises QueueError.
 
     Docker stores secrets in files; unlike variables, they do not show in `docker inspect` and are not inherited.

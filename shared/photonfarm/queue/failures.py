@@ -20,7 +20,7 @@ from pathlib import Path
 from photonfarm.queue.job import TRIES, RenderArguments, is_job_name
 from photonfarm.store import Store
 from photonfarm.store.io.storage import put_json
-from photonfarm.store.write.store import FAILURES_FOLDER
+from photonfarm.store.model.store import FAILURES_FOLDER
 
 REASON_LETTERS = 2000
 
@@ -59,12 +59,12 @@ class FailureCause:
         return next(iter(self.jobs))
 
 
-def one_line(reason: str) -> str:
+def shorten(reason: str) -> str:
     """A reason as it is kept: one line, not too long."""
     return " ".join(reason.split())[:REASON_LETTERS]
 
 
-def causes(failures: Mapping[str, Failure]) -> list[FailureCause]:
+def group_causes(failures: Mapping[str, Failure]) -> list[FailureCause]:
     """Failures by their cause, the most frequent first."""
     grouped: dict[str, dict[str, Failure]] = {}
     for name, failure in sorted(failures.items(), key=lambda item: (not item[1].set_aside, item[0])):
@@ -86,7 +86,7 @@ RETRIED = "retried"
 
 def keep_failure(store: Store, name: str, reason: str, *, worker: str) -> None:
     """Keep why a job failed just now. Raises OSError if the store refuses."""
-    _keep(store, name, {"job": name, "reason": one_line(reason), "worker": worker})
+    _keep(store, name, {"job": name, "reason": shorten(reason), "worker": worker})
 
 
 def keep_retry(store: Store) -> None:
@@ -100,7 +100,7 @@ def _keep(store: Store, name: str, document: dict[str, str]) -> None:
     put_json(store.storage, {**document, "at_s": at_ms / 1000}, f"{FAILURES_FOLDER}/{name}.{at_ms}.json")
 
 
-def kept_failures(store: Store, wanted: Callable[[str], bool] = lambda _: True) -> dict[str, Failure]:
+def read_kept_failures(store: Store, wanted: Callable[[str], bool] = lambda _: True) -> dict[str, Failure]:
     """The last kept failure of each of the `wanted` jobs since all were retried, by its name.
 
     Raises OSError if the store cannot be read.
@@ -112,7 +112,7 @@ def kept_failures(store: Store, wanted: Callable[[str], bool] = lambda _: True) 
     }
 
 
-def times_failed(store: Store) -> dict[str, int]:
+def count_failures(store: Store) -> dict[str, int]:
     """How often each job has failed since all were retried, by its name, for one listing. Raises OSError."""
     return {name: len(times_ms) for name, times_ms in _times_ms(store).items()}
 
@@ -130,6 +130,6 @@ def _times_ms(store: Store) -> dict[str, list[int]]:
 
 def _reason(store: Store, name: str, at_ms: int) -> str:
     try:
-        return one_line(json.loads(store.storage.read(f"{FAILURES_FOLDER}/{name}.{at_ms}.json"))["reason"])
+        return shorten(json.loads(store.storage.read(f"{FAILURES_FOLDER}/{name}.{at_ms}.json"))["reason"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         return "the record of the failure cannot be read"

@@ -15,7 +15,7 @@ from photonfarm.core.errors import QueueError
 from photonfarm.queue.connection import redis_errors
 from photonfarm.queue.job import job_name
 from photonfarm.queue.rq_adapter import add, fail_lost, forget_failures, open_queue
-from photonfarm.queue.workers import serve, started
+from photonfarm.queue.workers import read_started, serve
 from photonfarm.store import SceneStore, Store
 
 QUEUE_LIMIT = 10_000
@@ -40,7 +40,7 @@ _logged: dict[str, str] = {}
 """Why scenes were skipped, by scene id: an idle worker looks every few seconds, and logs each reason once."""
 
 
-def look(store: Store, connection: Redis, *, scene_id: str | None = None, every_s: float) -> Look:
+def fill_seldom(store: Store, connection: Redis, *, scene_id: str | None = None, every_s: float) -> Look:
     """Fill the queue as `reconcile` does, at most once in `every_s` by all callers together.
 
     So a thousand workers that wait for the last jobs cost the store and Redis no more than one of them. The others
@@ -51,7 +51,7 @@ def look(store: Store, connection: Redis, *, scene_id: str | None = None, every_
     with redis_errors("asked what is missing"):
         if known := connection.get(key):
             return "waits" if known == b"waits" else "nothing"
-        found = _filled(store, connection, scene_id)
+        found = _fill_alone(store, connection, scene_id)
         if found is None:
             return "waits"
         if found.queued:
@@ -73,7 +73,7 @@ def reconcile(
     Raises QueueError also if Redis fails or serves another store, StoreError if the store or the one scene cannot be
     read.
     """
-    found = _filled(store, connection, scene_id, wait_s, retry=retry)
+    found = _fill_alone(store, connection, scene_id, wait_s, retry=retry)
     if found is None:
         raise QueueError(
             f"another process has been filling the queue for {wait_s:g} s, so this one has queued and retried "
@@ -87,7 +87,7 @@ class _Filled(NamedTuple):
     under_way: int  # missing jobs that were queued or started before
 
 
-def _filled(
+def _fill_alone(
     store: Store, connection: Redis, scene_id: str | None, wait_s: float = 0.0, *, retry: bool | str = False
 ) -> _Filled | None:
     """What `reconcile` has done; None if another process still fills the queue after `wait_s`. Raises as that does."""
@@ -109,7 +109,7 @@ def _fill(store: Store, connection: Redis, only: str | None) -> _Filled:
     queue = open_queue(connection)
     fail_lost(queue)
     queued = queue.get_job_ids()
-    under_way = {*queued, *(entry.partition(":")[0] for entry in started(connection))}
+    under_way = {*queued, *(entry.partition(":")[0] for entry in read_started(connection))}
     failed = set(queue.failed_job_registry.get_job_ids(cleanup=False))
     busy = under_way | failed
     held = Counter(name.rpartition("-")[0] for name in queued)

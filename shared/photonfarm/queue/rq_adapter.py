@@ -21,9 +21,9 @@ from rq.results import Result
 from rq.serializers import JSONSerializer
 
 from photonfarm.queue.connection import redis_errors
-from photonfarm.queue.failures import Failure, one_line
+from photonfarm.queue.failures import Failure, shorten
 from photonfarm.queue.job import FUNCTION, QUEUE, QUEUE_KEY, TRIES, is_job_name, job_name
-from photonfarm.queue.workers import Activity, as_text, read_workers, started
+from photonfarm.queue.workers import Activity, decode_text, read_started, read_workers
 
 AT_ONCE = 500
 """The names of queued jobs in one request."""
@@ -61,7 +61,7 @@ def take(
     Jobs of other scenes than `scene_id`, and of the scenes in `leave`, stay in the queue for other workers. A job lost
     between the queue and its execution is queued again by `reconcile`.
     """
-    for name in _queued(queue):
+    for name in _read_queued(queue):
         scene = name.rpartition("-")[0]
         if scene in leave or scene_id not in (None, scene):
             continue
@@ -77,7 +77,7 @@ def take(
     return None
 
 
-def _queued(queue: Queue) -> Iterator[str]:
+def _read_queued(queue: Queue) -> Iterator[str]:
     """The queued names in order, as many at once as one request should read."""
     start = 0
     while names := queue.get_job_ids(start, AT_ONCE):
@@ -131,7 +131,7 @@ def fail(queue: Queue, execution: Execution, reason: str, *, counts: bool = True
             if job.should_retry:
                 job.retry(queue, pipeline)
             else:
-                record_job_failure(job, one_line(reason), pipeline)
+                record_job_failure(job, shorten(reason), pipeline)
                 is_set_aside = True
         pipeline.execute()
     return is_set_aside
@@ -139,7 +139,7 @@ def fail(queue: Queue, execution: Execution, reason: str, *, counts: bool = True
 
 def fail_lost(queue: Queue) -> None:
     """Fail the executions whose workers no longer keep them alive."""
-    for entry, alive in started(queue.connection).items():
+    for entry, alive in read_started(queue.connection).items():
         if not alive:
             fail(queue, Execution.from_composite_key(entry, queue.connection), "its worker died, or lost Redis")
 
@@ -148,7 +148,7 @@ def fail_of_worker(connection: Redis, worker: str, reason: str, *, counts: bool)
     """Fail what a worker has in hand, whose process has ended."""
     of_worker = Execution("", "", connection, worker).worker_executions_key
     for entry in connection.smembers(of_worker):
-        execution = Execution.from_composite_key(as_text(entry), connection)
+        execution = Execution.from_composite_key(decode_text(entry), connection)
         execution.worker_name = worker
         fail(open_queue(connection), execution, reason, counts=counts)
 
@@ -211,7 +211,7 @@ def queue_status(connection: Redis) -> QueueStatus:
                 left.setdefault(scene_id, {})[name] = reason
         return QueueStatus(
             queued=connection.llen(QUEUE_KEY),
-            running=sum(started(connection).values()),
+            running=sum(read_started(connection).values()),
             workers=len(workers),
             failed=read_failures(open_queue(connection)),
             paused={name: report.paused for name, report in workers.items() if report.paused},

@@ -74,7 +74,7 @@ class WorkerReport:
         return self.host == process_space() and is_gone(self.process)
 
 
-def as_text(value: object) -> str:
+def decode_text(value: object) -> str:
     """What Redis holds, as text."""
     return value.decode() if isinstance(value, bytes) else str(value)
 
@@ -119,7 +119,7 @@ def bury(connection: Redis, name: str) -> None:
 
 def read_workers(connection: Redis) -> dict[str, WorkerReport]:
     """The workers that are alive, by name; those of this machine only if their process is. Forgets the others."""
-    names = sorted(as_text(key).removeprefix(WORKER) for key in connection.smembers(WORKERS))
+    names = sorted(decode_text(key).removeprefix(WORKER) for key in connection.smembers(WORKERS))
     with connection.pipeline(transaction=False) as pipeline:
         for name in names:
             pipeline.hget(WORKER + name, REPORT)
@@ -131,12 +131,12 @@ def read_workers(connection: Redis) -> dict[str, WorkerReport]:
     return {name: report for name, report in found.items() if not report.has_ended}
 
 
-def started(connection: Redis) -> dict[str, bool]:
+def read_started(connection: Redis) -> dict[str, bool]:
     """RQ's entries of started jobs, `<name>:<execution>`, and whether their workers still tell of them.
 
     An execution's key ends by the clock of Redis, while RQ's own times are those of each worker's.
     """
-    entries = [as_text(entry) for entry in connection.zrange(STARTED_KEY, 0, -1)]
+    entries = [decode_text(entry) for entry in connection.zrange(STARTED_KEY, 0, -1)]
     with connection.pipeline(transaction=False) as pipeline:
         for entry in entries:
             pipeline.exists(f"rq:execution:{entry}")
@@ -169,7 +169,7 @@ def serve(connection: Redis, store: Store) -> None:
 def check_served(connection: Redis, store: Store) -> None:
     """Check that this Redis serves no other store; raises OtherStoreError if it does, QueueError if it fails."""
     with redis_errors("asked which store it serves"):
-        other, left_ms = as_text(connection.get(SERVED) or b""), connection.pttl(SERVED)
+        other, left_ms = decode_text(connection.get(SERVED) or b""), connection.pttl(SERVED)
     if other and other != store.store_id:
         raise OtherStoreError(
             f"this Redis serves the store with the id {other}, and {store.storage.where} has the id {store.store_id}; "
@@ -195,7 +195,7 @@ def report_consumed(connection: Redis, scene_id: str, samples: int) -> None:
     connection.set(CONSUMED + scene_id, samples, ex=CONSUMED_TTL_S)
 
 
-def consumed_samples(connection: Redis, scene_ids: Sequence[str]) -> dict[str, int]:
+def read_consumed(connection: Redis, scene_ids: Sequence[str]) -> dict[str, int]:
     """How many samples of each of these scenes its trainer has used, by its last report; 0 without one."""
     counts = connection.mget([CONSUMED + scene_id for scene_id in scene_ids]) if scene_ids else []
     return {scene_id: int(samples or 0) for scene_id, samples in zip(scene_ids, counts, strict=True)}

@@ -19,13 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, FiniteFloat, ValidationError
 
-from photonfarm.core.archives import stored_arrays, write_arrays
+from photonfarm.core.archives import read_arrays, write_arrays
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Frozen, sentences
 from photonfarm.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.view import View, in_free_space, in_group
+from photonfarm.scene.view import View, are_in_free_space, are_in_group
 
 MOST_FRAMES = 10_000
 ORBIT = 0.9
@@ -66,7 +66,7 @@ class CameraPath(Frozen):
         except ValueError as error:
             raise SpecError(f"{file}: is not valid JSON: {error}; a camera path looks like {FORM}") from error
 
-    def sampled(self) -> list[View]:
+    def sample(self) -> list[View]:
         """The views of all frames, at equal steps of the curve's parameter, which is 1 between two key views.
 
         Origin and look-at point each follow a Catmull–Rom spline [Catmull and Rom, 1974], which goes through all of
@@ -99,7 +99,7 @@ def orbit(spec: SceneSpec, frames: int, modification: Modification | None = None
     )
 
 
-def kept_clear(spec: SceneSpec, views: list[View], modification: Modification) -> list[View]:
+def check_clear(spec: SceneSpec, views: list[View], modification: Modification) -> list[View]:
     """The views of a path, if all its cameras are in free space; raises SpecError for the first that is not.
 
     Free space is known in the box of origins alone; beyond it, only the movable groups are looked at.
@@ -117,8 +117,8 @@ def _obstacles(spec: SceneSpec, views: list[View], modification: Modification | 
     """The frames whose cameras are not in free space, each with what they stand in."""
     vectors = (rest(spec) if modification is None else modification).vector[None].repeat(len(views), axis=0)
     origins = np.stack([view.origin for view in views])
-    around = {group.name: in_group(spec, g, origins, vectors) for g, group in enumerate(spec.groups)}
-    for frame in np.flatnonzero(~in_free_space(spec, origins, vectors)).tolist():
+    around = {group.name: are_in_group(spec, g, origins, vectors) for g, group in enumerate(spec.groups)}
+    for frame in np.flatnonzero(~are_in_free_space(spec, origins, vectors)).tolist():
         names = [name for name, holds in around.items() if holds[frame]]
         yield frame, f"in the box around {names[0]!r}" if names else "in a solid of the scene, or close to one"
 
@@ -198,7 +198,7 @@ class Frames:
     @classmethod
     def read(cls, file: Path) -> Self:
         """Read what `write` stored; raises StoreError for anything else."""
-        with stored_arrays(file, "buffers", "buffers") as stored:
+        with read_arrays(file, "buffers", "buffers") as stored:
             views = tuple(View.from_vector(vector) for vector in stored["view"])
             photons = None
             if "photon_bounce" in stored:

@@ -54,7 +54,7 @@ class FreeSpace(Frozen):
 Free = NDArray[np.bool_]
 
 
-def packed(free: Free) -> str:
+def pack(free: Free) -> str:
     """Cells (X, Y, Z) as the text of `FreeSpace.free`."""
     return base64.b64encode(zlib.compress(np.packbits(free).tobytes(), 9)).decode()
 

@@ -39,7 +39,7 @@ def warnings(named: NamedSpec) -> list[str]:
 
 def doubts(spec: SceneSpec, lights: frozenset[str]) -> list[Doubt]:
     """What a spec says that can hardly be meant; `lights` are the ids of the scene's own lights."""
-    return [*_of_view(spec), *_of_transport(spec), *_of_lights(spec, lights), *_of_groups(spec)]
+    return [*_check_view(spec), *_check_transport(spec), *_check_lights(spec, lights), *_check_groups(spec)]
 
 
 def group_key(spec: SceneSpec, index: int) -> str:
@@ -48,7 +48,7 @@ def group_key(spec: SceneSpec, index: int) -> str:
     return f"objects.{index}" if index < objects else f"lights.{index - objects}"
 
 
-def _of_view(spec: SceneSpec) -> Iterator[Doubt]:
+def _check_view(spec: SceneSpec) -> Iterator[Doubt]:
     view, (narrow, wide) = spec.view, USUAL_FOV
     if view.fov_deg < narrow:
         yield Doubt(
@@ -73,11 +73,11 @@ def _of_view(spec: SceneSpec) -> Iterator[Doubt]:
             "view.origin",
             f"origin is {gap:.3g} away from look_at, {gap / scale:.0f} times the size of all that is looked at",
         )
-    if view.near > 0.1 * max(_size(_joined(view.origin, view.look_at)), gap):
+    if view.near > 0.1 * max(_size(_join(view.origin, view.look_at)), gap):
         yield Doubt("view.near", f"near = {view.near:g} hides everything nearer than that, which is much of the view")
 
 
-def _of_transport(spec: SceneSpec) -> Iterator[Doubt]:
+def _check_transport(spec: SceneSpec) -> Iterator[Doubt]:
     follows = {
         0: "renders black images, as every path of light has at least one edge",
         1: "shows lights that are seen directly, and nothing that they light",
@@ -87,7 +87,7 @@ def _of_transport(spec: SceneSpec) -> Iterator[Doubt]:
         yield Doubt("transport.max_depth", f"max_depth = {depth} {follows[depth]}; 8 is usual")
 
 
-def _of_lights(spec: SceneSpec, lights: frozenset[str]) -> Iterator[Doubt]:
+def _check_lights(spec: SceneSpec, lights: frozenset[str]) -> Iterator[Doubt]:
     movable = [light for light in spec.lights if light.removal_probability < 1]
     moved = {shape for light in spec.lights for shape in light.shape_ids}
     own = lights - moved
@@ -99,8 +99,8 @@ def _of_lights(spec: SceneSpec, lights: frozenset[str]) -> Iterator[Doubt]:
         yield Doubt("scene", "the scene has no light at all, so that every image is black; add one under [[lights]]")
 
 
-def _of_groups(spec: SceneSpec) -> Iterator[Doubt]:
-    around = _joined(spec.view.origin, spec.view.look_at)
+def _check_groups(spec: SceneSpec) -> Iterator[Doubt]:
+    around = _join(spec.view.origin, spec.view.look_at)
     for index, group in enumerate(spec.groups):
         key = group_key(spec, index)
         size, seen = _size(group.box), _size(around)
@@ -121,7 +121,7 @@ def _of_groups(spec: SceneSpec) -> Iterator[Doubt]:
             yield Doubt(f"{key}.removal_probability", f"removal_probability = 1: {group.name!r} is never there")
 
 
-def _joined(one: Box, other: Box) -> Box:
+def _join(one: Box, other: Box) -> Box:
     low, high = np.minimum(one.low, other.low), np.maximum(one.high, other.high)
     return Box(min=tuple(low.tolist()), max=tuple(high.tolist()))
 

@@ -116,7 +116,7 @@ def sample_views(
         vectors[left] = low + uniform_of([keys[i] for i in left.tolist()], "placement", 6, 6 * draw) * (high - low)
         origin, target = vectors[left, :3], vectors[left, 3:].astype(np.float64)
         is_kept = np.linalg.norm(target - origin, axis=1) >= least
-        left = left[~(is_kept & in_free_space(spec, origin, modifications[left]))]
+        left = left[~(is_kept & are_in_free_space(spec, origin, modifications[left]))]
     raise nowhere(spec)
 
 
@@ -141,7 +141,7 @@ def nowhere(spec: SceneSpec) -> SpecError:
     )
 
 
-def in_free_space(spec: SceneSpec, origins: F32, modifications: F32) -> NDArray[np.bool_]:
+def are_in_free_space(spec: SceneSpec, origins: F32, modifications: F32) -> NDArray[np.bool_]:
     """Whether origins (N, 3) are in the open in configurations (N, G, 4), (N,): in free cells, in no group's box.
 
     All are in a spec without free space.
@@ -151,11 +151,11 @@ def in_free_space(spec: SceneSpec, origins: F32, modifications: F32) -> NDArray[
         return np.ones(len(origins), np.bool_)
     free = space.holds(spec.view.origin.low, spec.view.origin.high, origins)
     for g in range(len(spec.groups)):
-        free &= ~in_group(spec, g, origins, modifications)
+        free &= ~are_in_group(spec, g, origins, modifications)
     return free
 
 
-def in_group(spec: SceneSpec, g: int, origins: F32, modifications: F32) -> NDArray[np.bool_]:
+def are_in_group(spec: SceneSpec, g: int, origins: F32, modifications: F32) -> NDArray[np.bool_]:
     """Whether origins (N, 3) are in the box around a group, where configurations (N, G, 4) put it, (N,)."""
     space, group = spec.view.free_space, spec.groups[g]
     if space is None or group.name not in space.groups:

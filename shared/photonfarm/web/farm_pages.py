@@ -13,7 +13,7 @@ from photonfarm.farm.status import NoQueue
 from photonfarm.farm.training import VIEWS, RunFolder
 from photonfarm.farm.watch import FarmView, FarmWatch
 from photonfarm.store import Store
-from photonfarm.store.write.plans import plan_of
+from photonfarm.store.model.plans import plan_of
 from photonfarm.web.images import Cached
 from photonfarm.web.samples import SceneSamples
 from photonfarm.web.server import NotThereError

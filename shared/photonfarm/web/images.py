@@ -51,12 +51,12 @@ def encode(picture: Picture, kind: Literal["PNG", "JPEG"] = "PNG") -> bytes:
 def draw_array(name: str, values: F32, exposure: float) -> Picture:
     """A buffer or guide, (H, W) or (H, W, 3), by its name: normals, reflectances, distances, α, else radiance."""
     if name in NORMALS:
-        return pictures.of_normal(values)
+        return pictures.draw_normal(values)
     if name in REFLECTANCES:
-        return pictures.of_albedo(values)
+        return pictures.draw_albedo(values)
     if name == "roughness":
         return np.repeat(np.round(255 * np.clip(values, 0, 1)).astype(np.uint8)[..., None], 3, axis=2)
-    return pictures.of_depth(values) if values.ndim == 2 else pictures.display(values, exposure)
+    return pictures.draw_depth(values) if values.ndim == 2 else pictures.display(values, exposure)
 
 
 def estimate_noise(halves: F32) -> F32:
@@ -86,7 +86,7 @@ def pack_points(position: F32, normal: F32, colour: Picture, seen: NDArray[np.bo
 
 def colour_points(albedo: F32, emission: F32) -> Picture:
     """The colours (N, 3) of points: their reflectance, and white-hot where they emit."""
-    return pictures.of_albedo(np.clip(albedo + emission, 0, 1)[None])[0]
+    return pictures.draw_albedo(np.clip(albedo + emission, 0, 1)[None])[0]
 
 
 def colour_photons(power: F32) -> Picture:

@@ -55,12 +55,19 @@ def test_without_a_repository_the_commit_is_unknown(tmp_path: Path, monkeypatch:
 def test_tables_are_written_under_the_name_of_their_page(checkout: Path) -> None:
     out = checkout / "docs" / "results"
     results.write("compare_with_path", "# Page", {"rows": [1]}, out, page="bdpt_against_path")
-    document = json.loads((out / "bdpt_against_path.json").read_text())
+    document = json.loads((out / "compare_with_path.json").read_text())
     assert document["rows"] == [1]
     assert document["commit"] == git(checkout, "rev-parse", "--short", "HEAD")
     page, signed = (out / "bdpt_against_path.md").read_text().split("\n\n")
     assert page == "# Page"
     assert signed.startswith("Made by `")
+
+
+def test_a_benchmark_replaces_its_own_part_of_a_page_and_leaves_the_others(tmp_path: Path) -> None:
+    for text in ("# Cost\n\nold\n\n## Views\n\nold", "# Rays\n\nmany", "# Cost\n\nnew"):
+        results.save("cost", text, {"of": text}, tmp_path, stem=text[2:6].lower())
+    assert (tmp_path / "cost.md").read_text() == "# Cost\n\nnew\n\n# Rays\n\nmany\n"
+    assert json.loads((tmp_path / "rays.json").read_text()) == {"of": "# Rays\n\nmany"}
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ mi = backend.load(threads=1)
 from bench.renderer.peers.luxcore import LuxCoreMethod, installed, settings  # noqa: E402 - after the variant is set
 from bench.renderer.peers.luxcore_scene import NotExpressibleError, translate  # noqa: E402
 from bench.renderer.peers.methods import MitsubaMethod, integrator  # noqa: E402
-from bench.stability.scenes.hard_scenes import HARD_SCENES, camera, grey, rectangle  # noqa: E402
+from tests.stability.scenes.hard_scenes import HARD_SCENES, camera, grey, rectangle  # noqa: E402
 
 needs_luxcore = pytest.mark.skipif(not installed(), reason="pyluxcore is not installed: make bench-render installs it")
 

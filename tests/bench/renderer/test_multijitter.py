@@ -11,7 +11,7 @@ from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
 from bench.renderer.peers.methods import MitsubaMethod, integrator, multijittered  # noqa: E402
-from bench.stability.scenes.hard_scenes import HARD_SCENES, camera  # noqa: E402 - after the variant is set
+from tests.stability.scenes.hard_scenes import HARD_SCENES, camera  # noqa: E402 - after the variant is set
 
 SEEDS = 16
 SPP = 16

@@ -10,7 +10,7 @@ from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.queue import TRIES, connect, queue_status
 from photonfarm.queue.rq_adapter import open_queue
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.write.lease import lease
+from photonfarm.store.model.lease import hold_lease
 
 
 @pytest.mark.parametrize("share", [None, "0/1"])
@@ -25,7 +25,7 @@ def test_a_worker_leaves_a_scene_that_somebody_has_for_itself_until_it_is_free(
     ) as worker:
         try:
             analytic.wait_for(lambda: len(scene.committed_jobs()) == 1, 60)
-            with lease(store.storage, scene.scene_id, "store check --repair", lambda _: None):
+            with hold_lease(store.storage, scene.scene_id, "store check --repair", lambda _: None):
                 done = len(scene.committed_jobs())
                 analytic.wait_for(lambda: "takes no jobs of scene" in log.read_text(), 30)
                 if not share:

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.queue import TRIES, connect, kept_failures, queue_status, reconcile
+from photonfarm.queue import TRIES, connect, queue_status, read_kept_failures, reconcile
 from photonfarm.queue.rq_adapter import open_queue
 from photonfarm.renderer.worker.settings import GRACE_S
 from photonfarm.store import SceneReader, SceneStore, Store
@@ -223,7 +223,7 @@ def test_a_job_that_hangs_is_ended_at_the_deadline_and_where_it_hung_is_told(
     scene = planned(1)
     running = start(scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=4.0)
     store = Store(scene.folder.parent.parent)
-    analytic.wait_for(lambda: sum(failure.times for failure in kept_failures(store).values()) >= 2)
+    analytic.wait_for(lambda: sum(failure.times for failure in read_kept_failures(store).values()) >= 2)
     running.send_signal(signal.SIGTERM)
     running.wait(20)
     told = running.stderr.read().decode()

@@ -17,7 +17,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import QueueError
 from photonfarm.farm.submission import submit
 from photonfarm.plan.request import Request
-from photonfarm.queue import TRIES, Share, kept_failures
+from photonfarm.queue import TRIES, Share, read_kept_failures
 from photonfarm.renderer.worker.child import RenderWorker
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.worker import run_worker
@@ -127,7 +127,7 @@ def test_sigterm_lets_the_job_at_hand_be_finished(
     running.send_signal(signal.SIGTERM)
     assert running.wait(20) == 0
     assert done + 1 <= len(scene.committed_jobs()) <= done + 2
-    assert kept_failures(Store(scene.folder.parent.parent)) == {}
+    assert read_kept_failures(Store(scene.folder.parent.parent)) == {}
 
 
 def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_a_retry(
@@ -137,7 +137,7 @@ def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_a_retr
     store = Store(scene.folder.parent.parent)
     for _ in range(2):  # the second worker finds what the first one has kept
         assert start(scene, "0/1", 0, "broken", until_complete=True).wait(60) == 7
-    assert [failure.times for failure in kept_failures(store).values()] == [TRIES, TRIES]
+    assert [failure.times for failure in read_kept_failures(store).values()] == [TRIES, TRIES]
     assert "photonfarm submit --retry" in (tmp_path / "worker-0.log").read_text()
 
     named = NamedSpec("analytic", analytic.small_spec(), None)
@@ -160,7 +160,7 @@ def test_a_job_whose_process_is_killed_comes_last_and_is_tried_again(
     assert scene.missing_jobs() == []
     committed = sorted((scene.folder / "committed").iterdir(), key=lambda marker: marker.stat().st_mtime_ns)
     assert int(committed[-1].stem) == 0
-    (failure,) = kept_failures(Store(scene.folder.parent.parent)).values()
+    (failure,) = read_kept_failures(Store(scene.folder.parent.parent)).values()
     assert "SIGKILL" in failure.reason
 
 
@@ -168,7 +168,7 @@ def test_a_job_whose_process_is_killed_comes_last_and_is_tried_again(
 def test_a_job_that_hangs_has_failed_at_the_deadline(planned: Callable[..., SceneStore], start: Starter) -> None:
     scene = planned(1)
     assert start(scene, "0/1", 60, until_complete=True, deadline_s=0.5, steady_s=0.1).wait(120) == 7
-    kept = kept_failures(Store(scene.folder.parent.parent)).values()
+    kept = read_kept_failures(Store(scene.folder.parent.parent)).values()
     assert {failure.times for failure in kept} == {TRIES}
     assert all("took longer than --deadline 0.5 s" in failure.reason for failure in kept)
 

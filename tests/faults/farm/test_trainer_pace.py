@@ -18,7 +18,7 @@ from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import AHEAD_LOOK_S, TrainerPace
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.write.scene_store import Progress
+from photonfarm.store.model.scene_store import Progress
 
 
 class Clock:

@@ -8,7 +8,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.scenes.hard_scenes import HARD_SCENES
+from tests.stability.scenes.hard_scenes import HARD_SCENES
 
 SIZE, SEEDS, REFERENCE_SEEDS = 16, range(8), range(1000, 1008)
 PATH = {"type": "path", "max_depth": 6}

@@ -9,14 +9,14 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.scenes import hard_scenes
-from bench.stability.weights.weight_check import ball_light, bulb_room, random_usefulness
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.guiding import grid, learning
 from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
 from photonfarm.renderer.bdpt.guiding.learning import LightGuide
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.lights.emission import INFINITE, Lights, read_lights, sample_emission
+from tests.stability.scenes import hard_scenes
+from tests.stability.weights.weight_check import ball_light, bulb_room, random_usefulness
 
 BDPT = {"type": "bdpt", "max_depth": 5}
 

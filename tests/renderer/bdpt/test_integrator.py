@@ -9,10 +9,10 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.scenes.hard_scenes import HARD_SCENES
 from photonfarm.renderer import bdpt
 from photonfarm.renderer.bdpt import variant
 from photonfarm.renderer.bdpt.lights import emission
+from tests.stability.scenes.hard_scenes import HARD_SCENES
 
 SIZE = 16
 

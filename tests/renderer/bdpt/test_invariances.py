@@ -8,9 +8,9 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.invariances import COUNTS, Invariance, checks
-from bench.stability.scenes.hard_scenes import HARD_SCENES
 from photonfarm.renderer.bdpt import launches
+from tests.stability.invariances import COUNTS, Invariance, checks
+from tests.stability.scenes.hard_scenes import HARD_SCENES
 
 # The oracle's have tests of their own, and more of them: test_oracle.py
 SLOW = ("seed-many-lights", "counts-many-lights", "counts-plastics")

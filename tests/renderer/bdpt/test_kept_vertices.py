@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.scenes import hard_scenes
 from photonfarm.renderer.bdpt import light_paths, randomness
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex
 from photonfarm.renderer.bdpt.light_paths import PathOptions
 from photonfarm.renderer.bdpt.lights.emission import read_lights
+from tests.stability.scenes import hard_scenes
 
 PATHS, EDGES = 1 << 15, 6
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bench.stability.scenes.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining
 from photonfarm.renderer.bdpt.guiding import grid
 from photonfarm.renderer.bdpt.lights import selection
 from photonfarm.renderer.bdpt.lights.emission import read_lights
+from tests.stability.scenes.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining
 
 SIGNIFICANCE = 1e-5  # of each test over all its comparisons; the seeds are fixed
 CELLS = selection.CELLS**3

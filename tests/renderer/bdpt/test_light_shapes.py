@@ -10,11 +10,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.scenes import hard_scenes
-from bench.stability.scenes.lights import round_lights
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.lights.emission import read_lights, sample_emission
 from photonfarm.renderer.bdpt.lights.selection import is_unfolded
+from tests.stability.scenes import hard_scenes
+from tests.stability.scenes.lights import round_lights
 
 BDPT = {"type": "bdpt", "max_depth": 4}
 

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from bench.stability.scenes.case import BdptSettings
-from bench.stability.weights import weight_check
-from bench.stability.weights.oracle import F64
-from bench.stability.weights.weight_check import SCENES, compare_weights
+from tests.stability.scenes.case import BdptSettings
+from tests.stability.weights import weight_check
+from tests.stability.weights.oracle import F64
+from tests.stability.weights.weight_check import SCENES, compare_weights
 
 LANES = 256
 

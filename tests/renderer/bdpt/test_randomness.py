@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from bench.stability.scenes.hard_scenes import HARD_SCENES
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.launches import Launch
+from tests.stability.scenes.hard_scenes import HARD_SCENES
 
 SIGNIFICANCE = 1e-5  # of each test, over all its comparisons together; the seeds are fixed
 SEEDS = (0, 1, 12345, 0xFFFFFFFF)

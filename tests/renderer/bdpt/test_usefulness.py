@@ -9,11 +9,11 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.scenes import hard_scenes
 from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.guiding.learning import LightGuide
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, LEAST, NORMALS, SIDE, cell_of, usefulness
+from tests.stability.scenes import hard_scenes
 
 CONNECTED = {"type": "bdpt", "max_depth": 6, "connections": 4, "light_ratio": 0.125, "guided_light": True}
 

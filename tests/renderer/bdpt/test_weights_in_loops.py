@@ -14,11 +14,6 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from bench.stability.scenes import hard_scenes
-from bench.stability.weights import oracle
-from bench.stability.weights.joined_paths import Bounce, JoinedPaths, Pinhole, TechniqueCounts
-from bench.stability.weights.oracle_paths import stored, usefulness
-from bench.stability.weights.weight_check import random_guide, random_usefulness
 from photonfarm.renderer.bdpt import eye_paths, light_paths, weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
 from photonfarm.renderer.bdpt.guiding.learning import LightGuide
@@ -26,6 +21,11 @@ from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
 from photonfarm.renderer.bdpt.lights.emission import AREA, DIRECTION, POSITION, DirectSample, read_lights
+from tests.stability.scenes import hard_scenes
+from tests.stability.weights import oracle
+from tests.stability.weights.joined_paths import Bounce, JoinedPaths, Pinhole, TechniqueCounts
+from tests.stability.weights.oracle_paths import stored, usefulness
+from tests.stability.weights.weight_check import random_guide, random_usefulness
 
 EDGES, SIZE, SPP = 5, 16, 8
 CONNECTIONS, LIGHT_RATIO = 1, 0.5

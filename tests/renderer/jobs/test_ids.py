@@ -17,7 +17,7 @@ from photonfarm.renderer.jobs.repeat import repeat
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.read.other_scenes import with_same_radiance
+from photonfarm.store.read.other_scenes import find_same_radiance
 
 REQUEST = Request(modifications=3, views_per_modification=2)
 
@@ -176,8 +176,8 @@ def test_halves_that_are_damaged_there_are_rendered_and_the_healthy_scene_is_pla
     taken = rendered(store, other, analytic, halves_from=scene.scene_id)
     assert [taken.marker(job)["figures"]["taken_over"] for job in range(3)] == [1, 2, 2]
     (scene.folder / "plans/000000/zarr.json").write_text("{")
-    assert with_same_radiance(Store(tmp_path / "store"), other) is None
-    assert with_same_radiance(Store(tmp_path / "store"), analytic.small_spec(points=48)) == other.scene_id
+    assert find_same_radiance(Store(tmp_path / "store"), other) is None
+    assert find_same_radiance(Store(tmp_path / "store"), analytic.small_spec(points=48)) == other.scene_id
 
 
 def test_two_scenes_that_take_halves_from_each_other_are_repeated(

@@ -19,7 +19,7 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers
-from photonfarm.store.write.lease import LeasedError, lease
+from photonfarm.store.model.lease import LeasedError, hold_lease
 
 
 @pytest.fixture
@@ -256,14 +256,14 @@ def test_a_job_that_is_not_committed_says_who_came_between(
     scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Another commits it before we do."""
-    place = markers.place
+    place = markers.place_marker
 
     def meanwhile(*about: Any) -> bool:
-        monkeypatch.setattr(markers, "place", place)
+        monkeypatch.setattr(markers, "place_marker", place)
         assert ShardRenderer(Store(store.root), worker="other", load=recorded.load).render(scene.scene_id, 0)
         return place(*about)
 
-    monkeypatch.setattr(markers, "place", meanwhile)
+    monkeypatch.setattr(markers, "place_marker", meanwhile)
     assert not ShardRenderer(store, worker="test", load=recorded.load).render(scene.scene_id, 0)
     (said,) = [record.getMessage() for record in caplog.records]
     assert scene.is_committed(0)
@@ -340,6 +340,6 @@ def test_a_job_that_is_not_planned_is_refused_and_one_of_a_forgotten_scene_is_dr
 
 def test_a_leased_scene_is_not_rendered(store: Store, scene: SceneStore, recorded: type) -> None:
     renderer = ShardRenderer(store, worker="test", load=recorded.load)
-    with lease(store.storage, scene.scene_id, "store join", pytest.fail), pytest.raises(LeasedError):
+    with hold_lease(store.storage, scene.scene_id, "store join", pytest.fail), pytest.raises(LeasedError):
         renderer.render(scene.scene_id, 0)
     assert renderer.render(scene.scene_id, 0)

@@ -174,3 +174,29 @@ def test_the_verb_says_what_it_has_copied(stores: tuple[SceneStore, SceneStore],
     assert f"{count} samples there, {count} planned here now, 0 before" in said.output
     with pytest.raises(SpecError, match="is the store that it is to be joined with"):
         join(tmp_path / "b", tmp_path / "b")
+
+
+@pytest.mark.parametrize("name", ["sample_modification", "sample_key", "view/zarr.json"])
+def test_damaged_inputs_of_a_join_are_taken_again_from_the_other_store(
+    stores: tuple[SceneStore, SceneStore], tmp_path: Path, analytic: ModuleType, name: str
+) -> None:
+    """Also where the other store has more samples by now, which the keys of the plan tell."""
+    here, there = stores
+    join(tmp_path / "a", tmp_path / "b")
+    here.plan(TopUp.of("+8"))
+    analytic.render_missing(Store(tmp_path / "a"), here.scene_id)
+    number = next(plan.number for plan in here.plans() if plan.request.kind == "join")
+    (path,) = (here.folder / f"plans/{number:06d}").glob(name if "/" in name else f"{name}/c.0*")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    if name != "sample_key":
+        there.plan(Request(modifications=4, seed=2))
+        analytic.render_missing(Store(tmp_path / "b"), there.scene_id)
+    with pytest.raises(CorruptError, match=f"--joined-from OTHER` .* {Store(tmp_path / 'b').store_id}"):
+        SceneStore(here.storage, here.scene_id).plans()
+    for other in (None, Store(tmp_path / "a")):
+        report = check_store(Store(tmp_path / "a"), when="now", repair=True, joined_from=other)
+        assert (report.exit_code, path.read_bytes() == whole) == (4, False)
+    report = check_store(Store(tmp_path / "a"), when="now", repair=True, joined_from=Store(tmp_path / "b"))
+    assert (report.exit_code, path.read_bytes() == whole) == (7, True)
+    assert check_store(Store(tmp_path / "a"), when="now").exit_code == 0

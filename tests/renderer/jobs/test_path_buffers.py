@@ -21,7 +21,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.format.schema import output_arrays
-from photonfarm.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.store.format.shards import NOISY_GUIDES, round_to_8_bits
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_what_views_show_is_what_the_store_has_of_the_same_views(tmp_path: Path,
             assert 0.005 < stored.mean() < 0.5
         made = arrays_of(frames.buffers(place)) | arrays_of(frames.guides_of(place))
         for name, stored in (arrays_of(sample.buffers) | arrays_of(sample.guides)).items():
-            kept = rounded(made[name]) if name in NOISY_GUIDES else made[name].astype(arrays[name].dtype)
+            kept = round_to_8_bits(made[name]) if name in NOISY_GUIDES else made[name].astype(arrays[name].dtype)
             assert np.array_equal(kept.astype(np.float32), stored), name
     for name, stored in arrays_of(reader.read_photons(0)).items():
         np.testing.assert_allclose(getattr(frames.photons, name), stored, rtol=2e-3, atol=1e-3, err_msg=name)

@@ -7,10 +7,10 @@ from photonfarm.renderer.scene import backend
 
 mi = backend.load(threads=1)
 
-from bench.stability.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy import content  # noqa: E402
 from photonfarm.renderer.strategy.candidates import GRID, PLAIN  # noqa: E402
 from photonfarm.scene.spec import Box, PhotonSpec, ViewSpec  # noqa: E402
+from tests.stability.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 
 MIRROR = {"type": "sphere", "bsdf": {"type": "conductor"}}
 BULB = {"type": "point", "intensity": {"type": "rgb", "value": 1.0}}

@@ -99,7 +99,7 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
         run_worker(root, redis_server.url, child=analytic.command(0, "broken"), **QUICK)
     failed = queue_status(connection).failed
     assert {name: failure.times for name, failure in failed.items()} == dict.fromkeys(names, queue.TRIES)
-    assert queue.kept_failures(Store(root)) == failed
+    assert queue.read_kept_failures(Store(root)) == failed
     command = f"photonfarm work --store {root} --scene {scene.scene_id} --job 0"
     assert command in capfd.readouterr().err
 

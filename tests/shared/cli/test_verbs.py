@@ -52,7 +52,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> Install:
             entry = EntryPoint(name, f"{__name__}:{name}", main.GROUP)
             monkeypatch.setattr(EntryPoint, "load", lambda self: commands[self.name])
             found[name] = entry
-        monkeypatch.setattr(main, "_installed", lambda: found)
+        monkeypatch.setattr(main, "_find_verbs", lambda: found)
 
     return of
 

@@ -16,7 +16,7 @@ from zarr.storage import LocalStore
 from photonfarm.store.io import object_cache
 from photonfarm.store.io.local import LocalStorage
 from photonfarm.store.io.storage import put_json
-from photonfarm.store.write.staging import group_in
+from photonfarm.store.model.staging import group_in
 
 
 @pytest.fixture

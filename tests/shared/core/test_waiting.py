@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from photonfarm.core.processes import ended_by_ctrl_c
+from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import Steps, WorkLog, pause_after_look
 
 
@@ -70,8 +70,8 @@ def test_what_a_budget_leaves_no_time_for_does_not_count() -> None:
 @pytest.mark.usefixtures("hears_ctrl_c")
 def test_ctrl_c_ends_native_code_at_once() -> None:
     code = (
-        "from photonfarm.core.processes import ended_by_ctrl_c\n"
-        "with ended_by_ctrl_c():\n    print('in', flush=True); sum(range(10**12))"  # looks at no signal until it ends
+        "from photonfarm.core.processes import end_on_ctrl_c\n"
+        "with end_on_ctrl_c():\n    print('in', flush=True); sum(range(10**12))"  # looks at no signal until it ends
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
@@ -84,7 +84,7 @@ def test_ctrl_c_ends_native_code_at_once() -> None:
 @pytest.mark.usefixtures("hears_ctrl_c")
 def test_afterwards_ctrl_c_is_what_it_was() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with ended_by_ctrl_c():
+    with end_on_ctrl_c():
         assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
     assert signal.getsignal(signal.SIGINT) is before
 

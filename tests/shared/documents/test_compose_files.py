@@ -11,15 +11,15 @@ ROOT = Path(__file__).parents[3]
 OVERRIDES = ("docker-compose.bucket.yml", "docker-compose.gpu.yml")
 
 
-def services(name: str) -> dict[str, Any]:
+def read_services(name: str) -> dict[str, Any]:
     """The services of a compose file, by their names."""
-    found: dict[str, Any] = yaml.safe_load((ROOT / name).read_text())["services"]
-    return found
+    services: dict[str, Any] = yaml.safe_load((ROOT / name).read_text())["services"]
+    return services
 
 
 @pytest.mark.parametrize("name", OVERRIDES)
 def test_what_is_laid_over_the_farm_changes_services_that_it_has_and_says_how_it_is_used(name: str) -> None:
-    assert services(name).keys() <= services("docker-compose.yml").keys()
+    assert read_services(name).keys() <= read_services("docker-compose.yml").keys()
     assert f"docker-compose -f docker-compose.yml -f {name} up" in (ROOT / name).read_text()
 
 
@@ -29,7 +29,7 @@ def test_what_is_laid_over_the_farm_changes_services_that_it_has_and_says_how_it
 def test_a_service_on_a_card_reserves_it_with_the_parts_of_the_driver_that_it_uses(
     service: str, needs: set[str]
 ) -> None:
-    described = services("docker-compose.gpu.yml")[service]
+    described = read_services("docker-compose.gpu.yml")[service]
     (reserved,) = described["deploy"]["resources"]["reservations"]["devices"]
     assert reserved["driver"] == "nvidia"
     assert set(reserved["capabilities"]) == {"gpu", *needs}
@@ -40,4 +40,4 @@ def test_a_service_on_a_card_reserves_it_with_the_parts_of_the_driver_that_it_us
 
 
 def test_renderers_on_a_card_use_no_other_device() -> None:
-    assert services("docker-compose.gpu.yml")["renderer"]["environment"]["PHOTONFARM_DEVICE"] == "cuda"
+    assert read_services("docker-compose.gpu.yml")["renderer"]["environment"]["PHOTONFARM_DEVICE"] == "cuda"

@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from photonfarm.store.write.findings import Cause
+from photonfarm.store.model.findings import Cause
 
 ROOT = Path(__file__).parents[3]
 

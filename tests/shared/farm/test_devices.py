@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import BackendError
 from photonfarm.farm import devices
-from photonfarm.farm.devices import Card, Cards, cards_here, of_workers, shown_alone
+from photonfarm.farm.devices import Card, Cards, cards_here, visible_device, worker_devices
 
 Driver = Callable[..., Cards]
 TWO = Cards((Card(0, "Test Card A", "8.9", 8 << 30), Card(1, "Test Card B", "8.9", 8 << 30)), "", 1208)
@@ -64,7 +64,7 @@ def test_a_driver_that_cannot_render_is_told_why_and_auto_is_the_processor(
     found = driver(**variables)
     assert said in found.trouble
     assert found.card("auto") is found.card("cpu") is None
-    assert of_workers("auto", found) == ("cpu",)
+    assert worker_devices("auto", found) == ("cpu",)
     with pytest.raises(BackendError, match="--device cpu"):
         found.card("cuda")
 
@@ -79,9 +79,9 @@ def test_names_stand_for_cards() -> None:
 
 
 def test_workers_take_all_cards_in_turn_unless_one_is_named() -> None:
-    assert of_workers("auto", TWO) == of_workers("cuda", TWO) == ("cuda:0", "cuda:1")
-    assert of_workers("cuda:1", TWO) == ("cuda:1",)
-    assert of_workers("cpu", TWO) == ("cpu",)
+    assert worker_devices("auto", TWO) == worker_devices("cuda", TWO) == ("cuda:0", "cuda:1")
+    assert worker_devices("cuda:1", TWO) == ("cuda:1",)
+    assert worker_devices("cpu", TWO) == ("cpu",)
 
 
 @pytest.mark.parametrize(("visible", "shown"), [(None, "1"), ("", "1"), ("3,5", "5"), ("GPU-a, GPU-b", "GPU-b")])
@@ -91,7 +91,7 @@ def test_a_card_is_shown_alone_among_those_that_are_visible(
     monkeypatch.delenv(devices.VISIBLE_VARIABLE, raising=False)
     if visible is not None:
         monkeypatch.setenv(devices.VISIBLE_VARIABLE, visible)
-    assert shown_alone(TWO.cards[1]) == shown
+    assert visible_device(TWO.cards[1]) == shown
 
 
 def test_a_device_that_is_not_there_is_refused_before_anything_is_written(

@@ -12,8 +12,7 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SchedulerError, SpecError, StoreError
-from photonfarm.farm.slurm.launch import check_slurm
-from photonfarm.farm.slurm.scripts import limit_s
+from photonfarm.farm.slurm import check_slurm, limit_s
 
 Launcher = Callable[..., Result]
 

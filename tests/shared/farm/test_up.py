@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import store_samples as samples
 
-from photonfarm.cli.show_up import FarmTalk, progress_line
+from photonfarm.cli.show_watch import FarmTalk, progress_line
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.farm import up
 from photonfarm.farm.redis_server import EmbeddedRedis

@@ -17,11 +17,11 @@ from rich.console import Console
 
 from photonfarm import queue
 from photonfarm.cli.main import umbrella
-from photonfarm.cli.show_watch import drawn, lines
+from photonfarm.cli.show_watch import draw_farm, lines
 from photonfarm.core.errors import QueueError
 from photonfarm.farm import running_farm, status
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.farm.running_farm import announced
+from photonfarm.farm.running_farm import announce
 from photonfarm.farm.status import RECENT_S, NoQueue, StoreQueue, queue_of, since_commit_s
 from photonfarm.farm.training import RunFolder
 from photonfarm.farm.watch import STEADY_S, FarmWatch
@@ -86,7 +86,7 @@ def test_a_damaged_scene_is_told_and_the_others_are_watched(scene: SceneStore, s
     assert found[other.scene_id].error
     assert found[scene.scene_id].samples == (0, 8)
     terminal = Console(file=io.StringIO(), width=400)
-    terminal.print(drawn(view))
+    terminal.print(draw_farm(view))
     for shown in ("\n".join(lines(view)), terminal.file.getvalue()):
         assert f"scene {other.scene_id} cannot be read: {found[other.scene_id].error}" in shown
 
@@ -127,6 +127,15 @@ def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
 def test_samples_that_no_worker_renders_wait_for_one(store: Store, connection: redis.Redis, common_redis: Any) -> None:
     assert len(list(status.waits(queue_of(store, common_redis.url), {}, 8))) == 1
     assert list(status.waits(queue_of(store, common_redis.url), {}, 0)) == []
+
+
+def test_status_says_that_missing_samples_wait_for_a_worker(
+    scene: SceneStore, store: Store, connection: redis.Redis, common_redis: EmbeddedRedis
+) -> None:
+    words = ["status", "--store", str(store.root), "--redis", common_redis.url]
+    assert "8 samples wait for a worker" in CliRunner().invoke(umbrella, words).stdout
+    samples.commit_all(scene)
+    assert "wait for a worker" not in CliRunner().invoke(umbrella, words).stdout
 
 
 def test_failures_outlive_redis_until_their_job_is_committed(scene: SceneStore, store: Store, tmp_path: Path) -> None:
@@ -172,7 +181,7 @@ def test_status_finds_the_redis_of_an_up_that_is_at_work_here(
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
     queue_samples.told(connection, "ada", queue.WorkerReport(host="elsewhere", process=1))
-    with announced(store, redis_url=common_redis.url, run=tmp_path / "run", web="http://localhost:1/"):
+    with announce(store, redis_url=common_redis.url, run=tmp_path / "run", web="http://localhost:1/"):
         found = json.loads(CliRunner().invoke(umbrella, ["status", "--json"]).stdout)
         assert found["queue"]["workers"] == 1
         assert found["up"]["web"] == "http://localhost:1/"
@@ -219,7 +228,7 @@ def _refuses(*_: Any, **__: Any) -> None:
 
 
 def test_a_farm_that_died_or_that_others_announce_is_not_believed(store: Store, tmp_path: Path) -> None:
-    with announced(store, redis_url="unix:///r", run=None, web=None):
+    with announce(store, redis_url="unix:///r", run=None, web=None):
         (file,) = (tmp_path / "farms").iterdir()
         text = file.read_text()
         assert running_farm.running_farm(store) is not None

@@ -44,7 +44,7 @@ def test_many_failures_are_read_in_a_few_requests(connection: redis.Redis, store
 
 
 def test_failures_are_grouped_by_what_they_have_in_common() -> None:
-    first, *others = queue.causes(
+    first, *others = queue.group_causes(
         {
             f"{SCENE_ID}-1": Failure(f"IncompleteError: half A of sample {'ab' * 16} came out non-finite 3 times", 1),
             f"{SCENE_ID}-2": Failure(
@@ -69,14 +69,14 @@ def test_a_failure_is_kept_in_the_store_until_it_is_retried_and_the_last_one_cou
     for reason in ("ValueError: first", "ValueError: second\nand more"):
         queue.keep_failure(store, name, reason, worker="ada")
         time.sleep(0.002)  # files are named by milliseconds
-    assert queue.kept_failures(Store(store.root)) == {name: Failure("ValueError: second and more", 2)}
-    assert queue.kept_failures(store, lambda _: False) == {}
-    assert queue.times_failed(store) == {name: 2}
+    assert queue.read_kept_failures(Store(store.root)) == {name: Failure("ValueError: second and more", 2)}
+    assert queue.read_kept_failures(store, lambda _: False) == {}
+    assert queue.count_failures(store) == {name: 2}
     queue.keep_retry(store)
     time.sleep(0.002)
-    assert queue.kept_failures(store) == queue.times_failed(store) == {}
+    assert queue.read_kept_failures(store) == queue.count_failures(store) == {}
     queue.keep_failure(store, name, "ValueError: third", worker="ada")
-    assert queue.times_failed(store) == {name: 1}
+    assert queue.count_failures(store) == {name: 1}
 
 
 def test_files_that_are_no_failures_do_no_harm(store: Store, scene: SceneStore) -> None:
@@ -90,4 +90,4 @@ def test_files_that_are_no_failures_do_no_harm(store: Store, scene: SceneStore) 
     (kept,) = folder.glob("*-0.*.json")
     assert json.loads(kept.read_text())["job"] == name
     kept.write_text("[" * 100_000)
-    assert list(queue.kept_failures(store)) == [name]
+    assert list(queue.read_kept_failures(store)) == [name]

@@ -8,7 +8,7 @@ import redis
 import store_samples as samples
 
 from photonfarm.plan.request import Request
-from photonfarm.queue import look, reconcile, reconciliation
+from photonfarm.queue import fill_seldom, reconcile, reconciliation
 from photonfarm.queue.rq_adapter import fail_of_worker
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.io.local import LocalStorage
@@ -52,10 +52,10 @@ def test_any_number_of_waiting_workers_list_the_markers_once_in_a_while(
 ) -> None:
     stores = [Store(store.root) for _ in range(workers)]
     listed()
-    assert {look(each, connection, every_s=60) for each in stores} == {"waits"}
+    assert {fill_seldom(each, connection, every_s=60) for each in stores} == {"waits"}
     assert listed() == 1
     connection.delete(KEY)  # as after the while
-    assert {look(each, connection, every_s=60) for each in stores} == {"waits"}
+    assert {fill_seldom(each, connection, every_s=60) for each in stores} == {"waits"}
     assert listed() == 1
 
 
@@ -63,26 +63,26 @@ def test_any_number_of_waiting_workers_list_the_markers_once_in_a_while(
 def test_a_waiting_worker_sends_few_commands(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
     def commands_of_a_look() -> int:
         before = sum(about["calls"] for about in connection.info("commandstats").values())
-        assert look(store, connection, every_s=60) == "waits"
+        assert fill_seldom(store, connection, every_s=60) == "waits"
         return sum(about["calls"] for about in connection.info("commandstats").values()) - before
 
-    look(store, connection, every_s=60)
+    fill_seldom(store, connection, every_s=60)
     assert commands_of_a_look() < 10
 
 
 def test_a_job_that_is_free_again_is_queued_once_the_while_is_over(
     connection: redis.Redis, store: Store, waiting: str
 ) -> None:
-    assert look(store, connection, every_s=60) == "waits"
+    assert fill_seldom(store, connection, every_s=60) == "waits"
     fail_of_worker(connection, "somebody", "killed", counts=True)
-    assert look(store, connection, every_s=60) == "waits"
+    assert fill_seldom(store, connection, every_s=60) == "waits"
     assert 0 < connection.pttl(KEY) <= 60_000
     assert queue_samples.queued(connection) == [waiting]
     connection.flushall()
-    assert look(store, connection, every_s=60) == "queued"
+    assert fill_seldom(store, connection, every_s=60) == "queued"
     assert queue_samples.queued(connection) == [waiting]
     assert connection.exists(KEY) == 0, "while there are new jobs, nobody is told to wait"
-    assert look(store, connection, every_s=60) == "waits"
+    assert fill_seldom(store, connection, every_s=60) == "waits"
 
 
 def test_a_submission_looks_whatever_others_have_found(
@@ -90,9 +90,9 @@ def test_a_submission_looks_whatever_others_have_found(
 ) -> None:
     for job in range(scene.jobs()):
         assert samples.commit(scene, job, samples.outputs(scene, job))
-    assert look(store, connection, every_s=60) == "nothing"
+    assert fill_seldom(store, connection, every_s=60) == "nothing"
     scene.plan(Request(modifications=2, seed=1))
-    assert look(store, connection, every_s=60) == "nothing", "as found before"
+    assert fill_seldom(store, connection, every_s=60) == "nothing", "as found before"
     assert reconcile(store, connection) == 1
 
 
@@ -101,13 +101,13 @@ def test_where_all_that_is_missing_has_failed_there_is_nothing_to_wait_for(
 ) -> None:
     fail_of_worker(connection, "somebody", "killed", counts=False)
     assert queue_samples.failed(connection, "it is broken") == waiting
-    assert look(store, connection, every_s=60) == "nothing"
+    assert fill_seldom(store, connection, every_s=60) == "nothing"
 
 
 def test_while_another_process_looks_there_is_something_to_wait_for(
     connection: redis.Redis, store: Store, scene: SceneStore
 ) -> None:
     with connection.lock("rq:photonfarm:reconcile", timeout=10):
-        assert look(store, connection, every_s=60) == "waits"
+        assert fill_seldom(store, connection, every_s=60) == "waits"
     assert connection.exists(KEY) == 0
-    assert look(store, connection, every_s=60) == "queued"
+    assert fill_seldom(store, connection, every_s=60) == "queued"

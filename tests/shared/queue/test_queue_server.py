@@ -22,7 +22,7 @@ from photonfarm.core.errors import QueueError
 from photonfarm.farm import submission
 from photonfarm.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, look, queue_status, reconcile, rq_adapter, with_password_of
+from photonfarm.queue import add_password, connect, fill_seldom, queue_status, reconcile, rq_adapter
 from photonfarm.queue.rq_adapter import open_queue
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import SceneStore, Store
@@ -82,7 +82,7 @@ def test_who_lacks_a_name_or_a_password_is_told_which_and_nobody_to_start_a_serv
         connect(url)
     (tmp_path / "password").write_text("wrong")
     with pytest.raises(QueueError, match="redis://default@host"):
-        connect(with_password_of(tmp_path / "password", url))
+        connect(add_password(tmp_path / "password", url))
     request = Request(modifications=1)
     with pytest.raises(QueueError) as refused:
         submission.submit(NamedSpec.load("cornell"), store.root, url, request)
@@ -99,10 +99,10 @@ def test_the_password_of_a_plain_redis_goes_with_the_user_that_it_has(tmp_path: 
         plain.config_set("port", port)
         plain.config_set("requirepass", "secret")
         with pytest.raises(QueueError):
-            connect(with_password_of(tmp_path / "password", f"redis://127.0.0.1:{port}/0"))
+            connect(add_password(tmp_path / "password", f"redis://127.0.0.1:{port}/0"))
         with pytest.raises(QueueError, match=r"does not let in the user default .*; check the password"):
             connect(f"redis://default:wrong@127.0.0.1:{port}/0")
-        with connect(with_password_of(tmp_path / "password", f"redis://default@127.0.0.1:{port}/0")) as let_in:
+        with connect(add_password(tmp_path / "password", f"redis://default@127.0.0.1:{port}/0")) as let_in:
             assert let_in.ping()
 
 
@@ -110,12 +110,12 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
     guarded: tuple[int, Path], store: Store, scene: SceneStore
 ) -> None:
     port, password = guarded
-    with connect(with_password_of(password, f"redis://127.0.0.1:{port}/0")) as limited:
+    with connect(add_password(password, f"redis://127.0.0.1:{port}/0")) as limited:
         assert reconcile(store, limited) == 10
         assert queue.take_name(limited, "worker", ttl_s=60) == "worker"
         assert queue.take_name(limited, "worker", ttl_s=60) == "worker-2"
         queue.report_consumed(limited, SCENE_ID, 1)
-        assert look(store, limited, every_s=60) == "waits"
+        assert fill_seldom(store, limited, every_s=60) == "waits"
         rq_adapter.finish(rq_adapter.open_queue(limited), queue_samples.taken(limited))
         queue_samples.failed(limited, "broken")
         rq_adapter.fail_of_worker(limited, queue_samples.taken(limited, "worker").worker_name, "killed", counts=False)
@@ -165,7 +165,7 @@ def test_an_autoscaler_may_count_what_waits_and_what_was_started(
     guarded: tuple[int, Path], store: Store, scene: SceneStore
 ) -> None:
     port, password = guarded
-    with connect(with_password_of(password, f"redis://127.0.0.1:{port}/0")) as limited:
+    with connect(add_password(password, f"redis://127.0.0.1:{port}/0")) as limited:
         jobs = open_queue(limited)
         lengths = limited.register_script(LENGTH)
         waiting, started = jobs.key, jobs.started_job_registry.key
@@ -244,10 +244,10 @@ def test_a_password_comes_from_a_file_where_the_url_has_none(tmp_path: Path) -> 
     file = tmp_path / "password"
     file.write_text("a/b@c:d\n")
     quoted = "a%2Fb%40c%3Ad"
-    assert with_password_of(file, "redis://h:1/0") == f"redis://photonfarm:{quoted}@h:1/0"
-    assert with_password_of(file, "rediss://ada@h:1/0?x=1") == f"rediss://ada:{quoted}@h:1/0?x=1"
+    assert add_password(file, "redis://h:1/0") == f"redis://photonfarm:{quoted}@h:1/0"
+    assert add_password(file, "rediss://ada@h:1/0?x=1") == f"rediss://ada:{quoted}@h:1/0?x=1"
     for url in ("redis://ada:own@h:1/0", "unix:///run/redis.sock"):
-        assert with_password_of(file, url) == url
-    assert with_password_of(None, "redis://h:1/0") == "redis://h:1/0"
+        assert add_password(file, url) == url
+    assert add_password(None, "redis://h:1/0") == "redis://h:1/0"
     with pytest.raises(QueueError):
-        with_password_of(tmp_path / "none", "redis://h:1/0")
+        add_password(tmp_path / "none", "redis://h:1/0")

@@ -94,8 +94,8 @@ def test_workers_are_told_of_as_rq_does_for_a_time_and_again_after_redis_lost_th
 
 def test_what_trainers_have_used_is_told_by_scene_and_lost_with_redis(connection: redis.Redis) -> None:
     other = "f" * 32
-    assert queue.consumed_samples(connection, []) == {}
-    assert queue.consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
+    assert queue.read_consumed(connection, []) == {}
+    assert queue.read_consumed(connection, [SCENE_ID]) == {SCENE_ID: 0}
     queue.report_consumed(connection, SCENE_ID, 100)
     queue.report_consumed(connection, other, 7)
-    assert queue.consumed_samples(connection, [SCENE_ID, other]) == {SCENE_ID: 100, other: 7}
+    assert queue.read_consumed(connection, [SCENE_ID, other]) == {SCENE_ID: 100, other: 7}

@@ -16,7 +16,7 @@ KEYS = np.array([[0, 0, 0, 5, 1, 0], [1, 0, 2, 5, 1, 1], [3, 1, 2, 5, 2, 2], [4,
 def path(keys: np.ndarray, frames: int, *, closed: bool = False) -> np.ndarray:
     views = [{"origin": list(map(float, key[:3])), "look_at": list(map(float, key[3:]))} for key in keys]
     described = {"frames": frames, "views": views, "closed": closed}
-    return np.array([view.vector for view in CameraPath.model_validate(described).sampled()])
+    return np.array([view.vector for view in CameraPath.model_validate(described).sample()])
 
 
 def test_the_path_passes_through_every_view_and_begins_and_ends_with_one() -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import Guides, Photons, arrays_of
-from photonfarm.farm.configuration import named_configuration
+from photonfarm.farm.configuration import find_configuration
 from photonfarm.plan.request import Request
 from photonfarm.scene.camera_path import Frames
 from photonfarm.scene.modification import Modification, rest, sample_modification
@@ -75,8 +75,8 @@ def test_a_configuration_is_a_vector_the_key_of_a_planned_one_or_the_scene_at_re
     key = planned.key(spec.radiance_id).hex()
     vector = " ".join(map(str, planned.vector.ravel()))
     for text, wanted in ((key, planned), (vector, planned), (None, rest(spec))):
-        np.testing.assert_array_equal(named_configuration(store, scene, text).vector, wanted.vector)
+        np.testing.assert_array_equal(find_configuration(store, scene, text).vector, wanted.vector)
     with pytest.raises(SpecError):
-        named_configuration(store, scene, "0 0 0 1")
+        find_configuration(store, scene, "0 0 0 1")
     with pytest.raises(StoreError):
-        named_configuration(store, scene, "0" * 32)
+        find_configuration(store, scene, "0" * 32)

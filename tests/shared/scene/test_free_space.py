@@ -10,8 +10,8 @@ from scipy import stats
 from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import make_key
 from photonfarm.plan.request import PlannedContent, Request, expand
-from photonfarm.scene.camera_path import CameraPath, kept_clear, orbit
-from photonfarm.scene.free_space import FreeSpace, packed
+from photonfarm.scene.camera_path import CameraPath, check_clear, orbit
+from photonfarm.scene.free_space import FreeSpace, pack
 from photonfarm.scene.modification import (
     Modification,
     modification_keys,
@@ -21,7 +21,7 @@ from photonfarm.scene.modification import (
 )
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
-from photonfarm.scene.view import in_free_space, sample_view, sample_views
+from photonfarm.scene.view import are_in_free_space, sample_view, sample_views
 
 BOX = {"min": [0.0, 0.0, 0.0], "max": [4.0, 1.0, 2.0]}
 FREE = np.ones((8, 2, 4), np.bool_)
@@ -34,7 +34,7 @@ def with_space(free: np.ndarray = FREE, **view: Any) -> SceneSpec:
         {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "removal_probability": 0.3,
          "box": {"min": [0, 0, 0], "max": [4, 0, 2]}}])  # fmt: skip
     shape = free.shape
-    space = FreeSpace(of=spec.free_space_digest, cells=shape, free=packed(free), groups={"object": TAKES})
+    space = FreeSpace(of=spec.free_space_digest, cells=shape, free=pack(free), groups={"object": TAKES})
     return spec.model_copy(update={"view": spec.view.model_copy(update={"free_space": space, **view})})
 
 
@@ -93,7 +93,7 @@ def test_a_plan_has_each_view_in_free_space_of_its_configuration() -> None:
     used = rows.sample_view >= 0
     views, configurations = rows.view[rows.sample_view[used]], rows.modification[rows.sample_modification[used]]
     assert len(views) == request.samples
-    assert in_free_space(spec, views[:, :3], configurations).all()
+    assert are_in_free_space(spec, views[:, :3], configurations).all()
     assert configurations[0].tobytes() == sample_modification(spec, 0, 0).vector.tobytes()
 
 
@@ -124,7 +124,7 @@ def test_free_space_of_another_scene_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "changed", [{"free": "no base64!"}, {"free": "aGVsbG8="}, {"cells": [8, 2, 5]}, {"cells": [8, 2, 900]},
-                {"free": packed(np.zeros((8, 2, 4), np.bool_))}], ids=str,
+                {"free": pack(np.zeros((8, 2, 4), np.bool_))}], ids=str,
 )  # fmt: skip
 def test_cells_that_cannot_be_read_are_refused(changed: dict[str, Any]) -> None:
     described = with_space().model_dump(mode="json")
@@ -140,7 +140,7 @@ def test_a_configuration_without_any_place_for_a_camera_is_refused_and_does_not_
     with pytest.raises(SpecError):
         sample_views(spec, [key], 0, [0], rest(spec).vector[None])
     gone = Modification(np.zeros((1, 3), np.float32), np.zeros(1, np.bool_))
-    assert in_free_space(spec, sample_view(spec, key, 0, 0, gone).origin[None], gone.vector[None])[0]
+    assert are_in_free_space(spec, sample_view(spec, key, 0, 0, gone).origin[None], gone.vector[None])[0]
 
 
 def filled(spec: SceneSpec) -> SceneSpec:
@@ -153,7 +153,7 @@ def test_an_orbit_goes_around_what_stands_there_and_a_path_through_it_is_refused
     spec = with_space()
     gone = Modification(np.zeros((1, 3), np.float32), np.zeros(1, np.bool_))
     views = orbit(spec, 24, gone)
-    assert in_free_space(spec, np.stack([view.origin for view in views]), gone.vector[None].repeat(24, 0)).all()
+    assert are_in_free_space(spec, np.stack([view.origin for view in views]), gone.vector[None].repeat(24, 0)).all()
     assert len({view.origin.tobytes() for view in views}) == 24
     whole = np.stack([view.origin for view in orbit(with_all_free(spec), 24, gone)])
     assert not stands_in_the_open(whole, None).all(), "or this test asks nothing"
@@ -162,10 +162,10 @@ def test_an_orbit_goes_around_what_stands_there_and_a_path_through_it_is_refused
 
     through = {"frames": 5, "views": [{"origin": [3, 0.5, 0.5], "look_at": [0, 0, 0]},
                                       {"origin": [0.5, 0.5, 1.5], "look_at": [4, 0, 0]}]}  # fmt: skip
-    path = CameraPath.model_validate(through).sampled()
+    path = CameraPath.model_validate(through).sample()
     with pytest.raises(SpecError, match=r"frame 3.*solid"):
-        kept_clear(spec, path, gone)
+        check_clear(spec, path, gone)
     beside = Modification(np.array([[3, 0, 0.5]], np.float32), np.ones(1, np.bool_))
     with pytest.raises(SpecError, match=r"frame 0.*'object'"):
-        kept_clear(spec, path, beside)
-    assert kept_clear(with_all_free(spec), path, beside) == path
+        check_clear(spec, path, beside)
+    assert check_clear(with_all_free(spec), path, beside) == path

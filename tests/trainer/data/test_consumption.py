@@ -13,7 +13,7 @@ import pytest
 from photonfarm.core.errors import IncompleteError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, consumed_samples, serve
+from photonfarm.queue import connect, read_consumed, serve
 from photonfarm.store import Store
 from photonfarm.trainer import service, train
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -35,7 +35,7 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
 
         def wait_for(samples: int) -> None:
             deadline = time.monotonic() + 60
-            while consumed_samples(connection, [SCENE_ID]) != {SCENE_ID: samples}:
+            while read_consumed(connection, [SCENE_ID]) != {SCENE_ID: samples}:
                 assert time.monotonic() < deadline
                 time.sleep(0.01)
 
@@ -56,7 +56,7 @@ def test_what_is_used_by_the_end_is_told_at_the_end(tmp_path: Path, monkeypatch:
     with EmbeddedRedis(tmp_path / "redis") as server:
         with service._report_use(server.url, made(tmp_path), SCENE_ID, print) as count:
             count(120, 48)
-        assert consumed_samples(connect(server.url), [SCENE_ID]) == {SCENE_ID: 48}
+        assert read_consumed(connect(server.url), [SCENE_ID]) == {SCENE_ID: 48}
 
 
 def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
@@ -82,7 +82,7 @@ def test_a_redis_that_serves_another_store_is_told_nothing_and_that_is_said_once
         with service._report_use(server.url, made(tmp_path), SCENE_ID, said.append) as count:
             count(40, 100)
             time.sleep(0.3)
-        assert consumed_samples(connection, [SCENE_ID]) == {SCENE_ID: 0}
+        assert read_consumed(connection, [SCENE_ID]) == {SCENE_ID: 0}
     (line,) = said
     assert "this Redis serves the store" in line
 
@@ -122,7 +122,7 @@ def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene,
         for job in range(scene.jobs()):
             commit(scene, job)
         thread.join(60)
-        assert consumed_samples(connect(server.url), [scene.scene_id]) == {scene.scene_id: 6}
+        assert read_consumed(connect(server.url), [scene.scene_id]) == {scene.scene_id: 6}
     assert said[-1] == "ended at step 3: steps"
     assert said[-2].startswith("step 3/3, ")
     assert not any("continues" in line for line in said)
@@ -140,4 +140,4 @@ def test_a_store_that_comes_later_is_told_of(tmp_path: Path, monkeypatch: pytest
             count(1, 1)
             time.sleep(0.1)
             made(tmp_path)
-        assert consumed_samples(connect(server.url), [SCENE_ID]) == {SCENE_ID: 1}
+        assert read_consumed(connect(server.url), [SCENE_ID]) == {SCENE_ID: 1}

@@ -12,7 +12,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.trainer.dry_run import dry_run
-from photonfarm.trainer.dry_run.dry_run import DryRun, describe, format_estimate, rehearse
+from photonfarm.trainer.dry_run.dry_run import DryRun, describe, format_dry_run, rehearse
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
 from photonfarm.trainer.networks import ARCHITECTURES, predict_image
 from photonfarm.trainer.networks.network import Network
@@ -103,7 +103,7 @@ def test_the_time_of_a_whole_batch_is_that_of_the_timed_part_of_it(monkeypatch: 
     run = found(batch=8, max_steps=100)
     assert (run.timed.samples, run.timed.steps, run.timed.step_s) == (1, 3, 8 * 4.0)
     assert run.seconds == 100 * 8 * 4.0
-    assert "times 8/1" in format_estimate(run)
+    assert "times 8/1" in format_dry_run(run)
 
 
 def test_a_batch_that_fits_is_timed_whole() -> None:

@@ -17,8 +17,8 @@ import torch
 from photonfarm.core.errors import IncompleteError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.write.lease import lease
-from photonfarm.store.write.withdrawal import forget
+from photonfarm.store.model.lease import hold_lease
+from photonfarm.store.model.withdrawal import forget
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import join_ranks, lead
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
@@ -136,7 +136,7 @@ def test_a_run_that_is_stopped_while_it_waits_goes_on_to_the_same_weights(
     train(SceneReader(committed.storage.root, committed.scene_id), settings, tmp_path / "undisturbed")
     trainer = Trainer(committed, settings, run)
     until(lambda: trainer.step > 2)
-    with lease(committed.storage, committed.scene_id, "store join", lambda _: None):
+    with hold_lease(committed.storage, committed.scene_id, "store join", lambda _: None):
         until(lambda: trainer.said("store join"))
         os.kill(trainer.processes[0].pid, signal.SIGTERM)
         assert trainer.codes() == [0]
@@ -156,7 +156,7 @@ def test_two_processes_have_both_ended_their_reading_when_the_lease_begins(
     assert Trainer(committed, settings, tmp_path / "undisturbed", size=2).codes() == [0, 0]
     trainer = Trainer(committed, settings, run, size=2)
     until(lambda: trainer.step > 2)
-    with lease(committed.storage, committed.scene_id, "store join", lambda _: None):
+    with hold_lease(committed.storage, committed.scene_id, "store join", lambda _: None):
         stands = trainer.step
         (moved := committed.folder.with_name("elsewhere")).mkdir()
         committed.folder.rename(moved / "scene")  # whoever reads now fails

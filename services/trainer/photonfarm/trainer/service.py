@@ -13,13 +13,13 @@ from pydantic import ValidationError
 from redis import Redis, RedisError
 
 from photonfarm.core.errors import IncompleteError, QueueError, SpecError, StoreError
-from photonfarm.core.processes import Stop, repeating
+from photonfarm.core.processes import Stop, repeat
 from photonfarm.scene.spec import Film
 from photonfarm.scene.spec_loading import load_spec, scene_folder
 from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
-from photonfarm.store.read.other_scenes import other_scenes
-from photonfarm.store.write.scene_store import held as scenes_held
+from photonfarm.store.model.scene_store import list_scenes
+from photonfarm.store.read.other_scenes import describe_scenes
 from photonfarm.trainer.runs.progress import RunProgress, follow_progress
 from photonfarm.trainer.runs.run_folder import lock_run, note_scene_folder, write_views
 from photonfarm.trainer.runs.settings import TrainSettings, make_settings
@@ -170,7 +170,7 @@ def _describe_lack(store: Store, scene_id: str, spec: SceneSpec | None) -> str:
     """What of a scene is waited for, in words."""
     if store.has_scene(scene_id):
         return "of which nothing is rendered yet"
-    others = other_scenes(store, spec) if spec else scenes_held(store.storage)
+    others = describe_scenes(store, spec) if spec else list_scenes(store.storage)
     return f"which {store.storage.where} does not hold yet; {others}"
 
 
@@ -287,7 +287,7 @@ def _give_sign_of_life(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise StoreError(f"{folder}: the folder of the training run cannot be written: {error.strerror}") from error
     try:
-        with repeating(ALIVE_S / 4, (folder / ALIVE_FILE).touch):
+        with repeat(ALIVE_S / 4, (folder / ALIVE_FILE).touch):
             yield
     finally:
         if folder.is_dir():
@@ -306,7 +306,7 @@ def _report_use(
     """
     reporter = _ConsumptionReporter(redis_url, store, scene_id, log)
     try:
-        with repeating(REPORT_S, reporter.report):
+        with repeat(REPORT_S, reporter.report):
             yield reporter.take
     finally:
         reporter.report()

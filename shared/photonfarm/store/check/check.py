@@ -17,17 +17,17 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.check.content_check import SIGNIFICANCE, CheckTotals, HalvesResult, HalvesTest
 from photonfarm.store.check.job_check import CheckTarget
 from photonfarm.store.check.job_pool import JobPool
-from photonfarm.store.check.plan_check import PlanCheck, jobs_to_render, unplanned_files
+from photonfarm.store.check.plan_check import PlanCheck, find_unplanned_files, jobs_to_render
 from photonfarm.store.check.plan_repair import PlanRepair
 from photonfarm.store.check.repeated_seeds import equal_samples
 from photonfarm.store.format import markers
 from photonfarm.store.io.storage import TMP, Storage
-from photonfarm.store.write import plans
-from photonfarm.store.write.findings import Cause, Finding, FindingGroup, Findings, Remedy
-from photonfarm.store.write.lease import Claim, OnWait, lease
-from photonfarm.store.write.quarantine import Quarantine, was_set_aside
-from photonfarm.store.write.scene_store import SCENES, read_spec, scene_ids
-from photonfarm.store.write.store import Store
+from photonfarm.store.model import plans
+from photonfarm.store.model.findings import Cause, Finding, FindingGroup, Findings, Remedy
+from photonfarm.store.model.lease import Claim, OnWait, hold_lease
+from photonfarm.store.model.quarantine import Quarantine, was_set_aside
+from photonfarm.store.model.scene_store import SCENES, read_spec, scene_ids
+from photonfarm.store.model.store import Store
 
 CheckProgress = Callable[[str, int, int, int], None]
 """Called with the scene's name, the jobs checked, the jobs to check, and the bytes read."""
@@ -76,13 +76,14 @@ def check_store(
     *,
     when: str,
     repair: bool = False,
+    joined_from: Store | None = None,
     on_progress: CheckProgress | None = None,
     on_wait: OnWait = lambda _: None,
 ) -> StoreReport:
     """Check every scene of a store, or one; `repair` sets what is damaged aside, at the time `when`.
 
-    A repair waits with `on_wait` until it has a damaged scene alone. Raises StoreError if the scene is not there, or
-    the store cannot be read.
+    Plans of joins are written again from `joined_from`. A repair waits with `on_wait` until it has a damaged scene
+    alone. Raises StoreError if the scene is not there, or the store cannot be read.
     """
     storage = store.storage
     with store_errors("check the store", storage.where):
@@ -92,7 +93,7 @@ def check_store(
         quarantine = Quarantine(storage, when)
         reports = []
         for each in ids:
-            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None), on_wait)
+            checking = _SceneChecking(storage, each, len(ids), on_progress or (lambda *_: None), on_wait, joined_from)
             reports.append(checking.run(quarantine if repair else None))
         return StoreReport(
             tuple(reports), sum(name.endswith(".partial") for name in storage.names(TMP)), repair, quarantine.folder
@@ -116,13 +117,20 @@ class _SceneChecking:
     """One scene on its way through the check."""
 
     def __init__(
-        self, storage: Storage, scene_id: str, scenes: int, on_progress: CheckProgress, on_wait: OnWait
+        self,
+        storage: Storage,
+        scene_id: str,
+        scenes: int,
+        on_progress: CheckProgress,
+        on_wait: OnWait,
+        joined_from: Store | None,
     ) -> None:
         self._storage = storage
         self._scene_id = scene_id
         self._name = f"{SCENES}/{scene_id}"
         self._on_progress = on_progress
         self._on_wait = on_wait
+        self._joined_from = joined_from
         self._findings = Findings()
         self._markers: dict[int, bytes] = {}  # of jobs with findings
         self._same: dict[int, bool] = {}  # of such jobs: whether they were equal again after being rendered again
@@ -141,7 +149,7 @@ class _SceneChecking:
                 with self._alone():
                     aside = ["spec"] if quarantine.spec(self._name, self._findings.of(Cause.SPEC)) else []
             return self._report(None, aside)
-        committed = markers.jobs(self._storage, self._name)
+        committed = markers.list_jobs(self._storage, self._name)
         inputs, done = self._plans(spec, quarantine)
         self._add(inputs.check_base(committed))
         scene = None
@@ -156,7 +164,7 @@ class _SceneChecking:
         return self._report(spec.name, done)
 
     def _alone(self) -> contextlib.AbstractContextManager[Claim]:
-        return lease(self._storage, self._scene_id, "store check --repair", self._on_wait)
+        return hold_lease(self._storage, self._scene_id, "store check --repair", self._on_wait)
 
     def _plans(self, spec: SceneSpec, quarantine: Quarantine | None) -> tuple[PlanCheck, list[str]]:
         """Check the plans, before the jobs, which need them; also returns what was written again."""
@@ -167,14 +175,14 @@ class _SceneChecking:
         if quarantine is None or not damaged:
             return check, []
         rewritten = []
-        repair = PlanRepair(self._storage, spec, self._name, quarantine)
+        repair = PlanRepair(self._storage, spec, self._name, quarantine, self._joined_from)
         with self._alone():
             for number in range(plans.count(self._storage, self._name)):
                 folder = f"{plans.folder(self._name, number)}/"
                 if why := [finding for finding in damaged if str(finding.file).startswith(folder)]:
                     try:
                         repair.run(number, why)
-                        rewritten.append(f"plan {number}, written again from its request")
+                        rewritten.append(f"plan {number}, written again")
                     except StoreError as error:
                         what = str(error).partition(": ")[2]
                         self._add([Finding(Cause.PLAN, what, self._scene_id, file=folder[:-1])])
@@ -202,7 +210,7 @@ class _SceneChecking:
             for part in pool.totals:
                 total.add(part)
         self._on_progress(called, len(committed), len(committed), total.size_bytes)
-        self._add(unplanned_files(scene))
+        self._add(find_unplanned_files(scene))
 
     def _again(self, found: Iterable[Finding]) -> Iterator[Finding]:
         """The findings, with another cause for equal halves that were equal again after being rendered again."""
@@ -221,7 +229,7 @@ class _SceneChecking:
     def _marker(self, job: int) -> bytes:
         """The marker that findings of a job refer to; raises FileNotFoundError if it was set aside in the meantime."""
         if job not in self._markers:  # found when all samples were looked at
-            self._markers[job] = self._storage.read(markers.name_of(self._name, job))
+            self._markers[job] = self._storage.read(markers.marker_name(self._name, job))
         return self._markers[job]
 
     def _add(self, found: Iterator[Finding] | list[Finding]) -> None:
@@ -248,7 +256,7 @@ class _SceneChecking:
         if why := self._findings.of(Cause.BASE):
             if quarantine.base(self._name, why):
                 aside.append("base")
-            committed = markers.jobs(self._storage, self._name)
+            committed = markers.list_jobs(self._storage, self._name)
             jobs = jobs_to_render(scene.plans) if scene is not None and scene.plans else set()
             if scene is not None and jobs and committed >= jobs:
                 # nothing is missing, and only a job that is rendered writes the base
@@ -261,7 +269,7 @@ class _SceneChecking:
         files = set(scene.files_of(job).values())
         try:
             marker = self._marker(job)
-            files.update(markers.files(marker, scene.name, job))
+            files.update(markers.parse_files(marker, scene.name, job))
         except FileNotFoundError:  # it is missing by now
             return False
         except CorruptError:

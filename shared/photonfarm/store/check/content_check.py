@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 from photonfarm.store.format.schema import bit_counts
-from photonfarm.store.write.findings import Cause
+from photonfarm.store.model.findings import Cause
 
 _FLOAT = {2: (np.uint16, 0x7FFF, 0x7C00), 4: (np.uint32, 0x7FFFFFFF, 0x7F800000)}
 """The integer type, the mask of the magnitude and the magnitude of infinity, by the bytes of a float."""

@@ -16,9 +16,9 @@ from photonfarm.store.check.content_check import CheckTotals, ContentCheck, is_f
 from photonfarm.store.format import markers, schema
 from photonfarm.store.format.shards import Shard
 from photonfarm.store.io.storage import Storage
-from photonfarm.store.write import findings, plans
-from photonfarm.store.write.findings import Cause, Finding
-from photonfarm.store.write.plans import JobRows, StoredPlan
+from photonfarm.store.model import findings, plans
+from photonfarm.store.model.findings import Cause, Finding
+from photonfarm.store.model.plans import JobRows, StoredPlan
 
 KINDS: tuple[schema.RowKind, ...] = ("sample", "view", "modification")
 
@@ -73,7 +73,7 @@ class JobCheck:
         The totals of the job are added to `totals`.
         """
         self._totals = totals
-        storage, name = self._scene.storage, markers.name_of(self._scene.name, job)
+        storage, name = self._scene.storage, markers.marker_name(self._scene.name, job)
         try:
             content = storage.read(name)
         except FileNotFoundError:
@@ -89,13 +89,13 @@ class JobCheck:
         return [], b""
 
     def _of(self, job: int, marker: bytes) -> Iterator[Finding]:
-        scene, name = self._scene, markers.name_of(self._scene.name, job)
+        scene, name = self._scene, markers.marker_name(self._scene.name, job)
         own = scene.files_of(job)
         if scene.plans is not None and not own:
             yield self._without_plan(job, marker, name)
             return
         try:
-            named = markers.files(marker, scene.name, job)
+            named = markers.parse_files(marker, scene.name, job)
         except CorruptError as error:
             yield self._finding(Cause.MARKER, job, _error_text(error), name)
             return
@@ -114,7 +114,7 @@ class JobCheck:
         """The finding for a marker without a plan: the last plan is missing if the marker names files in its folder."""
         scene = self._scene
         with contextlib.suppress(CorruptError):
-            named = {_plan_of(file) for file in markers.files(marker, scene.name, job)}
+            named = {_plan_of(file) for file in markers.parse_files(marker, scene.name, job)}
             if missing := named - {plan.folder for plan in scene.plans or []}:
                 return self._finding(Cause.PLAN, job, findings.MISSING, f"{min(missing)}/zarr.json")
         return self._finding(Cause.NO_PLAN, job, "no plan has this job", name)

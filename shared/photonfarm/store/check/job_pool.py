@@ -12,7 +12,7 @@ from photonfarm.core.processes import usable_cores
 from photonfarm.store.check.content_check import CheckTotals, HalvesTest
 from photonfarm.store.check.job_check import CheckTarget, JobCheck
 from photonfarm.store.io.storage import renew_copy
-from photonfarm.store.write.findings import Cause, Finding
+from photonfarm.store.model.findings import Cause, Finding
 
 MOST_THREADS = 4
 """The most threads: more would wait for the disk, or for each other."""

@@ -18,20 +18,18 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.core.records import BasePointCloud, Geometry
-from photonfarm.plan.request import UNUSED, PlannedRows, sample_keys
+from photonfarm.plan.request import UNUSED, sample_keys
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.check.job_check import CheckTarget
 from photonfarm.store.format import markers, schema
 from photonfarm.store.io.storage import Storage
-from photonfarm.store.write import findings, plans
-from photonfarm.store.write.findings import Cause, Finding
-from photonfarm.store.write.plans import StoredPlan
-from photonfarm.store.write.scene_store import read_base
+from photonfarm.store.model import findings, plans
+from photonfarm.store.model.findings import Cause, Finding
+from photonfarm.store.model.plans import StoredPlan
+from photonfarm.store.model.scene_store import read_base
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError)
 """What zarr-python raises for damaged metadata and chunks; a group in place of an array lacks its attributes."""
-
-_INPUTS = tuple(field.name for field in fields(PlannedRows))
 
 
 class PlanCheck:
@@ -76,47 +74,39 @@ class PlanCheck:
 
     def _plan(self, folder: str) -> Iterator[Finding]:
         """Yield what is wrong with the files of a plan."""
-        import zarr
-
         if not self._storage.exists(f"{folder}/zarr.json"):
             self.lost.add(folder)
             yield Finding(Cause.PLAN, findings.MISSING, self._id, file=f"{folder}/zarr.json")
             return
         try:
-            group = zarr.open_group(self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False)
-            plans.check_version(group.attrs, self._storage.where)
-            jobs, shard_rows = (int(str(group.attrs[name])) for name in ("jobs", "shard_rows"))
+            group, about = plans.open_plan(self._storage, folder)
         except StoreError as error:
             yield Finding(Cause.PLAN, str(error).partition(": ")[2], self._id, file=f"{folder}/zarr.json")
             return
-        except UNREADABLE as error:
-            detail = f"cannot be read: {plans.reason(error)}; {findings.RESTORE}"
-            yield Finding(Cause.PLAN, detail, self._id, file=f"{folder}/zarr.json")
-            return
-        self.shard_rows = self.shard_rows or shard_rows
-        for name in _INPUTS:
-            if detail := self._array(group, folder, name, jobs * shard_rows):
-                yield Finding(Cause.PLAN_INPUTS, detail, self._id, file=f"{folder}/{name}")
-        for array in schema.output_arrays(self._spec).values():
-            if detail := declaration(group, array, jobs, shard_rows):
-                yield Finding(Cause.PLAN_INPUTS, detail, self._id, file=f"{folder}/{array.name}/zarr.json")
+        self.shard_rows = self.shard_rows or about.shard_rows
+        remedy = plans.rewritten(about.request)
+        for name in plans.INPUTS:
+            if detail := self._array(group, folder, name):
+                yield Finding(Cause.PLAN_INPUTS, f"{detail}; {remedy}", self._id, file=f"{folder}/{name}")
+        for file in about.checksums:
+            name = file.partition("/")[0]
+            if name not in (file, *plans.INPUTS) and (detail := declaration(group, name)):
+                yield Finding(Cause.PLAN_INPUTS, f"{detail}; {remedy}", self._id, file=f"{folder}/{file}")
 
-    def _array(self, group: Any, folder: str, name: str, rows: int | None = None) -> str:
+    def _array(self, group: Any, folder: str, name: str) -> str:
         """What is wrong with an array of inputs or of the base; empty if nothing."""
         try:
-            array = group[name]
-            if rows is not None and array.shape[0] != rows:
-                return f"has {array.shape[0]} rows; the plan has {rows}"
-            values = schema.read_input(self._storage, f"{folder}/{name}", array)
+            values = schema.read_input(self._storage, f"{folder}/{name}", group[name])
         except CorruptError as error:
             return f"chunk {str(error).rpartition('/')[2].replace(':', '')}"
         except UNREADABLE as error:
             return f"cannot be read: {plans.reason(error)}"
-        return "" if values.dtype.kind != "f" or rows is not None or np.isfinite(values).all() else "is not finite"
+        may_be_nan = name in plans.INPUTS or values.dtype.kind != "f"
+        return "" if may_be_nan or np.isfinite(values).all() else "is not finite"
 
     def _references(self, found: list[StoredPlan]) -> Iterator[Finding]:
         """Find rows and jobs out of sequence, and samples that refer to rows that hold nothing."""
-        modification, view = _stacked(found)
+        modification, view = _stack(found)
         first_job = 0
         for plan in found:
             used = plan.rows.sample_modification != UNUSED
@@ -139,7 +129,7 @@ class PlanCheck:
 
     def _keys(self, found: list[StoredPlan]) -> Iterator[Finding]:
         """Find samples whose content key does not match their content, or belongs to another sample as well."""
-        modification, view = _stacked(found)
+        modification, view = _stack(found)
         for plan in found:
             rows = plan.rows
             used = np.flatnonzero(rows.sample_modification != UNUSED)
@@ -170,7 +160,7 @@ class PlanCheck:
             yield self._unreadable(folder, error)
 
     def _base(self, folder: str, committed: Set[int]) -> Iterator[Finding]:
-        import zarr
+        from photonfarm.store.format.metadata import open_group
 
         if not self._storage.exists(f"{folder}/zarr.json"):
             if committed:
@@ -182,11 +172,9 @@ class PlanCheck:
         found = []
         for part, record in (("geometry", Geometry), ("cloud", BasePointCloud)):
             try:
-                group: Any = zarr.open_group(
-                    self._storage.zarr(folder), mode="r", zarr_format=3, use_consolidated=False
-                )
+                group, _ = open_group(self._storage, folder)
                 names = [(field.name, group[part]) for field in fields(record)]
-            except UNREADABLE as error:
+            except (StoreError, *UNREADABLE) as error:
                 found.append(
                     Finding(Cause.BASE, f"cannot be read: {plans.reason(error)}", self._id, file=f"{folder}/{part}")
                 )
@@ -204,19 +192,16 @@ def jobs_to_render(found: list[StoredPlan]) -> set[int]:
     return {job for plan in found for job in range(plan.first_job, plan.end_job) if job not in plan.withdrawn}
 
 
-def declaration(group: Any, array: schema.ArraySchema, jobs: int, shard_rows: int) -> str:
-    """What is wrong with the declaration of an output array, by which other programs read it; empty if nothing."""
+def declaration(group: Any, name: str) -> str:
+    """What is wrong with the declaration of an array, by which other programs read it; empty if nothing."""
     try:
-        declared = group[array.name]
-        found = declared.shape, declared.dtype, declared.chunks, declared.shards
+        _ = group[name]
     except UNREADABLE as error:
         return f"cannot be read: {plans.reason(error)}"
-    shape = array.shape
-    expected = (jobs * shard_rows, *shape), array.dtype, (1, *shape), (shard_rows, *shape)
-    return "" if found == expected else f"declares {found}; {expected} is right"
+    return ""
 
 
-def _stacked(found: list[StoredPlan]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _stack(found: list[StoredPlan]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The modification vectors (R, G, 4) and view vectors (R, 6) of all rows of a scene."""
     return (
         np.concatenate([plan.rows.modification for plan in found]),
@@ -239,7 +224,7 @@ def _base_references(geometry: Geometry, cloud: BasePointCloud, groups: int) -> 
     return ""
 
 
-def unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
+def find_unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
     """Yield files of jobs that are not committed, and files that are not ours."""
     left: dict[int, str] = {}
     foreign = [
@@ -255,7 +240,7 @@ def unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
                 foreign.append(f"{folder}/{name}")
             else:
                 left.setdefault(job, f"{folder}/{name}")
-    for job in sorted(left.keys() - markers.jobs(scene.storage, scene.name)):  # now: a worker may have been at it
+    for job in sorted(left.keys() - markers.list_jobs(scene.storage, scene.name)):  # now: a worker may have been at it
         yield scene.finding(Cause.NO_MARKER, job, "not a sample yet", left[job])
     yield from (Finding(Cause.FOREIGN_FILE, "left alone", scene.scene_id, file=file) for file in foreign)
 

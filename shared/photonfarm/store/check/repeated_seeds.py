@@ -17,8 +17,8 @@ from photonfarm.store.check.content_check import CheckTotals, is_constant
 from photonfarm.store.check.job_check import CheckTarget
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import Shard
-from photonfarm.store.write import plans
-from photonfarm.store.write.findings import Cause, Finding
+from photonfarm.store.model import plans
+from photonfarm.store.model.findings import Cause, Finding
 
 DRAWN = 4
 """The number of seeds that a renderer may draw for a half: three are tried, and one may be the other half's."""
@@ -37,12 +37,12 @@ def equal_samples(scene: CheckTarget, totals: CheckTotals) -> Iterator[Finding]:
             if any(np.array_equal(a, b) for a in reference for b in halves)
         }
         for row, cause in causes.items():
-            yield _shared(scene, cause, row, first)
+            yield _report_shared(scene, cause, row, first)
         for cause in dict.fromkeys(causes.values()):
-            yield _shared(scene, cause, first, max(row for row in causes if causes[row] is cause))
+            yield _report_shared(scene, cause, first, max(row for row in causes if causes[row] is cause))
 
 
-def _shared(scene: CheckTarget, cause: Cause, row: int, other: int) -> Finding:
+def _report_shared(scene: CheckTarget, cause: Cause, row: int, other: int) -> Finding:
     detail = f"has a half in common with row {other}"
     return Finding(cause, detail, scene.scene_id, row // scene.shard_rows, row)
 

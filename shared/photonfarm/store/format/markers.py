@@ -58,54 +58,54 @@ class _Marker(_Stored):
     figures: _Figures
 
 
-def name_of(scene: str, job: int) -> str:
+def marker_name(scene: str, job: int) -> str:
     """The name of a job's marker; `scene` is the scene's folder."""
-    return f"{scene}/{COMMITTED}/{file_of(job)}"
+    return f"{scene}/{COMMITTED}/{marker_file(job)}"
 
 
-def file_of(job: int) -> str:
+def marker_file(job: int) -> str:
     """The file of a job's marker, in the folder of markers."""
     return f"{job:0{_DIGITS}d}.json"
 
 
-def place(
+def place_marker(
     storage: Storage, scene: str, job: int, files: Mapping[str, Mapping[str, Any]], figures: Mapping[str, Any]
 ) -> bool:
     """Place the marker of a job, whose files have settled; False if it was there already."""
     below = {name.removeprefix(f"{scene}/"): about for name, about in files.items()}
-    return put_json(storage, {"job": job, "files": below, "figures": figures}, name_of(scene, job))
+    return put_json(storage, {"job": job, "files": below, "figures": figures}, marker_name(scene, job))
 
 
-def read(storage: Storage, scene: str, job: int) -> dict[str, Any]:
+def read_marker(storage: Storage, scene: str, job: int) -> dict[str, Any]:
     """The marker of a committed job: its files, by path below the scene's folder, and its figures.
 
     Raises CorruptError, with the file and the broken rule, for content that no job of ours has written.
     """
-    name = name_of(scene, job)
+    name = marker_name(scene, job)
     where = f"{storage.where}/{name}"
     try:
         content = storage.read(name)
     except OSError as error:
         raise StoreError(f"{where}: cannot be read: {error.strerror}") from error
-    return parse(content, job, where)
+    return parse_marker(content, job, where)
 
 
-def parse(content: bytes, job: int, where: str) -> dict[str, Any]:
+def parse_marker(content: bytes, job: int, where: str) -> dict[str, Any]:
     """The marker in a job's bytes, which are stored at `where`; raises CorruptError as `read` does."""
     try:
         document = json.loads(content)
     except (ValueError, RecursionError) as error:
         raise CorruptError(f"{where}: is not a marker: {error}") from error
-    return _checked(document, job, where)
+    return _check(document, job, where)
 
 
-def files(content: bytes, scene: str, job: int) -> dict[str, dict[str, Any]]:
+def parse_files(content: bytes, scene: str, job: int) -> dict[str, dict[str, Any]]:
     """The files that a marker names, with their sizes and checksums, by their names in the store; raises as `parse`."""
-    named = parse(content, job, name_of(scene, job))["files"]
+    named = parse_marker(content, job, marker_name(scene, job))["files"]
     return {f"{scene}/{name}": about for name, about in named.items()}
 
 
-def _checked(document: Any, job: int, where: str) -> dict[str, Any]:
+def _check(document: Any, job: int, where: str) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise CorruptError(f"{where}: is not a marker: it holds no JSON object")
     try:
@@ -117,14 +117,14 @@ def _checked(document: Any, job: int, where: str) -> dict[str, Any]:
     return document
 
 
-def jobs(storage: Storage, scene: str) -> set[int]:
+def list_jobs(storage: Storage, scene: str) -> set[int]:
     """The jobs of a scene that have a marker; costs one listing."""
     with store_errors("list the markers", f"{storage.where}/{scene}"):
         names = storage.names(f"{scene}/{COMMITTED}")
-    return jobs_named(names)
+    return parse_jobs(names)
 
 
-def jobs_named(names: Iterable[str]) -> set[int]:
+def parse_jobs(names: Iterable[str]) -> set[int]:
     """The jobs of those names in a folder of markers that are names of markers."""
     return {int(found[1]) for name in names if (found := _NAME.fullmatch(name))}
 
@@ -161,7 +161,7 @@ class FollowedMarkers:
         """
         now = self._clock()
         if not self._known or now >= self._whole_due or not isinstance(self._storage, Ordered):
-            self._known = jobs(self._storage, self._scene)
+            self._known = list_jobs(self._storage, self._scene)
             self._whole_due = now + WHOLE_S
         else:
             with store_errors("look for markers", f"{self._storage.where}/{self._scene}"):
@@ -176,9 +176,9 @@ class FollowedMarkers:
         missing = np.flatnonzero(~seen)
         behind = np.append(missing, last + 1) - 1  # for 0, 1, 2, … of the missing asked for: the name to list behind
         asked = int(np.argmin(np.arange(len(behind)) + (last - behind) // LISTED_AT_ONCE))
-        new = {job for job in missing[:asked].tolist() if self._storage.exists(name_of(self._scene, job))}
-        after = file_of(int(behind[asked])) if behind[asked] >= 0 else ""
-        return new | jobs_named(storage.names_behind(f"{self._scene}/{COMMITTED}", after))
+        new = {job for job in missing[:asked].tolist() if self._storage.exists(marker_name(self._scene, job))}
+        after = marker_file(int(behind[asked])) if behind[asked] >= 0 else ""
+        return new | parse_jobs(storage.names_behind(f"{self._scene}/{COMMITTED}", after))
 
 
 def withdrawn_file(plan: str) -> str:

@@ -64,7 +64,7 @@ def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
     lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons, "L": min(spec.points, LIT_POINTS)}
     wanted = [each for each in OUTPUTS if all(lengths.get(str(n), 1) for n in each.shape)]
-    return {each.name: _resolved(each, lengths, spec) for each in wanted}
+    return {each.name: _resolve(each, lengths, spec) for each in wanted}
 
 
 def bytes_of_rows(spec: SceneSpec) -> dict[RowKind, int]:
@@ -81,7 +81,7 @@ def bit_counts(spec: SceneSpec) -> dict[str, int]:
     return {"point_seen": spec.points, "photon_seen": spec.photons.slots}
 
 
-def _resolved(declared: ArrayDeclaration, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
+def _resolve(declared: ArrayDeclaration, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
     exponents = {"radiance": spec.radiance_exponent, "radiance_wide": 0}
     scale = {"radiance_exponent": exponents[declared.name]} if declared.name in exponents else {}
     return ArraySchema(
@@ -203,12 +203,12 @@ def vector_attributes(name: str, groups: Sequence[str]) -> dict[str, Any]:
     return described | ({"groups": list(groups)} if name == "modification" else {})
 
 
-def known_columns(name: str, values: F32, attributes: Mapping[str, Any]) -> F32:
+def select_columns(name: str, values: F32, attributes: Mapping[str, Any]) -> F32:
     """Stored vectors (…, F) with the columns that this program knows; raises as `by_name` does."""
-    return by_name(values, [str(field["name"]) for field in attributes["fields"]], FIELDS[name])
+    return select_by_name(values, [str(field["name"]) for field in attributes["fields"]], FIELDS[name])
 
 
-def by_name(values: F32, stored: Sequence[str], known: Sequence[Mapping[str, Any]]) -> F32:
+def select_by_name(values: F32, stored: Sequence[str], known: Sequence[Mapping[str, Any]]) -> F32:
     """Vectors (…, F) whose columns have the names `stored`, with the `known` fields; those not stored are at rest.
 
     Unused rows stay NaN. Raises ValueError for a field that is not known.

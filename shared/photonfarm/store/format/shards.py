@@ -69,7 +69,7 @@ class ShardWriter:
 
     def append(self, row: int, content: memoryview) -> None:
         """Write one row as `encode` gave it; raises OSError."""
-        self._checksums[row] = _crc(content)
+        self._checksums[row] = crc_of(content)
         self._index[row] = self._size, len(content) + _CRC_BYTES
         self._write(content)
         self._write(self._checksums[row])
@@ -81,10 +81,10 @@ class ShardWriter:
     def finish(self) -> dict[str, Any]:
         """Write the index; returns the file's size, and one checksum over those of its rows and of the index."""
         index = self._index.tobytes()
-        self._write(index + _crc(index))
+        self._write(index + crc_of(index))
         self._file.close()
-        checksums = b"".join(self._checksums[row] for row in sorted(self._checksums)) + _crc(index)
-        return {"size": self._size, "crc32c": _crc(checksums).hex()}
+        checksums = b"".join(self._checksums[row] for row in sorted(self._checksums)) + crc_of(index)
+        return {"size": self._size, "crc32c": crc_of(checksums).hex()}
 
     def close(self) -> None:
         """Close the file, finished or not."""
@@ -127,7 +127,7 @@ class Shard:
             raise CorruptError(f"{self.path}: has {self._size} bytes, too few for the index of {shard_rows} rows")
         data = bytearray(wanted)
         read = self._read_at(self._size - wanted, data)
-        if read < wanted or _crc(memoryview(data)[:-_CRC_BYTES]) != data[-_CRC_BYTES:]:
+        if read < wanted or crc_of(memoryview(data)[:-_CRC_BYTES]) != data[-_CRC_BYTES:]:
             raise self._damaged("the index")
         index = np.frombuffer(data, "<u8", 2 * shard_rows).reshape(shard_rows, 2)
         offset, length = index[(index != _EMPTY).any(axis=1)].T
@@ -171,10 +171,10 @@ class Shard:
         end, crc = offset + length - _CRC_BYTES, bytearray(_CRC_BYTES)
         if (mapped := self._mapped(row, end, crc)) is None:
             content = np.empty(length - _CRC_BYTES, np.uint8) if memory is None else memory
-            whole = self._read_at(offset, content.data, crc) == length and _crc(content) == crc
+            whole = self._read_at(offset, content.data, crc) == length and crc_of(content) == crc
         elif memory is None:
             content = mapped[offset:end]
-            whole = _crc(content) == crc
+            whole = crc_of(content) == crc
         else:
             content = memory
             whole = _copy(mapped[offset:end], memory) == crc
@@ -229,7 +229,7 @@ class Shard:
         crcs = [bytearray(_CRC_BYTES) for _ in ends]
         for end, crc in zip(ends, crcs, strict=True):
             self._read_at(end - _CRC_BYTES, crc)
-        checksum = _crc(b"".join(crcs) + _crc(np.array(self._index, "<u8").tobytes()))
+        checksum = crc_of(b"".join(crcs) + crc_of(np.array(self._index, "<u8").tobytes()))
         return {"size": os.fstat(self._descriptor).st_size, "crc32c": checksum.hex()}
 
 
@@ -243,7 +243,7 @@ def _copy(content: NDArray[np.uint8], memory: NDArray[np.uint8]) -> bytes:
     return checksum.to_bytes(_CRC_BYTES, "little")
 
 
-def _crc(data: bytes | memoryview | NDArray[np.uint8]) -> bytes:
+def crc_of(data: bytes | memoryview | NDArray[np.uint8]) -> bytes:
     """The CRC-32C of contiguous bytes, as it is stored."""
     return _crc32c(data).to_bytes(_CRC_BYTES, "little")
 
@@ -252,7 +252,7 @@ def _crc32c(data: bytes | memoryview | NDArray[np.uint8], before: int = 0) -> in
     """The CRC-32C of contiguous bytes, after others with the checksum `before`.
 
     Of the kept libraries with this checksum, the AWS runtime's is ten times as fast as google-crc32c (60 against 6 GB/s
-    in the cache) and lets other threads run meanwhile. It takes 30 ms to load, which `status` never does.
+    in the cache) and lets other threads run meanwhile.
     """
     from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 
@@ -294,16 +294,16 @@ NOISY_GUIDES = ("direct", "gloss", "point_light")
 """The guides that are sampled, with seeds of their own; they are rounded."""
 
 
-def as_array(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
+def scale_to_array(radiance: F32, exponent: int) -> tuple[str, NDArray[Any]]:
     """The array that a sample goes to, and its values: scaled, or unscaled if float16 cannot hold them."""
     with np.errstate(over="ignore", under="ignore"):
         scaled = radiance * np.float32(2.0**exponent)
     return ("radiance", scaled) if stays_finite(scaled, np.dtype(np.float16)) else ("radiance_wide", radiance)
 
 
-def as_stored(radiance: F32, exponent: int) -> F32:
+def round_as_stored(radiance: F32, exponent: int) -> F32:
     """Radiance as readers give it once it is stored: rounded to float16 at the store's scale, if that can hold it."""
-    name, values = as_array(radiance, exponent)
+    name, values = scale_to_array(radiance, exponent)
     return (
         values if name == "radiance_wide" else values.astype(np.float16).astype(np.float32) * np.float32(2.0**-exponent)
     )
@@ -321,7 +321,7 @@ def stays_finite(values: NDArray[Any], stored: np.dtype[Any]) -> bool:
     return -end < float(values.min()) and float(values.max()) < end
 
 
-def rounded(values: NDArray[Any]) -> F32:
+def round_to_8_bits(values: NDArray[Any]) -> F32:
     """Numbers rounded to 8 significant bits, to nearest with ties to even; noisy values need no more.
 
     The two lower bytes are then 0 and take no room once compressed. Finite values must not be within 0.4 % of the

@@ -24,11 +24,11 @@ from photonfarm.scene.view import view_keys
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import Shard
 from photonfarm.store.io.storage import renew_copy
-from photonfarm.store.read.other_scenes import scene_of, told_apart
-from photonfarm.store.write import plans
-from photonfarm.store.write.plans import StoredPlan
-from photonfarm.store.write.scene_store import SceneStore
-from photonfarm.store.write.store import Store
+from photonfarm.store.model import plans
+from photonfarm.store.model.plans import StoredPlan
+from photonfarm.store.model.scene_store import SceneStore
+from photonfarm.store.model.store import Store
+from photonfarm.store.read.other_scenes import check_scene, tell_apart
 
 _KEY = re.compile(r"[0-9a-fA-F]{32}")
 
@@ -100,7 +100,7 @@ def scene_named(store: Store, text: str) -> str:
     found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
     found = found or [each for each in ids if _name(store, each) == text]
     if len(found) > 1 and all(_name(store, each) == text for each in found):
-        apart = told_apart(store, found)
+        apart = tell_apart(store, found)
         raise StoreError(f"{store.storage.where}: {len(found)} scenes have the name {text!r}: {apart}; give an id")
     if len(found) != 1:
         held = f"{len(found)} scenes have" if found else "no scene has"
@@ -121,7 +121,9 @@ def scene_or_spec(store: Store, named: str) -> SceneStore:
     Raises StoreError, which names the scenes that are there and how one of the spec's name differs from it, and
     SpecError for a file that is no spec.
     """
-    return store.scene(scene_of(store, named, load_spec(named)) if is_spec_file(named) else scene_named(store, named))
+    return store.scene(
+        check_scene(store, named, load_spec(named)) if is_spec_file(named) else scene_named(store, named)
+    )
 
 
 def _name(store: Store, scene_id: str) -> str | None:

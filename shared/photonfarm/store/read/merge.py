@@ -24,13 +24,13 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.core.archives import stored_arrays, write_arrays
+from photonfarm.core.archives import read_arrays, write_arrays
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.core.records import F32
+from photonfarm.store.model.scene_store import SceneStore
 from photonfarm.store.read.batch import Batch
 from photonfarm.store.read.find import Query, SceneMatch
 from photonfarm.store.read.reader import SceneReader
-from photonfarm.store.write.scene_store import SceneStore
 
 F64 = NDArray[np.float64]
 
@@ -77,7 +77,7 @@ class MergedView:
     @classmethod
     def read(cls, file: Path) -> Self:
         """Read what `write` stored; raises StoreError for anything else."""
-        with stored_arrays(file, "merged view", "store merge") as stored:
+        with read_arrays(file, "merged view", "store merge") as stored:
             images = (np.asarray(stored[name]) for name in ("mean", "m2", "half_a", "half_b"))
             return cls(int(stored["passes"]), *images)
 

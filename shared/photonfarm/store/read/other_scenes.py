@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from photonfarm.core.errors import StoreError
 from photonfarm.core.models import differing
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store.write.scene_store import SceneStore, held
-from photonfarm.store.write.store import Store
+from photonfarm.store.model.scene_store import SceneStore, list_scenes
+from photonfarm.store.model.store import Store
 
 FEW = 4
 """Up to so many differing keys are named."""
@@ -17,33 +17,34 @@ FILES = "the scene's files"
 """What the digest `content` is of."""
 
 
-def scene_of(store: Store, name: str, spec: SceneSpec) -> str:
+def check_scene(store: Store, name: str, spec: SceneSpec) -> str:
     """The id of a spec's scene, which the store holds; StoreError if it does not. `name` is the spec's for its user."""
     if not store.has_scene(spec.scene_id):
         where = store.storage.where
-        raise StoreError(f"{where}: holds no samples of {name} (scene {spec.scene_id}); {other_scenes(store, spec)}")
+        raise StoreError(f"{where}: holds no samples of {name} (scene {spec.scene_id}); {describe_scenes(store, spec)}")
     return spec.scene_id
 
 
-def other_scenes(store: Store, spec: SceneSpec) -> str:
+def describe_scenes(store: Store, spec: SceneSpec) -> str:
     """The scenes that a store has, in words, and where one of the spec's name differs from it."""
     nearest, others = _alike(store, spec)
     if nearest is None:
-        return held(store.storage)
+        return list_scenes(store.storage)
     more = f"; {others} more have this name" if others else ""
-    return f"scene {nearest.scene_id} of this name is there and differs in {differences(nearest.spec, spec)}{more}"
+    differ = describe_differences(nearest.spec, spec)
+    return f"scene {nearest.scene_id} of this name is there and differs in {differ}{more}"
 
 
-def first_plan_note(store: Store, spec: SceneSpec) -> str | None:
+def note_first_plan(store: Store, spec: SceneSpec) -> str | None:
     """What to say of a scene's first plan where the store has another scene of this name; None where it has none."""
     nearest, _ = _alike(store, spec)
     if nearest is None:
         return None
-    differ = differences(nearest.spec, spec)
-    return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {samples_of(nearest)}"
+    differ = describe_differences(nearest.spec, spec)
+    return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {describe_samples(nearest)}"
 
 
-def with_same_radiance(store: Store, spec: SceneSpec) -> str | None:
+def find_same_radiance(store: Store, spec: SceneSpec) -> str | None:
     """The id of the other scene that has most complete samples of the same radiance id; None without one."""
 
     def complete(scene: SceneStore) -> int:
@@ -55,15 +56,18 @@ def with_same_radiance(store: Store, spec: SceneSpec) -> str | None:
     return best if best and counted[best] else None
 
 
-def told_apart(store: Store, scene_ids: Sequence[str]) -> str:
+def tell_apart(store: Store, scene_ids: Sequence[str]) -> str:
     """Scenes of one name in words: how many samples each has, and how it differs from the first."""
     first, *others = [store.scene(each) for each in scene_ids]
-    said = [f"{first.scene_id} ({samples_of(first)})"]
-    said += [f"{each.scene_id} ({samples_of(each)}; {differences(first.spec, each.spec)} differ)" for each in others]
+    said = [f"{first.scene_id} ({describe_samples(first)})"]
+    said += [
+        f"{each.scene_id} ({describe_samples(each)}; {describe_differences(first.spec, each.spec)} differ)"
+        for each in others
+    ]
     return ", ".join(said)
 
 
-def samples_of(scene: SceneStore) -> str:
+def describe_samples(scene: SceneStore) -> str:
     """How many samples of a scene are complete, in words."""
     try:
         found = scene.progress()
@@ -72,15 +76,14 @@ def samples_of(scene: SceneStore) -> str:
     return f"{found.committed_samples} of {found.planned_samples} samples complete"
 
 
-def differences(there: SceneSpec, here: SceneSpec) -> str:
+def describe_differences(there: SceneSpec, here: SceneSpec) -> str:
     """Where two specs differ in what ids cover, in words."""
     changes = differing(there.identity(), here.identity())
     few = list(changes.items())[:FEW]
     more = f" and {len(changes) - len(few)} more" if len(changes) > len(few) else ""
     return (
         ", ".join(
-            FILES if key == "content" else f"{key} ({_said(a)} in the store, {_said(b)} asked for)"
-            for key, (a, b) in few
+            FILES if key == "content" else f"{key} ({_say(a)} in the store, {_say(b)} asked for)" for key, (a, b) in few
         )
         + more
     )
@@ -95,7 +98,7 @@ def _alike(store: Store, spec: SceneSpec) -> tuple[SceneStore | None, int]:
     return min(alike, key=lambda each: len(differing(each.spec.identity(), spec.identity()))), len(alike) - 1
 
 
-def _said(value: object) -> str:
+def _say(value: object) -> str:
     if value is None:
         return "not"
     text = f"{value:g}" if isinstance(value, float) else str(value)

@@ -29,12 +29,12 @@ from photonfarm.store.format import markers, schema
 from photonfarm.store.format.markers import FollowedMarkers
 from photonfarm.store.format.shards import OpenShards, Shard
 from photonfarm.store.io.storage import FORMAT_FILE, open_storage, renew_copy
+from photonfarm.store.model import plans
+from photonfarm.store.model.lease import announce_work, read_leases
+from photonfarm.store.model.plans import StoredPlan
+from photonfarm.store.model.scene_store import SCENES, is_there, read_base, read_spec
+from photonfarm.store.model.store import check_format
 from photonfarm.store.read.batch import Batch, Sample
-from photonfarm.store.write import plans
-from photonfarm.store.write.lease import at_work, leases
-from photonfarm.store.write.plans import StoredPlan
-from photonfarm.store.write.scene_store import SCENES, is_there, read_base, read_spec
-from photonfarm.store.write.store import check_format
 
 REPAIR = "`photonfarm store check --repair` sets its job aside, and workers render it again"
 """The remedy for damaged samples."""
@@ -288,11 +288,11 @@ class SceneReader:
 
     def at_work(self, what: str) -> AbstractContextManager[None]:
         """Announce that this process is at work in the scene, as `lease.at_work` does."""
-        return at_work(self._storage, self._scene_id, what)
+        return announce_work(self._storage, self._scene_id, what)
 
     def lease(self) -> str | None:
         """Who has the scene for itself now, in words; None if nobody has. Costs a listing."""
-        return leases(self._storage).get(self._scene_id)
+        return read_leases(self._storage).get(self._scene_id)
 
     def doubt(self) -> None:
         """Look for all markers at the next refresh: some may have been removed."""
@@ -350,7 +350,7 @@ class SceneReader:
                 self._check_not_forgotten()
                 for row in rows:
                     for part in (row, self._view_row[row], self._modification_row[row]):
-                        marker = markers.name_of(self._name, int(part) // self._plans[0].shard_rows)
+                        marker = markers.marker_name(self._name, int(part) // self._plans[0].shard_rows)
                         if not self._storage.exists(marker):
                             raise self._incomplete(int(row)) from error
                 raise CorruptError(f"{error}; {REPAIR}") from error

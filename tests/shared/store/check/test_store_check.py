@@ -125,8 +125,8 @@ def test_a_marker_of_a_job_that_no_plan_has_is_found_and_set_aside(store: Store,
 
 def test_a_value_that_is_not_finite_is_found(store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """No writer of ours stores one."""
-    monkeypatch.setattr("photonfarm.store.write.commit.as_array", lambda halves, _: ("radiance", halves))
-    monkeypatch.setattr("photonfarm.store.write.commit.stays_finite", lambda *_: True)
+    monkeypatch.setattr("photonfarm.store.model.commit.scale_to_array", lambda halves, _: ("radiance", halves))
+    monkeypatch.setattr("photonfarm.store.model.commit.stays_finite", lambda *_: True)
 
     def poison(given: Any) -> None:
         given.radiance[1][1, 2, 3, 0] = np.nan
@@ -142,7 +142,7 @@ def test_rows_that_are_missing_or_that_the_plan_does_not_use_are_found(
     store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last job has two samples; of another plan, it has three."""
-    from photonfarm.store.write.commit import JobWriter
+    from photonfarm.store.model.commit import JobWriter
 
     monkeypatch.setattr(JobWriter, "_claim", lambda *_: None)
     monkeypatch.setattr(JobWriter, "_check_complete", lambda _: None)

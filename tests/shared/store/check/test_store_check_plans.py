@@ -11,9 +11,13 @@ import checked_store as stores
 import pytest
 
 from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.farm.dry_run import rehearse
+from photonfarm.farm.submission import check_hold_out, submit
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
+from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store.format.metadata import seal
 
 scene = stores.scene
 samples, commit_all, checked, found = stores.samples, stores.commit_all, stores.checked, stores.found
@@ -49,6 +53,54 @@ def test_what_is_damaged_or_missing_of_a_plan_is_named(store: Store, scene: Scen
     (scene.folder / "plans/000000/radiance/zarr.json").unlink()
     (group,) = checked(store).scenes[0].groups
     assert len([finding for finding in group.first if "radiance/" in str(finding.file)]) == 1
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('"jobs": 3', '"jobs": 4'),
+        ("radiance_exponent", "radiance_exponenu"),
+        ('"light_samples": 3', '"light_samples": 4'),
+        ('"seed": 0', '"seed": 1'),
+        ('"generator"', '"Generator"'),
+        ('"parts": 2', '"parts": 3'),
+        ('"depth/zarr.json": "', '"depth/zarr.json": "f'),
+        ('"checksums"', '"Checksums"'),
+    ],
+)
+def test_changed_metadata_of_a_plan_is_found_and_other_scenes_go_on(
+    store: Store, scene: SceneStore, old: str, new: str
+) -> None:
+    other = store.scene(store.plan(samples.small_spec(points=8), Request(modifications=2)).scene_id)
+    change_text(scene.folder / "plans/000000/zarr.json", old, new)
+    again = Store(store.root)
+    errors = {status.scene_id: status.error for status in store_status(again)}
+    assert (errors.pop(other.scene_id), len(errors)) == (None, 1)
+    assert ("checksums is missing" if "checksums" in old else "fails its CRC-32C") in str(errors[scene.scene_id])
+    assert again.plan(samples.small_spec(points=8), Request(modifications=3)).new == 1
+    with pytest.raises(CorruptError):
+        SceneReader(store.root, scene.scene_id).refresh()
+    before = data(scene)
+    report = checked(store, scene_id=scene.scene_id, repair=True)
+    assert (found(report), report.exit_code, data(scene) == before) == ({"plan": 1}, 4, True)
+
+
+@pytest.mark.parametrize("name", ["", "cloud/", "geometry/faces/"])
+def test_changed_metadata_of_the_base_is_found_and_set_aside(store: Store, scene: SceneStore, name: str) -> None:
+    change_text(scene.folder / f"base/{name}zarr.json", '"attributes"', '"attributes" ')
+    with pytest.raises(CorruptError, match="store check --repair"):
+        scene.base()
+    assert list(found(checked(store))) == ["base"]
+    assert checked(store, repair=True).exit_code == 7
+    commit_all(scene)
+    scene.write_base(*samples.base())
+    assert found(checked(store)) == {}
+
+
+def change_text(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new))
 
 
 def shard_or_none(scene: SceneStore, name: str, job: int) -> list[Path]:
@@ -172,16 +224,29 @@ def test_a_damaged_base_is_set_aside_and_the_next_job_writes_it(store: Store, sc
     assert found(checked(store)) == {}
 
 
-def test_a_damaged_spec_is_set_aside_and_the_next_submission_writes_it(store: Store, scene: SceneStore) -> None:
+@pytest.mark.parametrize("gone", [False, True], ids=["flipped", "missing"])
+def test_a_damaged_spec_is_set_aside_and_the_next_submission_writes_it(
+    store: Store, scene: SceneStore, gone: bool
+) -> None:
     clean = data(scene)
     file = scene.folder / "spec.json"
     whole = file.read_bytes()
-    flip(file, 30)
-    assert checked(store, repair=True).exit_code == 7
+    named, request = NamedSpec("small", samples.small_spec(), None), Request(modifications=5, views_per_modification=2)
+    if gone:
+        file.unlink()
+    else:
+        flip(file, 30)
+        for dry_run in (False, True):
+            with pytest.raises(CorruptError, match="store check --repair"):
+                Store(store.root).plan(named.spec, request, dry_run=dry_run)
+        assert checked(store, repair=True).exit_code == 7
     with pytest.raises(CorruptError, match="photonfarm submit"):
         Store(store.root).scene(scene.scene_id)
     assert checked(store).exit_code == 4  # its plans are there without it
-    Store(store.root).plan(samples.small_spec(), Request(modifications=5, views_per_modification=2))
+    assert rehearse(named, store.root, request, measure=False, log=print).planned_before == 10
+    check_hold_out(named.spec, store.root, 0.5, request)
+    assert not file.exists()
+    assert submit(named, store.root, None, request).planned_before == 10
     assert file.read_bytes() == whole
     assert (found(checked(store)), data(scene)) == ({}, clean)
 
@@ -229,7 +294,7 @@ def test_a_damaged_file_of_a_plan_is_written_again_from_the_request(
     assert (found(report), report.exit_code) == ({"plan-inputs": 1}, 4)
     report = checked(store, repair=True)
     assert (found(report), report.exit_code) == ({"plan-inputs": 1}, 7)
-    assert report.scenes[0].set_aside == (f"plan {number}, written again from its request",)
+    assert report.scenes[0].set_aside == (f"plan {number}, written again",)
     assert data(scene) == clean
     quarantine = Path(store.root) / report.quarantine
     aside = quarantine / path.relative_to(store.root)
@@ -260,7 +325,7 @@ def test_several_damaged_plans_are_written_again_in_their_order(store: Store, pl
     [
         (lambda plan: change(plan, seed=1), "its request gives another modification than is there"),
         (lambda plan: change(plan, modifications=40), "its request does not give its 3 jobs"),
-        (lambda plan: change(plan, modifications=0), "its zarr.json cannot be read"),
+        (lambda plan: change(plan, modifications=0), "is not a readable plan"),
         (lambda plan: flip(plan / "sample_key/c.0.0", 30), "too little of it can be read"),
     ],
 )
@@ -281,3 +346,4 @@ def change(plan: Path, **request: int) -> None:
     about = json.loads((plan / "zarr.json").read_text())
     about["attributes"]["request"].update(request)
     (plan / "zarr.json").write_text(json.dumps(about))
+    seal(plan)

@@ -17,7 +17,7 @@ import pytest
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check import check
-from photonfarm.store.write.quarantine import Quarantine
+from photonfarm.store.model.quarantine import Quarantine
 
 scene, outputs = stores.scene, stores.outputs
 commit_all, checked, found, data = stores.commit_all, stores.checked, stores.found, stores.data
@@ -196,16 +196,17 @@ def test_a_job_that_another_repair_has_set_aside_meanwhile_is_no_error(
 
 def test_a_damaged_job_stays_where_it_is_until_its_plan_is_whole(store: Store, scene: SceneStore) -> None:
     """Set aside, nobody could render it again; and all of it but a bit is good."""
-    about = scene.folder / "plans/000000/zarr.json"
-    whole = about.read_bytes()
-    document = json.loads(whole)
-    del document["attributes"]["request"]
-    about.write_text(json.dumps(document))
+    inputs = {path: path.read_bytes() for path in (scene.folder / "plans/000000").glob("sample_*/c.0*")}
+    for path in inputs:
+        flip(path, 3)
     flip(shard(scene, "depth", 1), 20)
     before = data(scene)
     report = checked(store, repair=True)
-    assert (found(report), report.exit_code) == ({"checksum": 1, "plan": 1, "left-in-place": 1}, 4)
+    assert (found(report), report.exit_code) == (
+        {"plan-inputs": 4, "checksum": 1, "plan": 1, "left-in-place": 1}, 4
+    )  # fmt: skip
     assert (report.scenes[0].set_aside, report.quarantine, data(scene) == before) == ((), None, True)
     assert marker(scene, 1).exists()
-    about.write_bytes(whole)
+    for path, whole in inputs.items():
+        path.write_bytes(whole)
     assert checked(store, repair=True).scenes[0].set_aside == ("job 1",)

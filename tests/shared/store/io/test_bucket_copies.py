@@ -106,15 +106,15 @@ def test_a_marker_is_not_taken_back_for_a_copy_that_is_damaged_on_this_machine(
     url: str, scene: SceneStore, harm: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Another worker announces the files of ours before we do, and our copies of them rot."""
-    another, place = Store(url).scene(scene.scene_id), markers.place
+    another, place = Store(url).scene(scene.scene_id), markers.place_marker
 
     def meanwhile(*about: Any) -> bool:
-        monkeypatch.setattr(markers, "place", place)
+        monkeypatch.setattr(markers, "place_marker", place)
         assert samples.commit(another, 1, samples.outputs(another, 1))
         damage(scene, harm)
         return place(*about)
 
-    monkeypatch.setattr(markers, "place", meanwhile)
+    monkeypatch.setattr(markers, "place_marker", meanwhile)
     assert not samples.commit(scene, 1, samples.outputs(scene, 1))
     assert scene.storage.names("quarantine") == []
     assert scene.missing_jobs() == []
@@ -128,7 +128,7 @@ def test_whole_files_of_a_dead_writer_are_kept_though_their_copies_on_this_machi
 ) -> None:
     theirs = samples.outputs(scene, 1)
     assert samples.commit(scene, 1, theirs)
-    obstore.delete(objects_below(url)[0], markers.name_of(scene.name, 1))
+    obstore.delete(objects_below(url)[0], markers.marker_name(scene.name, 1))
     damage(scene, harm)
     ours = {row: halves + 1 for row, halves in theirs.radiance.items()}
     assert samples.commit(scene, 1, replace(theirs, radiance=ours))

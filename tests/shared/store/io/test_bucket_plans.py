@@ -11,7 +11,7 @@ from photonfarm.farm.join import join
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.check.check import check_store
-from photonfarm.store.write.withdrawal import withdraw
+from photonfarm.store.model.withdrawal import withdraw
 
 
 class KilledError(Exception):

@@ -29,11 +29,11 @@ class Clock:
 def put(url: str, *jobs: int) -> None:
     bucket = from_url(url, client_options={"allow_http": True})
     with ThreadPoolExecutor(16) as pool:
-        list(pool.map(lambda job: obstore.put(bucket, markers.name_of(SCENE, job), b"{}"), jobs))
+        list(pool.map(lambda job: obstore.put(bucket, markers.marker_name(SCENE, job), b"{}"), jobs))
 
 
 def remove(url: str, job: int, scene: str = SCENE) -> None:
-    obstore.delete(from_url(url, client_options={"allow_http": True}), markers.name_of(scene, job))
+    obstore.delete(from_url(url, client_options={"allow_http": True}), markers.marker_name(scene, job))
 
 
 def test_a_look_costs_two_requests_however_many_markers_there_are(
@@ -102,7 +102,7 @@ def test_in_a_folder_every_look_sees_all(tmp_path: Path) -> None:
     folder = tmp_path / SCENE / markers.COMMITTED
     folder.mkdir(parents=True)
     for job in range(3):
-        (folder / markers.file_of(job)).touch()
+        (folder / markers.marker_file(job)).touch()
     assert followed.look() == {0, 1, 2}
-    (folder / markers.file_of(1)).unlink()
+    (folder / markers.marker_file(1)).unlink()
     assert followed.look() == {0, 2}

@@ -15,8 +15,8 @@ from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.io import object_cache
 from photonfarm.store.io.objects import ObjectStorage
+from photonfarm.store.model.findings import Cause
 from photonfarm.store.read.find import Query, find_samples
-from photonfarm.store.write.findings import Cause
 
 planned, put = bucket_samples.planned, bucket_samples.put
 

@@ -19,8 +19,8 @@ from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import arrays_of
 from photonfarm.plan.request import PlannedRows, Request
 from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.store.model.plans import StoredPlan
 from photonfarm.store.read.find import Matches, Query, find_samples, scene_named
-from photonfarm.store.write.plans import StoredPlan
 
 
 @pytest.fixture

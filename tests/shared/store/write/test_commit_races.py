@@ -52,7 +52,7 @@ def test_two_writers_of_which_one_replaces_what_the_other_kept_announce_what_is_
     scene: SceneStore, monkeypatch: pytest.MonkeyPatch, theirs: str
 ) -> None:
     """One finds a file damaged, and the other commits, with other values, before that is replaced, or after."""
-    (scene.storage.root / markers.name_of(scene.name, 0)).unlink()
+    (scene.storage.root / markers.marker_name(scene.name, 0)).unlink()
     damaged = next((scene.folder / "plans/000000/radiance").glob("c.0.*"))
     damaged.write_bytes(damaged.read_bytes()[:-1])
     ours = samples.outputs(scene, 0)
@@ -107,7 +107,7 @@ def test_a_writer_whose_files_are_all_its_own_compares_them_with_a_marker_that_c
         file = f"{rows.folder}/depth/c.0.0.0"
         about = {"size": 1, "crc32c": "00000000"}
         figures = scene.marker(0)["figures"]
-        assert markers.place(another.storage, another.name, 1, {file: about}, figures)
+        assert markers.place_marker(another.storage, another.name, 1, {file: about}, figures)
 
     before(monkeypatch, markers, "place", meanwhile)
     assert samples.commit(scene, 1, samples.outputs(scene, 1))

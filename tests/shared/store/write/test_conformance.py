@@ -18,7 +18,7 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.view import Camera
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import schema
-from photonfarm.store.write.withdrawal import withdraw
+from photonfarm.store.model.withdrawal import withdraw
 
 ROOT = Path(__file__).parents[4]
 PLAIN_READER = Path(__file__).parents[2] / "plain_reader.py"

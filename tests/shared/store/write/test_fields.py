@@ -10,6 +10,7 @@ import zarr
 from photonfarm.core.errors import CorruptError
 from photonfarm.store import SceneStore
 from photonfarm.store.format import schema
+from photonfarm.store.format.metadata import seal
 
 scene = samples.scene
 TURN = {"name": "turn", "unit": "degrees", "rest": 0.0, "zero": "as modelled"}
@@ -43,11 +44,14 @@ def test_a_plan_that_lacks_a_field_has_it_at_rest(scene: SceneStore, monkeypatch
 def test_columns_are_found_by_name_in_any_order() -> None:
     known: Any = schema.FIELDS["modification"]
     values = np.arange(8, dtype=np.float32).reshape(1, 2, 4)
-    np.testing.assert_array_equal(schema.by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values)
+    np.testing.assert_array_equal(
+        schema.select_by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values
+    )
 
 
 def test_a_field_of_a_newer_program_is_refused(scene: SceneStore) -> None:
     plan = zarr.open_group(scene.folder / "plans/000000", mode="r+")
     plan["view"].update_attributes({"fields": [*plan["view"].attrs["fields"], {"name": "fov"}]})
+    seal(scene.folder / "plans/000000")
     with pytest.raises(CorruptError, match="has the field fov, which this program does not know"):
         SceneStore(scene.storage, scene.scene_id).plans()

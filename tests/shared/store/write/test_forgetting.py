@@ -14,18 +14,18 @@ from click.testing import CliRunner
 from photonfarm.cli.store_verbs import forget as verb
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
-from photonfarm.queue import job_name, keep_failure, times_failed
+from photonfarm.queue import count_failures, job_name, keep_failure
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
+from photonfarm.store.model.withdrawal import forget
 from photonfarm.store.read import reader as reading
-from photonfarm.store.write.withdrawal import forget
 
 FORGET = """
 import os, signal, sys
 from photonfarm.store import Store
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write.withdrawal import forget
+from photonfarm.store.model.withdrawal import forget
 left = int(sys.argv[3])
 for name in ("delete", "delete_folder", "adopt"):
     def dying(*args, plain=getattr(LocalStorage, name), **options):
@@ -96,7 +96,7 @@ def test_a_writer_that_slept_through_it_commits_nothing_of_what_it_rendered(
     scene: SceneStore, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
     scene.plan(Request(modifications=6))
-    given, place = samples.outputs(scene, 2), markers.place
+    given, place = samples.outputs(scene, 2), markers.place_marker
 
     def late(*about: Any) -> bool:
         monkeypatch.undo()
@@ -104,7 +104,7 @@ def test_a_writer_that_slept_through_it_commits_nothing_of_what_it_rendered(
         return place(*about)
 
     if when == "before the marker":
-        monkeypatch.setattr(markers, "place", late)
+        monkeypatch.setattr(markers, "place_marker", late)
         assert not samples.commit(scene, 2, given)
         again = Store(scene.storage.where).scene(scene.scene_id)
     else:
@@ -137,7 +137,7 @@ def test_its_failures_are_forgotten_and_those_of_others_are_not(store: Store, sc
     for each in (scene, other):
         keep_failure(store, job_name(each.scene_id, 0), "IncompleteError: no", worker="w1")
     forget(Store(store.root), scene.scene_id)
-    assert times_failed(store) == {job_name(other.scene_id, 0): 1}
+    assert count_failures(store) == {job_name(other.scene_id, 0): 1}
 
 
 @pytest.mark.parametrize("point", range(1, 12))

@@ -15,16 +15,16 @@ from photonfarm.core.errors import StoreError
 from photonfarm.core.processes import process_space
 from photonfarm.store import Store
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write import lease as leasing
-from photonfarm.store.write.lease import LeasedError, at_work, lease, leases
+from photonfarm.store.model import lease as leasing
+from photonfarm.store.model.lease import LeasedError, announce_work, hold_lease, read_leases
 
 SCENE = "0123456789abcdef0123456789abcdef"
 
 AT_WORK = """
 import sys, time
 from photonfarm.store import Store
-from photonfarm.store.write.lease import at_work
-with at_work(Store(sys.argv[1]).storage, sys.argv[2], "worker w1 at job 12"):
+from photonfarm.store.model.lease import announce_work
+with announce_work(Store(sys.argv[1]).storage, sys.argv[2], "worker w1 at job 12"):
     print("in", flush=True)
     sys.stdin.readline()
 """
@@ -57,22 +57,22 @@ def test_a_lease_waits_for_who_is_at_work_and_says_whom(storage: LocalStorage, w
         worker.stdin.write("\n")
         worker.stdin.flush()
 
-    with lease(storage, SCENE, "store check --repair", let_go):
+    with hold_lease(storage, SCENE, "store check --repair", let_go):
         assert worker.wait() == 0
-        assert "store check --repair" in leases(storage)[SCENE]
+        assert "store check --repair" in read_leases(storage)[SCENE]
     assert f"scene {SCENE}: store check --repair waits for worker w1 at job 12" in waited[0]
     assert str(worker.pid) in waited[0]
-    assert leases(storage) == {}
+    assert read_leases(storage) == {}
 
 
 def test_nobody_begins_to_work_under_a_lease_and_other_scenes_are_free(storage: LocalStorage) -> None:
     refused = pytest.raises(LeasedError, match=r"store forget .* has it for itself")
-    with lease(storage, SCENE, "store forget", pytest.fail):
-        with refused, at_work(storage, SCENE, "worker w1 at job 3"):
+    with hold_lease(storage, SCENE, "store forget", pytest.fail):
+        with refused, announce_work(storage, SCENE, "worker w1 at job 3"):
             pytest.fail("worked under a lease")
-        with at_work(storage, SCENE[::-1], "worker w1 at job 3"):
+        with announce_work(storage, SCENE[::-1], "worker w1 at job 3"):
             pass
-    with at_work(storage, SCENE, "worker w1 at job 3"):
+    with announce_work(storage, SCENE, "worker w1 at job 3"):
         pass
 
 
@@ -80,14 +80,14 @@ def test_who_may_wait_goes_on_when_the_lease_has_ended(storage: LocalStorage) ->
     taken, said = threading.Event(), threading.Event()
 
     def hold() -> None:
-        with lease(storage, SCENE, "store join", print):
+        with hold_lease(storage, SCENE, "store join", print):
             taken.set()
             said.wait(10)
 
     thread = threading.Thread(target=hold)
     thread.start()
     taken.wait(10)
-    with at_work(storage, SCENE, "submit", on_wait=lambda _: said.set()):
+    with announce_work(storage, SCENE, "submit", on_wait=lambda _: said.set()):
         assert said.is_set()
     thread.join()
 
@@ -97,7 +97,7 @@ def test_two_never_have_the_lease_at_once(storage: LocalStorage) -> None:
 
     def hold() -> None:
         for _ in range(4):
-            with lease(storage, SCENE, "store withdraw", lambda _: None):
+            with hold_lease(storage, SCENE, "store withdraw", lambda _: None):
                 inside[0] += 1
                 most[0] = max(most[0], inside[0])
                 time.sleep(0.01)
@@ -114,7 +114,7 @@ def test_two_never_have_the_lease_at_once(storage: LocalStorage) -> None:
 def test_the_killed_are_not_waited_for(storage: LocalStorage, worker: subprocess.Popen[str]) -> None:
     worker.send_signal(signal.SIGKILL)
     worker.wait()
-    with lease(storage, SCENE, "store check --repair", pytest.fail):
+    with hold_lease(storage, SCENE, "store check --repair", pytest.fail):
         pass
     assert storage.names(f"{leasing.LEASES}/{SCENE}") == []
 
@@ -122,11 +122,11 @@ def test_the_killed_are_not_waited_for(storage: LocalStorage, worker: subprocess
 def test_a_lease_of_a_killed_process_ends_with_it(storage: LocalStorage, worker: subprocess.Popen[str]) -> None:
     document = {"what": "store join", "space": process_space(), "process": worker.pid, "beat": 0}
     Path(storage.where, leasing.LEASES, f"{SCENE}.json").write_text(json.dumps(document))
-    assert "store join" in leases(storage)[SCENE]
+    assert "store join" in read_leases(storage)[SCENE]
     worker.kill()
     worker.wait()
-    assert leases(storage) == {}
-    with lease(storage, SCENE, "store withdraw", pytest.fail):
+    assert read_leases(storage) == {}
+    with hold_lease(storage, SCENE, "store withdraw", pytest.fail):
         pass
 
 
@@ -138,7 +138,7 @@ def test_two_who_find_a_lease_of_the_dead_do_not_both_take_it(storage: LocalStor
 
     def hold(begun: threading.Barrier) -> None:
         begun.wait()
-        with lease(storage, SCENE, "store withdraw", lambda _: None):
+        with hold_lease(storage, SCENE, "store withdraw", lambda _: None):
             inside[0] += 1
             most[0] = max(most[0], inside[0])
             time.sleep(0.01)
@@ -153,7 +153,7 @@ def test_two_who_find_a_lease_of_the_dead_do_not_both_take_it(storage: LocalStor
         for thread in threads:
             thread.join()
     assert most == [1]
-    assert leases(storage) == {}
+    assert read_leases(storage) == {}
 
 
 def test_who_was_suspended_for_too_long_notices_that_others_went_on(
@@ -161,9 +161,9 @@ def test_who_was_suspended_for_too_long_notices_that_others_went_on(
 ) -> None:
     monkeypatch.setattr(leasing, "SILENT_S", -1.0)  # everybody counts as dead
     monkeypatch.setattr(leasing, "BEAT_S", 0.01)
-    with lease(storage, SCENE, "store forget", pytest.fail) as held:
+    with hold_lease(storage, SCENE, "store forget", pytest.fail) as held:
         held.check()
-        with lease(storage, SCENE, "store join", pytest.fail) as other:
+        with hold_lease(storage, SCENE, "store join", pytest.fail) as other:
             with pytest.raises(StoreError, match="store forget was silent for so long that others went on"):
                 held.check()
             time.sleep(0.1)
@@ -177,17 +177,17 @@ def test_who_is_silent_on_another_machine_counts_as_dead(
     name = Path(storage.where, leasing.LEASES, f"{SCENE}.json")
     name.parent.mkdir(exist_ok=True)
     name.write_text(json.dumps({"what": "store join", "space": "elsewhere-1", "process": 1, "beat": 7}))
-    assert "store join (elsewhere, process 1)" in leases(storage)[SCENE]
+    assert "store join (elsewhere, process 1)" in read_leases(storage)[SCENE]
     now = time.monotonic()
     monkeypatch.setattr(leasing.time, "monotonic", lambda: now + leasing.SILENT_S + 1)
-    assert leases(storage) == {}
+    assert read_leases(storage) == {}
     name.write_text(json.dumps({"what": "store join", "space": "elsewhere-1", "process": 1, "beat": 8}))
-    assert SCENE in leases(storage)  # it lives
+    assert SCENE in read_leases(storage)  # it lives
 
 
 def test_it_is_renewed(storage: LocalStorage, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(leasing, "BEAT_S", 0.01)
-    with lease(storage, SCENE, "store join", pytest.fail):
+    with hold_lease(storage, SCENE, "store join", pytest.fail):
         time.sleep(0.2)
         assert json.loads(storage.read(f"{leasing.LEASES}/{SCENE}.json"))["beat"] > 1
 
@@ -199,5 +199,5 @@ def test_a_reader_of_a_store_that_cannot_be_written_announces_nothing(
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(LocalStorage, "adopt", refuse)
-    with at_work(storage, SCENE, "trainer of run r"):
+    with announce_work(storage, SCENE, "trainer of run r"):
         assert storage.names(f"{leasing.LEASES}/{SCENE}") == []

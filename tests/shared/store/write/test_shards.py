@@ -115,7 +115,7 @@ def test_shards_read_equal_in_zarr_and_those_of_zarr_read_equal_here(
 def test_the_checksum_is_the_crc_32c_of_another_library() -> None:
     content = np.random.default_rng(0).integers(0, 256, 1 << 20, np.uint8).tobytes()
     for length in [*range(300), 4095, 65537, 1 << 20]:
-        assert int.from_bytes(shards._crc(content[:length]), "little") == google_crc32c.value(content[:length])
+        assert int.from_bytes(shards.crc_of(content[:length]), "little") == google_crc32c.value(content[:length])
 
 
 # ---------------------------------------------------------------------------------------------------- reading the rows

@@ -13,7 +13,7 @@ from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.core.records import ViewBuffers, Visibility, arrays_of
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store, store_status
-from photonfarm.store.format.shards import NOISY_GUIDES, rounded
+from photonfarm.store.format.shards import NOISY_GUIDES, round_to_8_bits
 
 scene, reader_of = samples.scene, samples.reader_of
 
@@ -35,7 +35,7 @@ def test_every_committed_sample_reads_back_as_it_was_rendered(scene: SceneStore)
             for name, array in arrays_of(given.buffers[s.view_row]).items():
                 np.testing.assert_array_equal(getattr(read.buffers, name), array)
             for name, array in arrays_of(given.guides[s.view_row]).items():
-                expected = rounded(array) if name in NOISY_GUIDES else array
+                expected = round_to_8_bits(array) if name in NOISY_GUIDES else array
                 np.testing.assert_array_equal(getattr(read.guides, name), expected, err_msg=name)
                 assert (expected != array).any() == (name in NOISY_GUIDES)
             for name, array in arrays_of(given.visibility[s.view_row]).items():
@@ -47,15 +47,15 @@ def test_every_committed_sample_reads_back_as_it_was_rendered(scene: SceneStore)
 
 def test_noisy_guides_are_rounded_to_8_significant_bits_to_the_nearest_and_ties_to_even() -> None:
     exact = np.array([0, 1, -1, 255, 256, 0.5**20, 2.0**127, 1.0078125], np.float32)
-    np.testing.assert_array_equal(rounded(exact), exact)
+    np.testing.assert_array_equal(round_to_8_bits(exact), exact)
     unit = np.float32(2.0**-7)  # between numbers of 8 bits from 1 on
     between = np.array([1 + unit / 2, 1 + 3 * unit / 2, 1 + 0.51 * unit, 1 + 1.49 * unit], np.float32)
-    np.testing.assert_array_equal(rounded(between), np.array([1, 1 + 2 * unit, 1 + unit, 1 + unit], np.float32))
+    np.testing.assert_array_equal(round_to_8_bits(between), np.array([1, 1 + 2 * unit, 1 + unit, 1 + unit], np.float32))
     many = np.random.default_rng(1).gamma(0.5, 3.0, 100_000).astype(np.float32)
-    error = rounded(many) / many.astype(np.float64) - 1
+    error = round_to_8_bits(many) / many.astype(np.float64) - 1
     assert np.abs(error).max() <= 2.0**-8
     assert abs(error.mean()) < 4 * 2.0**-8 / np.sqrt(3 * len(many)), "as many up as down"
-    assert not (rounded(many).view(np.uint32) & 0xFFFF).any()
+    assert not (round_to_8_bits(many).view(np.uint32) & 0xFFFF).any()
 
 
 def test_radiance_is_scaled_by_the_power_of_two_nearest_to_the_exposure(store: Store) -> None:

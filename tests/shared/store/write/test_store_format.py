@@ -18,6 +18,7 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.spec import Emitters, GuideSpec
 from photonfarm.store import SceneReader, SceneStore, Store, store_status
 from photonfarm.store.format import declarations, markers, schema
+from photonfarm.store.format.metadata import seal
 from photonfarm.store.io.local import LocalStorage
 
 DOCUMENT = Path(__file__).parents[4] / "docs/store-format.md"
@@ -243,6 +244,8 @@ def add_everywhere(scene: SceneStore) -> None:
         group = zarr.open_group(str(path), mode="r+")
         group.create_array("variance", data=np.ones((3, 2)))
         group.create_group("appendix")
+    for path in (plan, base):
+        seal(path)
 
 
 def test_unknown_files_arrays_attributes_and_keys_are_ignored(scene: SceneStore, tmp_path: Path) -> None:
@@ -299,7 +302,7 @@ def read_marker(root: Path, content: str | bytes) -> dict[str, Any]:
     (root / "scenes/s/committed/000000000000.json").write_bytes(
         content.encode() if isinstance(content, str) else content
     )
-    return markers.read(LocalStorage(root), "scenes/s", 0)
+    return markers.read_marker(LocalStorage(root), "scenes/s", 0)
 
 
 @pytest.mark.parametrize(
@@ -358,4 +361,4 @@ def test_only_names_of_twelve_digits_are_markers(tmp_path: Path) -> None:
     )
     for name in names:
         (folder / name).write_text("{}")
-    assert markers.jobs(LocalStorage(tmp_path), "scenes/s") == {7}
+    assert markers.list_jobs(LocalStorage(tmp_path), "scenes/s") == {7}

@@ -90,7 +90,6 @@ def test_a_scene_that_has_lost_its_spec_is_told_by_all_and_a_submission_writes_t
     request = Request(modifications=4)
     for look in (
         lambda: again.scene(scene.scene_id),
-        lambda: again.plan(samples.small_spec(points=16), request, dry_run=True),
         SceneReader(store.root, scene.scene_id).refresh,
         lambda: find_samples(again, again.scene_ids(), Query.of()),
     ):

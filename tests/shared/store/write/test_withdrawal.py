@@ -16,9 +16,9 @@ from photonfarm.plan.top_up import TopUp
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
-from photonfarm.store.write.lease import at_work
-from photonfarm.store.write.status import scene_status
-from photonfarm.store.write.withdrawal import withdraw
+from photonfarm.store.model.lease import announce_work
+from photonfarm.store.model.status import scene_status
+from photonfarm.store.model.withdrawal import withdraw
 
 REQUEST = Request(modifications=8, views_per_modification=1)
 
@@ -85,7 +85,7 @@ def test_the_job_in_hand_is_waited_for_and_stays(scene: SceneStore) -> None:
     taken, waited = threading.Event(), threading.Event()
 
     def work() -> None:
-        with at_work(scene.storage, scene.scene_id, "worker w1 at job 1"):
+        with announce_work(scene.storage, scene.scene_id, "worker w1 at job 1"):
             taken.set()
             assert waited.wait(20)
             assert samples.commit(scene, 1, samples.outputs(scene, 1))
@@ -121,6 +121,26 @@ def test_a_later_plan_that_leans_on_it_is_withdrawn_first(scene: SceneStore) -> 
     assert withdraw(scene, 0).jobs == 2
     with pytest.raises(SpecError, match="has no plan 2; the last one is 1"):
         withdraw(scene, 2)
+
+
+def test_without_a_number_it_is_the_last_plan_that_has_something_to_withdraw(scene: SceneStore) -> None:
+    scene.plan(Request(modifications=10))
+    assert [withdraw(scene).plan, withdraw(scene).plan] == [1, 0]
+    scene.plan(Request(modifications=3))
+    scene.plan(Request(modifications=2, views_per_modification=2))
+    for job in set(scene.missing_jobs()) & set(range(scene.plans()[3].first_job, scene.jobs())):
+        assert samples.commit(scene, job, samples.outputs(scene, job))
+    nothing = withdraw(scene, 3)
+    assert (nothing.jobs, nothing.left) == (0, "not rendered yet: 1 samples of plan 2")
+    done = withdraw(scene)
+    assert (done.plan, done.samples, withdraw(scene).left) == (2, 1, "not rendered yet: none")
+
+
+def test_what_rendered_samples_of_a_later_plan_lean_on_stays_planned(scene: SceneStore) -> None:
+    scene.plan(TopUp.of("+8", ["rows=2-3"]))
+    assert samples.commit(scene, 4, samples.outputs(scene, 4))
+    done = withdraw(scene)
+    assert (done.plan, done.samples, done.kept) == (0, 2, 2)
 
 
 def test_rows_of_withdrawn_jobs_are_unused(scene: SceneStore) -> None:

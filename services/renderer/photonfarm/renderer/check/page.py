@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import store_errors
-from photonfarm.core.pictures import Picture, display_values, rendered
+from photonfarm.core.pictures import Picture, display_values, render_page
 from photonfarm.renderer.check.drawings import COLOURS
 from photonfarm.renderer.check.findings import CUT_AT_ALL, INSIDE, LEAST_SEEN, MEANS, OUTSIDE, percent
 from photonfarm.renderer.check.scene_check import SceneCheck
@@ -63,7 +63,7 @@ def page(check: SceneCheck, lines: SpecLines) -> str:
         for each in samples.shown
     ]
     exposed = spec.exposure * np.nan_to_num(samples.images.halves.mean(axis=1))
-    return rendered(
+    return render_page(
         TEMPLATE,
         title=f"photonfarm: {spec.name}",
         check=check,

@@ -9,7 +9,7 @@ from functools import partial
 import click
 
 from photonfarm.cli.options import device_option, json_option
-from photonfarm.core.processes import ended_by_ctrl_c
+from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import WorkLog
 
 
@@ -22,7 +22,7 @@ from photonfarm.core.waiting import WorkLog
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @device_option
 @json_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_json: bool) -> None:
     """Measure what samples of SPEC cost on this machine, in core-seconds, and how noisy they are.
 
@@ -50,7 +50,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
               help="Random configurations to render, a view of each.")  # fmt: skip
 @device_option
 @json_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None:
     """Propose an exposure for SPEC, from a quick render of random views; nothing is written.
 
@@ -74,7 +74,7 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 @click.option("--write", is_flag=True, help="Put it into SPEC's file; the scene then has another id, and new views.")
 @device_option
 @json_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     """Measure where SPEC's cameras may stand: in the open, by rays, and in no movable group's box.
 
@@ -120,7 +120,7 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @device_option
 @json_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def scene_plan(spec: str, seconds: int, purpose: str, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
     from photonfarm.renderer.scene import backend

@@ -10,8 +10,8 @@ from pathlib import Path
 import click
 
 from photonfarm.cli.options import device_option, json_option, store_option
-from photonfarm.core.processes import ended_by_ctrl_c
-from photonfarm.core.waiting import waiting
+from photonfarm.core.processes import end_on_ctrl_c
+from photonfarm.core.waiting import tell_waiting
 
 
 @click.command()
@@ -51,7 +51,7 @@ def preview(scene: str, store: str | Path, count: int, out: Path) -> None:
 @click.option("--orbit", type=click.IntRange(1, 10_000), metavar="FRAMES", help="Instead: once around the scene.")
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="buffers.npz", show_default=True)
 @device_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def buffers(
     store: str | Path, scene: str, modification: str | None, path: Path | None, orbit: int | None, out: Path
 ) -> None:  # fmt: skip
@@ -65,7 +65,7 @@ def buffers(
     if (path is None) == (orbit is None):
         raise click.UsageError("one of --camera-path and --orbit is required")
     along = orbit or CameraPath.load(path or Path())
-    with waiting(partial(click.echo, err=True), f"rendering buffers of {scene}"):
+    with tell_waiting(partial(click.echo, err=True), f"rendering buffers of {scene}"):
         frames = write_buffers(store, scene, modification, along, out)
     click.echo(f"{out}: {frames} frames")
 
@@ -83,7 +83,7 @@ def buffers(
               help="Time the first P points of the base cloud, those that a network uses.  [default: all]")  # fmt: skip
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="frames.npz", show_default=True)
 @device_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def measure_frames(
     store: str | Path,
     scene: str,
@@ -103,7 +103,7 @@ def measure_frames(
     backend.load(threads=1)
     from photonfarm.renderer.measure.frame_costs import write_frame_costs
 
-    with waiting(partial(click.echo, err=True), f"timing {timed} frames"):
+    with tell_waiting(partial(click.echo, err=True), f"timing {timed} frames"):
         costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
     parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
     click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()))
@@ -120,7 +120,7 @@ def measure_frames(
               help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.")  # fmt: skip
 @device_option
 @json_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def render(scene: str, store: str | Path, row: int, pass_number: int | None, out: Path | None, as_json: bool) -> None:
     """Render a sample again, from its seeds, and compare it with the stored one; the store stays as it is.
 

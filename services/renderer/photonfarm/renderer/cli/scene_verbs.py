@@ -10,8 +10,8 @@ from shlex import quote
 import click
 
 from photonfarm.cli.options import device_option, json_option
-from photonfarm.core.processes import ended_by_ctrl_c
-from photonfarm.core.waiting import waiting
+from photonfarm.core.processes import end_on_ctrl_c
+from photonfarm.core.waiting import tell_waiting
 
 
 @click.command()
@@ -57,7 +57,7 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
               help="The page.")  # fmt: skip
 @device_option
 @json_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def scene_check(spec: str, out: Path, as_json: bool) -> None:
     """Look at SPEC and its scene, and say what cannot be right: a page (HTML), and each finding with its line.
 
@@ -87,13 +87,13 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 @click.command()
 @click.argument("spec")
 @json_option
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def scene_shapes(spec: str, as_json: bool) -> None:
     """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
     from photonfarm.cli import show
     from photonfarm.renderer.check import shapes
 
-    with waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
+    with tell_waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
         found = shapes.listed(spec)
     if as_json:
         show.print_json([shape.document() for shape in found])

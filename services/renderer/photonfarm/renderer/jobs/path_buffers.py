@@ -10,7 +10,7 @@ import numpy as np
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.keys import view_key
 from photonfarm.core.records import BasePointCloud, Guides, arrays_of
-from photonfarm.farm.configuration import named_configuration
+from photonfarm.farm.configuration import find_configuration
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import (
     SceneLoader,
@@ -20,7 +20,7 @@ from photonfarm.renderer.jobs.render import (
     located,
     visibility_of,
 )
-from photonfarm.scene.camera_path import CameraPath, Frames, kept_clear, orbit
+from photonfarm.scene.camera_path import CameraPath, Frames, check_clear, orbit
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
@@ -36,12 +36,12 @@ def write_buffers(store: str | Path, scene: str, modification: str | None, path:
     """
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
-    configuration = named_configuration(opened, stored, modification)
+    configuration = find_configuration(opened, stored, modification)
     spec = located(stored.spec)
     if isinstance(path, int):
         views = orbit(spec, path, configuration)
     else:
-        views = kept_clear(spec, path.sampled(), configuration)
+        views = check_clear(spec, path.sample(), configuration)
     cloud = stored.base()[1] if stored.has_base() else None
     frames_of(spec, configuration, views, cloud).write(out)
     return len(views)

@@ -39,7 +39,7 @@ from photonfarm.scene.spec import GuideSpec, SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
 from photonfarm.scene.view import View
 from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
-from photonfarm.store.write.lease import at_work
+from photonfarm.store.model.lease import announce_work
 
 SCENES_KEPT = 2
 """The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""
@@ -136,7 +136,7 @@ class ShardRenderer:
         buffers are.
         """
         what = f"worker {self._worker} at job {job}"
-        with at_work(self._store.storage, scene_id, what):
+        with announce_work(self._store.storage, scene_id, what):
             if not self._store.has_scene(scene_id):  # forgotten while its jobs were queued
                 return False
             stored = self._store.scene(scene_id)

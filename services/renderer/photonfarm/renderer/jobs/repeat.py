@@ -12,14 +12,13 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core import pictures
-from photonfarm.core.archives import write_arrays
+from photonfarm.core.archives import write_arrays, write_layers
 from photonfarm.core.errors import SpecError, StoreError, store_errors
-from photonfarm.core.exr import write_layers
 from photonfarm.core.files import whole_file
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import block_z_test
-from photonfarm.core.waiting import Log, waiting
+from photonfarm.core.waiting import Log, tell_waiting
 from photonfarm.plan.request import sample_key
 from photonfarm.renderer.jobs.estimates import halves_of
 from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
@@ -30,7 +29,7 @@ from photonfarm.scene.spec_loading import scene_folder
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers
-from photonfarm.store.format.shards import as_stored
+from photonfarm.store.format.shards import round_as_stored
 from photonfarm.store.read.find import Query, SceneMatch, is_spec_file, scene_or_spec
 
 SUFFIXES = (".npz", ".exr", ".png")
@@ -153,10 +152,10 @@ def repeat(
     key = sample_key(stored.spec.radiance_id, modification, view.vector, number)
     at = _row_of(stored, key)
     spec = located(_beside(scene, _as_rendered(opened, stored, key)))
-    with waiting(log, f"loading scene {spec.name}"):
+    with tell_waiting(log, f"loading scene {spec.name}"):
         loaded = load(spec)
         loaded.apply(modification)
-    with waiting(log, f"rendering pass {number} of the view in row {row}"):
+    with tell_waiting(log, f"rendering pass {number} of the view in row {row}"):
         ((halves, _),) = halves_of(loaded, [(key, view)])
     there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
@@ -206,7 +205,7 @@ def _planned(stored: SceneStore, row: int) -> tuple[Modification, View, int]:
 
 def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparison:
     """The comparison of both halves with those in a row; what is rendered is rounded as the store rounds."""
-    here = as_stored(halves, stored.spec.radiance_exponent)
+    here = round_as_stored(halves, stored.spec.radiance_exponent)
     difference = here.astype(np.float64) - there
     test = block_z_test(_interleaved(here), _interleaved(there), blocks=4)
     root = float(np.sqrt(np.mean(there.astype(np.float64) ** 2)))

@@ -23,10 +23,10 @@ from photonfarm.core.waiting import Log
 from photonfarm.renderer.scene.gbuffer import sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE
-from photonfarm.scene.free_space import FreeSpace, packed
+from photonfarm.scene.free_space import FreeSpace, pack
 from photonfarm.scene.modification import Modification, rest, sample_modifications
 from photonfarm.scene.spec import Box, SceneSpec, shape_ids
-from photonfarm.scene.view import in_free_space
+from photonfarm.scene.view import are_in_free_space
 
 ALONG = 48
 """The cells along the longest side of the box of origins."""
@@ -79,7 +79,7 @@ def measure(spec: SceneSpec, beside: Path | None, log: Log) -> Measured:
             f"{spec.name}: view.origin: no camera in it stands in the open; move the box into the room"
         )
     x, y, z, _ = middles.shape
-    space = FreeSpace(of=spec.free_space_digest, cells=(x, y, z), free=packed(free), groups=groups)
+    space = FreeSpace(of=spec.free_space_digest, cells=(x, y, z), free=pack(free), groups=groups)
     found = Measured(space, float(sides.max()), float(free.mean()), _share(spec, space))
     if found.free < LEAST:
         raise NothingFreeError(
@@ -141,4 +141,4 @@ def _share(spec: SceneSpec, space: FreeSpace) -> float:
     """The share of the box of origins that is free, in the mean over random configurations."""
     with_space = spec.model_copy(update={"view": spec.view.model_copy(update={"free_space": space})})
     vectors = np.repeat(sample_modifications(with_space, 0, range(CONFIGURATIONS)), ORIGINS, axis=0)
-    return float(in_free_space(with_space, _inside(spec.view.origin, len(vectors)), vectors).mean())
+    return float(are_in_free_space(with_space, _inside(spec.view.origin, len(vectors)), vectors).mean())

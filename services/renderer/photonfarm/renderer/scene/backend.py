@@ -111,7 +111,7 @@ def load(threads: int | None = None) -> Any:
     chosen = device()
     if chosen.card and "mitsuba" not in sys.modules:
         os.environ[devices.ORDER_VARIABLE] = devices.ORDER
-        os.environ[devices.VISIBLE_VARIABLE] = devices.shown_alone(chosen.card)
+        os.environ[devices.VISIBLE_VARIABLE] = devices.visible_device(chosen.card)
     if chosen.variant.startswith("llvm"):
         os.environ[LLVM_VARIABLE] = find_llvm()
     mitsuba, drjit = _import("mitsuba"), _import("drjit")

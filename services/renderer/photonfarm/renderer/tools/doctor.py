@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from photonfarm.core.errors import PhotonfarmError, QueueError, StoreError, store_errors
-from photonfarm.core.processes import ended_by_ctrl_c
-from photonfarm.core.waiting import Log, waiting
+from photonfarm.core.processes import end_on_ctrl_c
+from photonfarm.core.waiting import Log, tell_waiting
 from photonfarm.farm.devices import Cards, cards_here
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.store.io.storage import open_storage
@@ -72,7 +72,7 @@ def _cards(found: Cards) -> MachineCheck:
     return MachineCheck("GPU", True, "; ".join([*cards, driver, "OptiX"]))
 
 
-@ended_by_ctrl_c()
+@end_on_ctrl_c()
 def _renders(log: Log) -> str:
     from photonfarm.renderer.scene import backend
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
@@ -82,7 +82,7 @@ def _renders(log: Log) -> str:
     mi = backend.load(threads=1)
     spec = load_spec("cornell")
     start = time.perf_counter()
-    with waiting(log, "rendering a Cornell box"):
+    with tell_waiting(log, "rendering a Cornell box"):
         image = LoadedScene.load(spec).render_half(sample_view(spec, b"", 0, 0), seed=0)
     seconds = time.perf_counter() - start
     size = f"{spec.film.width} × {spec.film.height}"

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core import pictures
 from photonfarm.core.errors import store_errors
-from photonfarm.core.pictures import Picture, rendered
+from photonfarm.core.pictures import Picture, render_page
 from photonfarm.core.records import Geometry, Photons
 from photonfarm.renderer.tools.plan_view import PlanView, hue
 from photonfarm.scene.modification import Modification
@@ -57,7 +57,7 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
     shown = reader.rows[np.unique(np.linspace(0, len(reader.rows) - 1, min(count, len(reader.rows))).astype(np.int64))]
     spec = reader.spec
     plan = PlanView.of(spec, reader.base()[0] if reader.ready() else NO_GEOMETRY)
-    return rendered(
+    return render_page(
         TEMPLATE,
         title=f"photonfarm: {spec.name}",
         spec=spec,
@@ -83,9 +83,9 @@ def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:
     panels = (
         a,
         b,
-        pictures.of_albedo(sample.buffers.albedo),
-        pictures.of_normal(sample.buffers.normal),
-        pictures.of_depth(sample.buffers.depth),
+        pictures.draw_albedo(sample.buffers.albedo),
+        pictures.draw_normal(sample.buffers.normal),
+        pictures.draw_depth(sample.buffers.depth),
         photon_picture(sample, reader.read_photons(row) if spec.photons.paths else None, spec),
     )
     return SheetRow(
@@ -120,4 +120,4 @@ def photon_picture(sample: Sample, photons: Photons | None, spec: SceneSpec) -> 
         u = np.floor(scale * (offset @ camera.right) + camera.width / 2).clip(0, camera.width - 1).astype(int)
         v = np.floor(scale * (offset @ camera.down) + camera.height / 2).clip(0, camera.height - 1).astype(int)
         canvas[v, u] = power / np.maximum(power.max(axis=1, keepdims=True), 1e-30)
-    return pictures.of_albedo(canvas)
+    return pictures.draw_albedo(canvas)

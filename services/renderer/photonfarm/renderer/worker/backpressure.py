@@ -19,7 +19,7 @@ from photonfarm.core.errors import store_errors
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.io.local import LocalStorage
-from photonfarm.store.write.scene_store import Progress
+from photonfarm.store.model.scene_store import Progress
 
 AHEAD_MINIMUM = 256
 """The samples that may be committed before any is used, as a trainer first waits for some, held-out ones included."""
@@ -113,7 +113,7 @@ class TrainerPace:
             for scene_id, progress in self._progress().items()
             if progress.committed_samples > AHEAD_MINIMUM and progress.committed_samples < progress.planned_samples
         }
-        used = queue.consumed_samples(self._connection, list(committed))
+        used = queue.read_consumed(self._connection, list(committed))
         return {
             scene_id: f"{samples} samples are committed, and the trainer has used {used[scene_id]} "
             f"(--ahead {self._ratio:g})"

@@ -24,7 +24,7 @@ from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, R
 from photonfarm.renderer.worker.share_source import ShareSource
 from photonfarm.renderer.worker.source import Ending, JobSource, TakenError
 from photonfarm.store import Store
-from photonfarm.store.write.lease import leases
+from photonfarm.store.model.lease import read_leases
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +105,7 @@ class RenderWorker:
 
     def _left(self) -> Mapping[str, str]:
         """Why this worker now takes no jobs of some scenes, by their ids."""
-        waiting = {**self._source.ahead(), **leases(self._store.storage)}
+        waiting = {**self._source.ahead(), **read_leases(self._store.storage)}
         self._talk.waiting(waiting)
         return {**waiting, **self._outcomes.left()}
 

@@ -6,7 +6,7 @@ import contextlib
 import faulthandler
 from collections.abc import Callable, Iterator
 
-from photonfarm.core.processes import repeating
+from photonfarm.core.processes import repeat
 from photonfarm.renderer.worker.outcomes import send_line
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 
@@ -18,7 +18,7 @@ REPORT_S = 2.0
 
 def heartbeat(beat: Callable[[], object], ttl_s: float) -> contextlib.AbstractContextManager[None]:
     """Beat until the block ends, in a thread that rendering does not block, well before `ttl_s` are over."""
-    return repeating(min(REPORT_S, ttl_s / 5), beat)
+    return repeat(min(REPORT_S, ttl_s / 5), beat)
 
 
 @contextlib.contextmanager

@@ -28,7 +28,7 @@ from photonfarm.renderer.worker.backpressure import DiskReserve, is_full
 from photonfarm.renderer.worker.settings import JOBS_SO_FAR, RECYCLED, WorkerSettings
 from photonfarm.renderer.worker.source import Ending
 from photonfarm.store import Store
-from photonfarm.store.write.lease import LeasedError
+from photonfarm.store.model.lease import LeasedError
 
 
 @dataclass(frozen=True, slots=True)

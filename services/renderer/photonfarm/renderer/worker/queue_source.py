@@ -98,7 +98,7 @@ class QueueSource(JobSource):
 
     def has_more(self, *, may_leave: bool) -> bool:
         """Whether something was missing and is queued now, or is in the hands of others."""
-        found = queue.look(
+        found = queue.fill_seldom(
             self._store, self._connection, scene_id=self._settings.scene_id, every_s=self._settings.idle_s
         )
         return found == "queued" or (found == "waits" and not may_leave)

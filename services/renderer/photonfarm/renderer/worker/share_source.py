@@ -68,7 +68,7 @@ class ShareSource(JobSource):
             log.warning("scene %s is passed over, and the others go on: %s", scene_id, unreadable[scene_id])
         self._unreadable = unreadable
         with store_errors("look for failures", self._store.storage.where):
-            times = queue.times_failed(self._store) | dict.fromkeys(self._not_kept, TRIES)
+            times = queue.count_failures(self._store) | dict.fromkeys(self._not_kept, TRIES)
         found = [
             (times.get(job_name(scene_id, job), 0), not self._share.owns(job), RenderArguments(scene_id, job))
             for scene_id, jobs in missing.items()
@@ -98,7 +98,7 @@ class ShareSource(JobSource):
             return False
         try:
             queue.keep_failure(self._store, name, reason, worker=self._settings.name)
-            return queue.times_failed(self._store)[name] >= TRIES
+            return queue.count_failures(self._store)[name] >= TRIES
         except OSError:
             self._not_kept[name] = reason
             return True
@@ -110,5 +110,5 @@ class ShareSource(JobSource):
     def set_aside(self) -> Mapping[str, str]:
         """Why jobs failed too often."""
         with store_errors("look for failures", self._store.storage.where):
-            kept = queue.kept_failures(self._store)
+            kept = queue.read_kept_failures(self._store)
         return {name: failure.reason for name, failure in kept.items() if failure.set_aside} | self._not_kept

@@ -217,7 +217,7 @@ def infer(
     if modification and given in (["--row"], ["--buffers"]):
         raise click.UsageError(f"{given[0]} has a configuration; --modification cannot give it another one")
     if path is not None:
-        CameraPath.load(path).sampled()  # a faulty one is refused before anything is loaded
+        CameraPath.load(path).sample()  # a faulty one is refused before anything is loaded
     trained = TrainedRun.load(run)
     if path is not None or orbit is not None:
         shows.check_path(trained)

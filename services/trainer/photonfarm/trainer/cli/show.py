@@ -13,8 +13,8 @@ from rich import markup
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from photonfarm.core.processes import repeating
-from photonfarm.core.statistics import stated
+from photonfarm.core.processes import repeat
+from photonfarm.core.statistics import format_estimate
 from photonfarm.core.waiting import SILENCE_S, Steps
 from photonfarm.trainer.runs import progress
 
@@ -34,8 +34,8 @@ def print_record(of: dict[str, Any]) -> None:
     if of["kind"] == "validation":
         there = f"on {of['held_out']} of {of['samples']} samples; "
         click.echo(
-            f"step {of['step']}: held-out error {stated(of['error'], of['standard_error'])} "
-            f"({stated(of['shown_error'], None)} up to white) {there}"
+            f"step {of['step']}: held-out error {format_estimate(of['error'], of['standard_error'])} "
+            f"({format_estimate(of['shown_error'], None)} up to white) {there}"
             + progress.format_waits(of["waits"], of["samples_per_used"]),
             err=True,
         )
@@ -43,9 +43,9 @@ def print_record(of: dict[str, Any]) -> None:
 
 def print_dry_run(estimate: DryRun, as_json: bool) -> None:
     """Print the estimate of a training."""
-    from photonfarm.trainer.dry_run.dry_run import describe, format_estimate
+    from photonfarm.trainer.dry_run.dry_run import describe, format_dry_run
 
-    click.echo(json.dumps(describe(estimate), indent=2) if as_json else format_estimate(estimate))
+    click.echo(json.dumps(describe(estimate), indent=2) if as_json else format_dry_run(estimate))
 
 
 def _format_recovery(log_record: dict[str, Any]) -> str:
@@ -56,7 +56,8 @@ def _format_recovery(log_record: dict[str, Any]) -> str:
     elif errors["now"] is None:
         reason = "the held-out error is not finite"
     else:
-        reason = f"held-out error {stated(errors['now'], None)} (best so far {stated(errors['best'], None)})"
+        now, best = (format_estimate(errors[when], None) for when in ("now", "best"))
+        reason = f"held-out error {now} (best so far {best})"
     if log_record["cause"] == "end":
         return f"{reason}; ends with {back_to}"
     return f"{reason}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"
@@ -109,5 +110,5 @@ def _print_lines() -> Iterator[OnProgress]:
             return f"{name}, for {time.monotonic() - since_s:.0f} s"
         return f"{name}: sample {samples.words()}"
 
-    with repeating(SILENCE_S, lambda: click.echo(line(), err=True)):
+    with repeat(SILENCE_S, lambda: click.echo(line(), err=True)):
         yield show

@@ -14,7 +14,7 @@ import torch
 from torch.utils.flop_counter import FlopCounterMode
 
 from photonfarm.core.formatting import format_bytes
-from photonfarm.core.waiting import in_words
+from photonfarm.core.waiting import format_span
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch, count_bytes
 from photonfarm.trainer.dry_run.made_up import LiveMemory, MadeUpScene
@@ -167,7 +167,7 @@ def describe(estimate: DryRun) -> dict[str, Any]:
     return {**asdict(estimate), **derived}
 
 
-def format_estimate(estimate: DryRun) -> str:
+def format_dry_run(estimate: DryRun) -> str:
     """The estimate for people."""
     work, timed, batch = estimate.work, estimate.timed, estimate.batch
     parts = (
@@ -187,7 +187,7 @@ def format_estimate(estimate: DryRun) -> str:
         f"memory       {format_bytes(estimate.memory_bytes)} at least: "
         + ", ".join(f"{name} {format_bytes(size)}" for name, size in parts),
         *([] if timed.peak_bytes is None else [f"             {format_bytes(timed.peak_bytes)} at the timed steps"]),
-        f"here         {step} a step, {rate:,.0f} GFLOP/s, {in_words(estimate.seconds)} in all, on {timed.device}",
+        f"here         {step} a step, {rate:,.0f} GFLOP/s, {format_span(estimate.seconds)} in all, on {timed.device}",
         f"             (median of {timed.steps} steps of {timed.samples}{of}, on made-up samples; without reading, "
         "waiting, validation)",
     ]

@@ -13,7 +13,7 @@ places and normals:
 V = sigmoid(r(receiver) · s(sender) + b)
 
 For metals the light is summed over the directions that their lobe reflects; nothing is learned there. Light that points
-send to each other was tried, and brings nothing at equal time (`bench/trainer/candidates.py`).
+send to each other was tried, and brings nothing at equal time (docs/results/networks.md).
 
 Shape letters: B batch, L lit points, H W image, N receivers, C numbers of a surface.
 """

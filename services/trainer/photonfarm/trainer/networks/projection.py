@@ -123,7 +123,7 @@ def _behind_surface(point: Tensor, ray: Tensor, surface: Tensor, normal: Tensor)
 
     The depth of a pixel is that of its centre. Other points of the same plane in the pixel have another depth, which
     differs more the more the plane slants, and yet distance 0 from it: so ε can be small, and does not depend on near
-    and far. Nor is a point occluded that is no farther away than the surface. Ours; docs/results/projection.md has
+    and far. Nor is a point occluded that is no farther away than the surface. Ours; docs/results/networks.md has
     figures.
     """
     from_eye = (normal * ray).sum(dim=-1)  # < 0: the normal is on the eye's side

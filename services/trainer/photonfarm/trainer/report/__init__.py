@@ -17,7 +17,7 @@ from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparis
 from photonfarm.trainer.predict.animation import write_png
 from photonfarm.trainer.predict.trained import TrainedRun
 from photonfarm.trainer.report.contents import gather_contents
-from photonfarm.trainer.report.page import Verdict, format_markdown, render_page
+from photonfarm.trainer.report.page import Verdict, format_markdown, format_page
 from photonfarm.trainer.report.plots import draw_plots
 from photonfarm.trainer.report.views import OVERVIEW, choose_views, draw_overview
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
@@ -66,7 +66,7 @@ def write_report(
             (out / f"{plot.name}.svg").write_bytes(plot.svg)
         (out / "report.json").write_text(text + "\n")
         (out / "report.md").write_text(format_markdown(contents, verdict, drawn, COMPARISON))
-        (out / "report.html").write_text(render_page(contents, verdict, views, drawn))
+        (out / "report.html").write_text(format_page(contents, verdict, views, drawn))
     write_png(draw_comparison(contents.evaluation), out / COMPARISON)
     if views:
         write_png(draw_overview(views), out / OVERVIEW)

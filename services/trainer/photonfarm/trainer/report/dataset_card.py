@@ -9,7 +9,7 @@ from typing import Any
 from photonfarm.plan.request import UNUSED
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneStatus, SceneStore, Store
-from photonfarm.store.write.status import scene_status
+from photonfarm.store.model.status import scene_status
 
 SAMPLES = "samples"
 """The kind of plans whose rows are of new views; others add passes to these, which need no photons and no buffers."""

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.formatting import format_count, format_markdown_table
-from photonfarm.core.pictures import reduced, rendered
+from photonfarm.core.pictures import reduce_image, render_page
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page
@@ -187,9 +187,9 @@ MOST_LIGHT = 1_600_000
 LARGEST_HALF = np.float32(np.finfo(np.float16).max)
 
 
-def render_page(contents: ReportContents, verdict: Verdict, views: Sequence[ShownView], drawn: list[Plot]) -> str:
+def format_page(contents: ReportContents, verdict: Verdict, views: Sequence[ShownView], drawn: list[Plot]) -> str:
     """The report's HTML."""
-    return rendered(
+    return render_page(
         TEMPLATE,
         title=f"photonfarm: {contents.card.spec.name}",
         verdict=verdict,
@@ -230,5 +230,5 @@ def _order_by_importance(views: Sequence[ShownView]) -> Iterator[tuple[int, str,
 
 def encode_half_floats(light: F32) -> str:
     """Light (H, W, 3) as base64 of little-endian half floats; of a large film, the means over blocks of pixels."""
-    halves = np.clip(reduced(np.nan_to_num(light), LARGEST), -LARGEST_HALF, LARGEST_HALF).astype("<f2")
+    halves = np.clip(reduce_image(np.nan_to_num(light), LARGEST), -LARGEST_HALF, LARGEST_HALF).astype("<f2")
     return b64encode(halves.tobytes()).decode()

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from photonfarm.core.pictures import Picture, display, display_values, of_albedo, of_depth, of_normal
+from photonfarm.core.pictures import Picture, display, display_values, draw_albedo, draw_depth, draw_normal
 from photonfarm.core.records import F32, Guides
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
@@ -115,9 +115,9 @@ def _list_inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
     if row not in contents.inputs:
         return
     buffers, guides = contents.inputs[row]
-    yield Layer("albedo", "albedo", of_albedo(buffers.albedo))
-    yield Layer("normal", "normal", of_normal(buffers.normal))
-    yield Layer("depth", "depth", of_depth(buffers.depth))
+    yield Layer("albedo", "albedo", draw_albedo(buffers.albedo))
+    yield Layer("normal", "normal", draw_normal(buffers.normal))
+    yield Layer("depth", "depth", draw_depth(buffers.depth))
     if guides is not None:
         yield from _list_guides(guides, contents.card.spec.exposure)
 
@@ -129,7 +129,7 @@ def _list_guides(guides: Guides, exposure: float) -> Iterator[Layer]:
             layer = make_light_layer(name, name, np.float32(exposure) * values)
         else:
             layer = Layer(
-                name, name, of_albedo(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2))
+                name, name, draw_albedo(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2))
             )
         if layer.picture.std() > VARIED:
             yield layer

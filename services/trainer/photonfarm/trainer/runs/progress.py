@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Literal
 
 from photonfarm.core.files import write_whole
-from photonfarm.core.processes import repeating
-from photonfarm.core.waiting import in_words
-from photonfarm.farm.training import PROGRESS, TRAINS, WAITS, counted
+from photonfarm.core.processes import repeat
+from photonfarm.core.waiting import format_span
+from photonfarm.farm.training import PROGRESS, TRAINS, WAITS, count_steps
 
 TimeKind = Literal["start", "train", "validate", "wait_data", "wait_read", "save", "other"]
 """The kinds of time.
@@ -169,7 +169,7 @@ class RunProgress:
     def line(self) -> str:
         """The present state in words."""
         state = self.look()
-        left = f", {in_words(state['left_s'])} left" if isinstance(state["left_s"], float) else ""
+        left = f", {format_span(state['left_s'])} left" if isinstance(state["left_s"], float) else ""
         since = f" for {state['phase_s']:.0f} s" if state["phase"] != TRAINS else ""
         return f"{self._steps_done}: {state['phase']}{since}, {self._samples} samples have arrived{left}"
 
@@ -179,7 +179,7 @@ class RunProgress:
 
     @property
     def _steps_done(self) -> str:
-        return f"step {counted(self._step, self._steps)}"
+        return f"step {count_steps(self._step, self._steps)}"
 
 
 @contextmanager
@@ -196,7 +196,7 @@ def follow_progress(progress: RunProgress, run: Path, say: Callable[[str], objec
             say(progress.line())
 
     try:
-        with repeating(FILE_S, follow):
+        with repeat(FILE_S, follow):
             yield
         if say is not None and (last := progress.last_line()):
             say(last)

@@ -20,7 +20,7 @@ from photonfarm.core.models import Count, Frozen, Positive, sentences
 from photonfarm.plan.hold_out import HOLD_OUT
 from photonfarm.trainer.runs.user_code import is_own
 
-PAGE = "docs/results/firefly.md"
+PAGE = "docs/results/networks.md"
 """The source of the figures below: a pixel of mean 0.90 with rare bright samples."""
 
 
@@ -155,10 +155,10 @@ class NetworkSettings(Frozen):
     photons: PhotonUse = "gathered"  # what light_transport_photons makes of them (ours, as it was not published):
     # irradiance gathered in the image, or "transport": a second Light Transport Layer, over the photons
     occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
-    # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/projection.md)
+    # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/networks.md)
     occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
     precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case;
-    # "tf32" is of NVIDIA's cards alone (docs/results/arithmetic.md)
+    # "tf32" is of NVIDIA's cards alone (docs/results/train_step.md)
     lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it
@@ -188,7 +188,7 @@ class TrainSettings(Frozen):
     optimiser: Optimiser = "adam"  # [S 3.1]
     beta1: Annotated[float, Field(ge=0, lt=1)] = 0.9
     beta2: Annotated[float, Field(ge=0, lt=1)] = 0.999  # with rare fireflies 0.9999 … 0.99999: 1 / (1 − β₂) steps
-    # must see some 25 of them, or the weights that they reach stay too dark (docs/results/firefly.md)
+    # must see some 25 of them, or the weights that they reach stay too dark (docs/results/networks.md)
     alpha: Annotated[float, Field(ge=0, lt=1)] = 0.99  # of RMSprop, as β₂ of Adam: with 0.99 it darkens even more
     schedule: Schedule = "epochs"  # of the rate: × decay an epoch [S 3.1]; "cosine" (ours): up, then down to 0 at
     # max_steps, so that a run's last steps shake its weights the least; without decay and epochs
@@ -218,7 +218,7 @@ class TrainSettings(Frozen):
     compile: Compilation = (
         "off"  # "on": torch.compile makes kernels for the U-Net, which takes minutes at the beginning
     )
-    # and is slower than without on a CPU (docs/results/arithmetic.md); "graphs": with CUDA graphs too
+    # and is slower than without on a CPU (docs/results/train_step.md); "graphs": with CUDA graphs too
     resident_gb: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"  # of decoded samples that are kept on the
     # device; "auto": on CUDA while a quarter of the card is free, and none on a CPU, beside whose memory the files lie
 
@@ -258,8 +258,8 @@ def paper(**changes: object) -> TrainSettings:
     """The supplement to the letter, as far as it goes: `paper_dynamic` without our changes to the network.
 
     Positions have no octaves, projection uses the rule on the depth buffer [S 1.2], maxima are absolute [S Fig. 1], the
-    loss is linear [S 3.2], and a run never goes back. docs/training.md lists the remaining choices of ours, with
-    reasons.
+    loss is linear [S 3.2], and a run never goes back. docs/training-settings.md lists the remaining choices of ours,
+    with reasons.
     """
     network = NetworkSettings(points=16384, octaves=0, occlusion="window", maxima="absolute")
     return TrainSettings.model_validate({"network": network, "recover": False, **changes})

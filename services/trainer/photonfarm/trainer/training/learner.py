@@ -31,7 +31,7 @@ def build_optimiser(weights: Iterable[nn.Parameter], settings: TrainSettings) ->
     """Adam or RMSprop over these weights, without weight decay, momentum of RMSprop or gradient clipping.
 
     Both divide each weight's step by the root of a running mean of its squared gradients, and so both darken pixels
-    whose bright targets are rarer than the length of that mean (bench/trainer/firefly.py).
+    whose bright targets are rarer than the length of that mean (docs/results/networks.md).
     """
     if settings.optimiser == "rmsprop":
         return torch.optim.RMSprop(weights, lr=settings.learning_rate, alpha=settings.alpha)

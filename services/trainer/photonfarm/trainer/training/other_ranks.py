@@ -16,7 +16,7 @@ import torch
 
 from photonfarm.core.processes import Stop
 from photonfarm.core.waiting import pause_after_look
-from photonfarm.store.write.lease import LeasedError
+from photonfarm.store.model.lease import LeasedError
 from photonfarm.trainer.data.batch import ResidentSamples
 from photonfarm.trainer.data.feed import Feed, SampleSource
 from photonfarm.trainer.runs import checkpoint

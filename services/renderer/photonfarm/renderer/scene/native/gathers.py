@@ -2,7 +2,7 @@
 
 Without AVX-512, LLVM uses gather instructions only on processors whose gathers it holds to be fast. None of AMD's are
 among them. Elsewhere it loads one lane after the other, with a branch for each. Kernels that shade surfaces gather
-often. On Zen 3 they take a fifth less time with the instruction (docs/results/gathers.md), and results have the same
+often. On Zen 3 they take a fifth less time with the instruction (docs/results/cost.md), and results have the same
 bits. No other processor has been measured, so all others keep LLVM's choice.
 """
 

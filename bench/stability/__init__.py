@@ -1,7 +1,0 @@
-"""Is the integrator `bdpt` right where bidirectional path tracers go wrong? Hard scenes, their truths, and a report.
-
-`scenes` holds hard scenes with their truths; `rows` lists them by number; `runner` renders one and judges it; `report`
-runs them all; `markdown` and `pictures` show the results. `invariances` are what must not change an image, `weights`
-an oracle for the integrator's weights. All but `scenes.case` need Mitsuba's variant set
-(`photonfarm.renderer.scene.backend.load`) before they are imported.
-"""

@@ -1,1 +1,0 @@
-"""`photonfarm slurm`: render workers as an array of SLURM, and the trainer as a job beside it."""

@@ -1,0 +1,189 @@
+"""A store: its format and its scenes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+from photonfarm.core.errors import CorruptError, SpecError, StoreError, store_errors
+from photonfarm.core.models import differing
+from photonfarm.plan.request import SHARD_ROWS, PlannedContent, Request, expand
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.store.format import declarations
+from photonfarm.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, Storage, open_storage, put_json
+from photonfarm.store.model.scene_store import (
+    SCENES,
+    PlanResult,
+    SceneStore,
+    are_there,
+    is_there,
+    scene_ids,
+    write_spec,
+)
+
+FAILURES_FOLDER = "failures"
+"""The folder in which the queue keeps why jobs failed."""
+
+T = TypeVar("T")
+
+
+class Store:
+    """A sample store in a folder or bucket; holds any number of scenes."""
+
+    def __init__(self, root: str | Path, *, create: bool = False) -> None:
+        """Open a store, or make one if there is none; raises StoreError if that is impossible."""
+        self.root = root
+        self.storage = open_storage(root)
+        self._opened: dict[str, SceneStore] = {}
+        if create:
+            self._create()
+        self.store_id = check_format(self.storage)
+
+    def _create(self) -> None:
+        with store_errors("make a store here", self.storage.where):
+            if self.storage.exists(FORMAT_FILE):
+                return
+            if Path(self.storage.where).is_symlink() and not Path(self.storage.where).exists():
+                raise StoreError(
+                    f"{self.storage.where}: is a link to what is not there; mend it, or name another store"
+                )
+            foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
+            if foreign and not self.storage.exists(FORMAT_FILE):  # no other process made one in the meantime
+                raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
+            if are_there(self.storage):
+                return  # the store has lost its document: a new one would have another id
+            with self.storage.founding():
+                put_json(self.storage, _new_document(), FORMAT_FILE)
+
+    def check(self) -> None:
+        """Check that the store is still there; raises StoreError if it is gone, or replaced by another one."""
+        store_id = check_format(self.storage)
+        if store_id != self.store_id:
+            raise StoreError(
+                f"{self.storage.where}: was the store {self.store_id}, and now another one lies there, {store_id}"
+            )
+
+    def scene_ids(self) -> list[str]:
+        """The scenes that are there, including damaged ones, in order of their ids."""
+        with store_errors("list the scenes", self.storage.where):
+            return scene_ids(self.storage)
+
+    def has_scene(self, scene_id: str) -> bool:
+        """Whether a scene is there, damaged or not."""
+        with store_errors("look for a scene", self.storage.where):
+            return is_there(self.storage, scene_id)
+
+    def scene(self, scene_id: str) -> SceneStore:
+        """One scene of the store, the same object each time; raises StoreError if it is not there."""
+        if scene_id not in self._opened:
+            self._opened[scene_id] = SceneStore(self.storage, scene_id)
+        return self._opened[scene_id]
+
+    def scenes(self, only: str | None = None) -> list[SceneStore]:
+        """Every scene of the store, or the named one; raises StoreError if that is not there."""
+        return [self.scene(scene_id) for scene_id in (self.scene_ids() if only is None else [only])]
+
+    def each(self, what: Callable[[SceneStore], T]) -> tuple[dict[str, T], dict[str, StoreError]]:
+        """The result of a function for every scene, and the errors of those that fail: damage of one affects no other.
+
+        Raises StoreError if the store itself cannot be read.
+        """
+        given: dict[str, T] = {}
+        failed: dict[str, StoreError] = {}
+        for scene_id in self.scene_ids():
+            try:
+                given[scene_id] = what(self.scene(scene_id))
+            except StoreError as error:
+                failed[scene_id] = error
+        if any(not isinstance(error, CorruptError) for error in failed.values()):
+            check_format(self.storage)
+        return given, failed
+
+    def add(self, spec: SceneSpec) -> SceneStore:
+        """The scene of a spec, made if it is new.
+
+        Of a scene that is there, the spec replaces what no id covers: name, credits, exposure and strategy.
+        """
+        with store_errors("add a scene", self.storage.where):
+            write_spec(self.storage, spec)
+        self._opened.pop(spec.scene_id, None)
+        return self.scene(spec.scene_id)
+
+    def plan(
+        self,
+        spec: SceneSpec,
+        request: Request,
+        *,
+        shard_rows: int | None = None,
+        usual_rows: int = SHARD_ROWS,
+        halves_from: str | None = None,
+        dry_run: bool = False,
+    ) -> PlanResult:
+        """Plan the new samples of a request; `dry_run` only counts.
+
+        `shard_rows` is fixed by a scene's first plan; if it is None, that has `usual_rows`. `halves_from` is the id of
+        another scene of the store, whose halves the jobs take over; SpecError unless its radiance is the same.
+        """
+        if halves_from is not None:
+            self._check_same_radiance(spec, halves_from)
+        if dry_run and not self.has_scene(spec.scene_id):
+            expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or usual_rows)
+            return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
+        scene = SceneStore(self.storage, spec.scene_id, spec) if dry_run else self.add(spec)
+        return scene.plan(
+            request, shard_rows=shard_rows, usual_rows=usual_rows, halves_from=halves_from, dry_run=dry_run
+        )
+
+    def _check_same_radiance(self, spec: SceneSpec, scene_id: str) -> None:
+        other = self.scene(scene_id).spec
+        if scene_id == spec.scene_id:
+            raise SpecError(f"--halves-from {scene_id}: is the scene itself, whose halves are there")
+        if other.radiance_id != spec.radiance_id:
+            changed = differing(other.radiance_settings(), spec.radiance_settings())
+            raise SpecError(
+                f"--halves-from {scene_id}: its radiance is another one, as {', '.join(changed)} differ; only scenes "
+                "that differ in buffers, guides, photons and points share halves"
+            )
+
+    def sweep(self, *, stray_age_s: float = STRAY_AGE_S) -> int:
+        """Remove temporary files that dead writers left; returns how many."""
+        with store_errors("sweep temporary files", self.storage.where):
+            return self.storage.sweep(stray_age_s=stray_age_s)
+
+
+def _new_document() -> dict[str, Any]:
+    """The document of a store made now."""
+    return {**declarations.stamp(), "id": declarations.new_store_id()}
+
+
+def _put_back() -> str:
+    """The remedy for a store that has lost its document."""
+    return (
+        f"put it back from a copy. A new store's would be {json.dumps(_new_document())}: without a copy, write that, "
+        "if a photonfarm of this version made the store"
+    )
+
+
+def check_format(storage: Storage) -> str:
+    """The id of a store of this program's format and version; raises StoreError, with a sentence, for any other."""
+    file = f"{storage.where}/{FORMAT_FILE}"
+    try:
+        document = json.loads(storage.read(FORMAT_FILE))
+        name, version = document["format"], document["version"]
+    except FileNotFoundError as error:
+        if are_there(storage):
+            raise CorruptError(f"{file}: is missing, and scenes are there: {_put_back()}") from error
+        if not set(storage.names("")) - {TMP}:
+            remedy = "`photonfarm submit` makes one, and --store names another"
+            raise StoreError(f"{storage.where}: there is no store; {remedy}") from error
+        raise StoreError(f"{storage.where}: is not a store: {FORMAT_FILE} is missing") from error
+    except OSError as error:
+        raise StoreError(f"{storage.where}: cannot be read: {error.strerror}") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise CorruptError(f"{file}: is not the document of a store: {error}; {_put_back()}") from error
+    declarations.check_version(name, version, storage.where)
+    if not declarations.is_store_id(store_id := document.get("id")):
+        raise CorruptError(f"{file}: id = {store_id!r}: 32 lower-case hexadecimal digits are required")
+    return str(store_id)

@@ -1,0 +1,232 @@
+"""Scenes that are hard because of their lights."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from tests.stability.scenes import hard_scenes
+from tests.stability.scenes.case import (
+    ALL,
+    LONG,
+    QUICK,
+    WITH_LIGHT_PATHS,
+    Effort,
+    HardScene,
+    Images,
+    SceneDict,
+    Truth,
+)
+from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
+from tests.stability.scenes.meshes import grid, octahedron
+from tests.stability.scenes.truths import PATH, TRUTH_SEEDS, load, render, rendered
+
+# ------------------------------------------------ Lights at infinity, and edits ------------------------------------
+
+SHIFT = [4.5, 0.0, 0.0]
+
+
+def _under_sky_and_sun(size: int, block: Any) -> SceneDict:
+    return {
+        "type": "scene",
+        "sensor": camera(size, [2, -8, 3], [2, 0, 0.4], 42),
+        "floor": rectangle([1.5, 1.5], [0, 0, 0], [0, 0, 1], bsdf=grey(0.5)),
+        "block": {"type": "cube", "bsdf": grey(0.7), "to_world": block},
+        "sun": {"type": "directional", "direction": [0.3, 1, -1], "irradiance": {"type": "rgb", "value": 2.0}},
+        "sky": {"type": "constant", "radiance": {"type": "rgb", "value": [0.5, 0.7, 1.0]}},
+    }
+
+
+def block_at_home(size: int) -> SceneDict:
+    """A block on a floor, under a sky and a sun."""
+    return _under_sky_and_sun(size, mi.ScalarTransform4f().translate([0, 0, 0.8]).scale(0.8))
+
+
+def block_far_away(size: int) -> SceneDict:
+    """The scene of `block_at_home`, its block outside of the former bounding sphere but still in the picture."""
+    return _under_sky_and_sun(size, mi.ScalarTransform4f().translate(SHIFT).translate([0, 0, 0.8]).scale(0.8))
+
+
+def move_block(scene: Any) -> None:
+    """Move the block in the loaded scene to where it is in `block_far_away`."""
+    parameters = mi.traverse(scene)
+    vertices = dr.unravel(mi.Point3f, parameters["block.vertex_positions"])
+    parameters["block.vertex_positions"] = dr.ravel(vertices + mi.Point3f(*SHIFT))
+    parameters.update()
+
+
+# ------------------------------------------------ Light through glass ------------------------------------------------
+
+
+def point_caustic(size: int) -> SceneDict:
+    """The caustic of a point light under a glass ball, which is itself out of the picture."""
+    glass = {"type": "dielectric", "int_ior": 1.5}
+    return {
+        "type": "scene",
+        "sensor": camera(size, [-0.3, -3, 1.0], [-0.3, 0, 0], 20),
+        "floor": rectangle([2, 2], [0, 0, 0], [0, 0, 1], bsdf=grey(0.6)),
+        "ball": {"type": "sphere", "center": [0, 0, 1.2], "radius": 0.4, "bsdf": glass},
+        "light": {"type": "point", "position": [0.7, 0, 2.8], "intensity": {"type": "rgb", "value": 8.0}},
+    }
+
+
+def bulb(size: int) -> SceneDict:
+    """A room lit by a ball in a hollow bulb of glass: no technique joins anything to the light itself."""
+    scene = lit_room(size)
+    at = [0, 0, 1.2]
+    shell = {"type": "dielectric", "int_ior": 1.5}
+    cavity = {"type": "dielectric", "int_ior": 1.0, "ext_ior": 1.5}
+    scene["light"] = {"type": "sphere", "center": at, "radius": 0.22, "bsdf": grey(0.2), "emitter": shining(6.0)}
+    scene["bulb"] = {"type": "sphere", "center": at, "radius": 0.4, "bsdf": shell}
+    scene["cavity"] = {"type": "sphere", "center": at, "radius": 0.35, "bsdf": cavity}
+    return scene
+
+
+# ------------------------------------------------ Shapes of lights ------------------------------------------------
+
+
+def _cube_light(size: int, mirrored: bool) -> SceneDict:
+    sign = -1 if mirrored else 1
+    scene = lit_room(size)
+    to_world = mi.ScalarTransform4f().translate([0.2, 0.1, 1.2]) @ mi.ScalarTransform4f().scale([sign * 0.2, 0.1, 0.3])
+    scene["light"] = {"type": "cube", "to_world": to_world, "emitter": shining([6.0, 5.0, 4.0])}
+    return scene
+
+
+def mirrored_light(size: int) -> SceneDict:
+    """A room lit by a box whose transformation mirrors it."""
+    return _cube_light(size, mirrored=True)
+
+
+def unmirrored_light(size: int) -> SceneDict:
+    """The room of `mirrored_light`, its box not mirrored; as the box is symmetric, the images must be equal."""
+    return _cube_light(size, mirrored=False)
+
+
+def grid_light(size: int) -> SceneDict:
+    """A room lit by a flat mesh of 1058 triangles of unequal sizes."""
+    scene = lit_room(size)
+    scene["light"] = grid("light", 23, emitter=shining([8.0, 7.0, 6.0]))
+    return scene
+
+
+def round_lights(size: int) -> SceneDict:
+    """A room lit by a cylinder, a disk and a sphere that is turned."""
+    scene = lit_room(size)
+    disk = mi.ScalarTransform4f().look_at(origin=[0.95, 0, 1], target=[0, 0, 0.8], up=[0, 0, 1])
+    tube = {"type": "cylinder", "p0": [-0.7, 0.4, 1.2], "p1": [-0.2, 0.4, 1.5], "radius": 0.08}
+    scene["light"] = {**tube, "emitter": shining([9.0, 2.0, 2.0])}
+    scene["disk"] = {"type": "disk", "to_world": disk @ mi.ScalarTransform4f().scale(0.2), "emitter": shining(4.0)}
+    ball = mi.ScalarTransform4f().translate([0.4, 0.5, 0.4]).rotate([0.6, 0, 0.8], 160).scale(0.12)
+    scene["ball"] = {"type": "sphere", "to_world": ball, "emitter": shining([1.0, 6.0, 2.0])}
+    return scene
+
+
+def smooth_mesh_light(size: int) -> SceneDict:
+    """A room lit by an octahedron with smooth normals, which only hits find."""
+    scene = lit_room(size)
+    scene["light"] = octahedron("light", [0, 0, 1.5], 0.35, emitter=shining(8.0))
+    return scene
+
+
+def textured_ball_light(size: int) -> SceneDict:
+    """A room lit by a ball with a texture, which only hits find."""
+    emitter = hard_scenes.textured_light(size)["light"]["emitter"]
+    return {**lit_room(size), "light": {"type": "sphere", "center": [0, 0, 1.3], "radius": 0.3, "emitter": emitter}}
+
+
+def sun_and_sky(size: int) -> SceneDict:
+    """A room open to a sky model with its sun, for which `bdpt` has no emission sampling."""
+    scene = lit_room(size)
+    del scene["light"]
+    return {**scene, "sky": {"type": "sunsky", "sun_direction": [0.2, -0.8, 0.5]}}
+
+
+def projector(size: int) -> SceneDict:
+    """A room lit by a projector that throws a pattern of dark and bright texels."""
+    pattern = np.random.default_rng(3).uniform(0, 1, (8, 8, 3)).astype(np.float32) ** 3
+    to_world = mi.ScalarTransform4f().look_at(origin=[-0.5, -0.8, 1.6], target=[0.2, 0.6, 0.3], up=[0, 0, 1])
+    irradiance = {"type": "bitmap", "raw": True, "data": mi.TensorXf(pattern)}
+    light = {"type": "projector", "to_world": to_world, "fov": 60, "irradiance": irradiance, "scale": 20.0}
+    return {**lit_room(size), "light": light}
+
+
+def hundred_lights_one_by_one(scene: HardScene, effort: Effort, seed: int) -> Images:
+    """Sums of the images, by `path`, of each light of `hundred_lights` alone: the others are dead and never chosen."""
+    loaded = load(hard_scenes.hundred_lights(effort.size))
+    parameters = mi.traverse(loaded)
+    suffix = ".emitter.radiance.value"
+    names = [key.removesuffix(suffix) for key in parameters.keys() if key.endswith(suffix)]  # noqa: SIM118
+    radiance = {name: float(np.array(parameters[name + suffix]).max()) for name in names}
+
+    def switch(name: str, value: float) -> None:
+        # Data and not literals, or each light would be compiled anew
+        parameters[name + suffix] = mi.Color3f(dr.opaque(mi.Float, value))
+        parameters[f"{name}.emitter.sampling_weight"] = float(value > 0)
+
+    for name in names:
+        switch(name, 0)
+    total = np.zeros(1)
+    integrator = {"type": "path", "max_depth": scene.max_depth, "rr_depth": scene.rr_depth}
+    for k, name in enumerate(name for name in names if radiance[name] > 0):
+        switch(name, radiance[name])
+        parameters.update()
+        first = (k + 1) * TRUTH_SEEDS + seed
+        total = total + render(loaded, integrator, effort.truth_spp, range(first, first + effort.seeds))
+        switch(name, 0)
+    return total
+
+
+# ------------------------------------------------ Rows ------------------------------------------------
+
+_UNGUIDED = tuple(settings for settings in ALL if not settings.guided_light)
+"""Settings for a truth that is noisier than guided light paths: a test compares those with other settings instead."""
+_INDIRECT = replace(LONG, truth_spp=512)
+
+SCENES = (
+    HardScene(6, "rotated-envmap", "a bright spot in a sky that is turned about two axes", hard_scenes.rotated_envmap,
+              PATH),
+    HardScene(6, "constant-sky", "a constant sky, a room open to it, rough metal", hard_scenes.constant_environment,
+              PATH, quick=None),
+    HardScene(6, "sun-and-sky", "a light that no light path can start from", sun_and_sky, PATH),
+    HardScene(7, "moved-geometry", "sky and sun reach a block that was moved out of the old bounding sphere",
+              block_at_home, rendered("path", "fresh load by `path`", block_far_away), max_depth=4, edit=move_block),
+    HardScene(11, "cove", "all light is indirect", hard_scenes.cove, PATH, long=_INDIRECT),
+    HardScene(12, "door-gap", "all light comes through a narrow gap", hard_scenes.door_gap, PATH, max_depth=8,
+              quick=replace(QUICK, truth_spp=512, resolution=0.02), long=replace(_INDIRECT, resolution=0.004)),
+    HardScene(13, "glass-caustic", "a caustic of a small area light, and its image in the ball, found by chance alone",
+              hard_scenes.glass_caustic, rendered("path", "`path` at very high spp"), settings=_UNGUIDED,
+              quick=replace(QUICK, seeds=8, spp=256, truth_spp=2048, resolution=0.05),
+              long=replace(LONG, size=16, blocks=4, spp=2048, truth_spp=16384, resolution=0.02)),
+    HardScene(14, "point-caustic", "a caustic that only light paths find: `path` misses it", point_caustic,
+              rendered("ptracer", "`ptracer`"), settings=WITH_LIGHT_PATHS,
+              quick=replace(QUICK, spp=256, truth_spp=512, resolution=0.02), long=replace(LONG, resolution=0.01)),
+    HardScene(15, "light-in-bulb", "a light within glass: nothing joins it, caustics of caustics", bulb, PATH,
+              max_depth=10, quick=replace(QUICK, truth_spp=256, resolution=0.02), long=replace(LONG, resolution=0.004)),
+    HardScene(16, "mirror-corridor", "light that arrives by several mirrorings", hard_scenes.mirror_room, PATH,
+              max_depth=8, long=replace(LONG, resolution=0.006)),
+    HardScene(22, "mirrored-mesh-light", "a mesh light of negative scale: which side shines?", mirrored_light,
+              rendered("path", "`path`, not mirrored", unmirrored_light)),
+    HardScene(23, "textured-light", "dark and bright texels", hard_scenes.textured_light, PATH),
+    HardScene(23, "textured-ball-light", "a textured light whose points Mitsuba samples without their texels",
+              textured_ball_light, PATH, quick=replace(QUICK, spp=256, resolution=0.02),
+              long=replace(LONG, resolution=0.008)),
+    HardScene(24, "mesh-light", "1058 unequal triangles, chosen by area", grid_light, PATH),
+    HardScene(24, "round-lights", "cylinder, disk and sphere lights", round_lights, PATH),
+    HardScene(24, "smooth-mesh-light", "smooth normals on a mesh light, where `path` itself is biased",
+              smooth_mesh_light, rendered("prb_basic", "`prb_basic`: hits alone")),
+    HardScene(25, "hundred-lights", "radiances of 1:10⁴, every tenth light dead", hard_scenes.hundred_lights,
+              Truth("sum of single-light images by `path`", hundred_lights_one_by_one), max_depth=4,
+              quick=None, long=replace(LONG, seeds=8, spp=512, truth_spp=32, resolution=0.01)),
+    HardScene(25, "hundred-lights-at-once", "the same against one render of all lights", hard_scenes.hundred_lights,
+              PATH, max_depth=4, quick=replace(QUICK, spp=256, truth_spp=1024, resolution=0.03),
+              long=replace(LONG, spp=512, truth_spp=2048, resolution=0.01)),
+    HardScene(25, "lights-of-every-kind", "rectangle, sphere, disk, mesh, point, spot, sun and sky at once",
+              hard_scenes.many_lights, PATH),
+    HardScene(26, "projector", "a pattern thrown from a point", projector, PATH),
+)  # fmt: skip
+"""The scenes of rows 6, 7, 11–16 and 22–26."""

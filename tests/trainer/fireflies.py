@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from photonfarm.trainer.runs.settings import TrainSettings
-from photonfarm.trainer.training.optimisers import build_optimiser
+from photonfarm.trainer.training.learner import build_optimiser
 
 MEAN = 0.9
 COUNTS = (4, 16, 256)  # samples a target

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
-from experiments import equal_time, paper_tables, room_tables, tables
+from experiments import equal_time, paper_tables, tables
 from experiments.experiment import Experiment, SizeName
-from experiments.rooms import Room
+from experiments.rooms import Room, format_costs, format_descriptions, format_rooms, summarise, wrap
 from photonfarm.core.errors import IncompleteError, SpecError
 
 NETWORKS = ("light_transport_photons", "light_transport", "feature_projection", "cnn")
@@ -109,8 +109,8 @@ def cells(page: str, first: str) -> list[str]:
 def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> None:
     told: dict[str, str] = {}
     for page in (
-        room_tables.format_rooms([room("night-living-room-2")]),
-        room_tables.format_costs([room("night-living-room-2")]),
+        format_rooms([room("night-living-room-2")]),
+        format_costs([room("night-living-room-2")]),
     ):
         told |= dict(zip(cells(page, "experiment"), cells(page, "night-living-room-2"), strict=True))
     assert (told["images trained on"], told["held out"], told["reference passes"]) == ("769", "127", "4032")
@@ -122,19 +122,17 @@ def test_images_and_reference_passes_are_told_apart_with_what_each_cost() -> Non
 
 def test_a_room_is_described_with_what_moves_its_title_and_the_commits_of_training() -> None:
     found = room("night-living-room-2")
-    told = " ".join(room_tables.format_descriptions([found]).split())
+    told = " ".join(format_descriptions([found]).split())
     assert told.startswith("- **night-living-room-2** (At night: The White Room): The windows of movable-living-room-2")
     assert "`photonfarm scene plan` chose them" in told
     assert told.endswith("Trained at commit 1111111, 2222222; its report was read at commit 1234567.")
     del found.document["trained_at"], found.document["dataset"]["guides"]  # as an earlier version kept it
-    assert "At which commit it was trained was not recorded" in " ".join(
-        room_tables.format_descriptions([found]).split()
-    )
-    assert cells(room_tables.format_rooms([found]), "night-living-room-2")[-1] == "n/a"
+    assert "At which commit it was trained was not recorded" in " ".join(format_descriptions([found]).split())
+    assert cells(format_rooms([found]), "night-living-room-2")[-1] == "n/a"
 
 
 def test_lines_of_prose_are_at_most_as_wide_as_the_page_and_break_neither_code_nor_links() -> None:
-    text = room_tables.wrap("word " * 23 + "`a command` " + "word " * 21 + "[a link](page.md)", "- ", "  ")
+    text = wrap("word " * 23 + "`a command` " + "word " * 21 + "[a link](page.md)", "- ", "  ")
     assert [len(line) <= 120 for line in text.splitlines()] == [True] * 3
     assert [line[:11] for line in text.splitlines()] == ["- word word", "  `a comman", "  [a link]("]
 
@@ -214,9 +212,7 @@ def test_a_gpu_is_told_with_the_rooms_that_are_at_the_paper_s_size() -> None:
 def test_rooms_of_several_machines_are_named_with_theirs() -> None:
     other = {**report(), "machine": {**MACHINE, "cpu": "Another"}}
     found = [room("fixed-living-room"), room("fixed-dining-room", other)]
-    assert room_tables.summarise(found, Room.machine) == (
-        "Some CPU, 2 cores, x86_64 (fixed-dining-room: Another, 2 cores, x86_64)"
-    )
+    assert summarise(found, Room.machine) == ("Some CPU, 2 cores, x86_64 (fixed-dining-room: Another, 2 cores, x86_64)")
 
 
 def test_what_could_not_be_measured_is_not_available() -> None:

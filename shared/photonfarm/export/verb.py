@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photonfarm.cli.options import json_option, store_option
-from photonfarm.cli.show import print_json
 from photonfarm.core.formatting import format_bytes
 from photonfarm.core.waiting import format_span
 from photonfarm.plan.hold_out import HOLD_OUT
@@ -149,6 +148,8 @@ def show_progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
 
 def print_result(result: Result, as_json: bool) -> None:
     """Print what was written."""
+    from photonfarm.cli.show import print_json  # numpy comes with it
+
     if as_json:
         print_json(asdict(result))
         return

@@ -54,7 +54,7 @@ class Need:
 
 def measured(experiment: Experiment) -> Need:
     """What an experiment needs, its scene's costs measured here. Raises SpecError."""
-    from photonfarm.renderer.measure.sample_costs import measured_costs
+    from photonfarm.renderer.tools.measure.sample_costs import measured_costs
 
     return Need.of(experiment, measured_costs(experiment.spec(), frames=FRAMES))
 

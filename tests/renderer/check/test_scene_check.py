@@ -11,10 +11,10 @@ from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
 from photonfarm.plan.request import PlannedContent, Request, expand
-from photonfarm.renderer.check import samples
-from photonfarm.renderer.check.orthographic import PAPER, Projection, whole
-from photonfarm.renderer.check.scene_check import SceneCheck, check
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.check import samples
+from photonfarm.renderer.tools.check.orthographic import PAPER, Projection, whole
+from photonfarm.renderer.tools.check.scene_check import SceneCheck, check
 from photonfarm.scene.spec_loading import NamedSpec, load_spec
 
 ROOM = """<scene version="3.0.0">

@@ -13,10 +13,10 @@ import trimesh
 from obj_scenes import SQUARE
 from PIL import Image
 
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.loading import load
-from photonfarm.renderer.importing.proposal import surfaces
-from photonfarm.renderer.importing.readers import reader_of
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.loading import load
+from photonfarm.renderer.tools.importing.proposal import surfaces
+from photonfarm.renderer.tools.importing.readers import reader_of
 
 STRENGTH = "KHR_materials_emissive_strength"
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
@@ -153,7 +153,7 @@ def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quick render that is quicker."""
-    from photonfarm.renderer.measure import exposure
+    from photonfarm.renderer.tools.measure import exposure
 
     monkeypatch.setattr(exposure, "PATHS", 1 << 13)
     monkeypatch.setattr(exposure, "SIDE", 32)

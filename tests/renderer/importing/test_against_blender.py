@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.loading import load
-from photonfarm.renderer.importing.readers import reader_of
-from photonfarm.renderer.importing.readers.blender import VARIABLE
+from photonfarm.renderer.tools.importing import elements
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.loading import load
+from photonfarm.renderer.tools.importing.readers import reader_of
+from photonfarm.renderer.tools.importing.readers.blender import VARIABLE
 
 SCRIPT = Path(__file__).with_name("blender_render.py")
 

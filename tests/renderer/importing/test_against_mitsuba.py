@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 

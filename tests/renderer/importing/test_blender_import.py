@@ -12,7 +12,7 @@ import pytest
 from blender_files import Loaded, needs_blender, run
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.readers import blender
+from photonfarm.renderer.tools.importing.readers import blender
 
 
 def test_a_fault_of_blenders_exporter_is_not_told_as_one_of_reading(tmp_path: Path, monkeypatch: Any) -> None:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from blender_files import Loaded, needs_blender, run
 
-from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.readers.blender_lamps import Lamps
+from photonfarm.renderer.tools.importing import elements
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.readers.blender_lamps import Lamps
 
 STRAIGHT_DOWN = np.diag([1.0, 1, 1, 1]).tolist()
 

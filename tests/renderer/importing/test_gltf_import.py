@@ -93,7 +93,7 @@ def test_integers_that_are_normalised_and_sparse_ones_are_read(gltf: Any, loaded
 
 
 def test_a_glb_is_the_same_scene(gltf: Any, quad: Callable[..., Path], read: Read, tmp_path: Path) -> None:
-    from photonfarm.renderer.importing.elements import text
+    from photonfarm.renderer.tools.importing.elements import text
 
     separate = text(read(quad()).root)
     document = json.loads((tmp_path / "room.gltf").read_text())

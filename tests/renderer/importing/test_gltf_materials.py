@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from imported_scenes import FOUR, Loaded, Read, colour_at, losses, of_type
 
-from photonfarm.renderer.importing import images
-from photonfarm.renderer.importing.elements import child
+from photonfarm.renderer.tools.importing import images
+from photonfarm.renderer.tools.importing.elements import child
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing import images
+from photonfarm.renderer.tools.importing import images
 
 
 def written(values: np.ndarray, kind: str) -> bytes:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.meshes import Mesh, of_shape, write_ply
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.meshes import Mesh, of_shape, write_ply
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 

@@ -12,7 +12,7 @@ from mitsuba_scenes import SPHERE, Loaded, Read, reflectance
 from PIL import Image
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.readers import mitsuba_parts
+from photonfarm.renderer.tools.importing.readers import mitsuba_parts
 from photonfarm.scene.files import SceneFile
 
 

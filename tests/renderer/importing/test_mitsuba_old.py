@@ -13,7 +13,7 @@ from mitsuba_scenes import SPHERE, Loaded, Read, from_sky, reflectance
 from PIL import Image
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.images import save_radiance
+from photonfarm.renderer.tools.importing.images import save_radiance
 
 
 def test_names_of_version_0_6_are_those_of_version_3(write_xml: Callable[..., Path], loaded: Loaded) -> None:

@@ -23,7 +23,7 @@ from obj_scenes import (
 )
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 
 def test_objects_and_materials_name_shapes_and_images_stand_upright(

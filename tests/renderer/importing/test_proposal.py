@@ -13,11 +13,11 @@ from imported_scenes import proposed
 from pydantic import TypeAdapter
 
 from photonfarm.core.models import Name
-from photonfarm.renderer.importing.proposal import surfaces
-from photonfarm.renderer.importing.proposal.groups import group_name, is_furniture, is_shell
-from photonfarm.renderer.importing.proposal.proposed import largest_rectangle
-from photonfarm.renderer.importing.proposal.surfaces import Box, Frame
 from photonfarm.renderer.scene.surroundings import surroundings
+from photonfarm.renderer.tools.importing.proposal import surfaces
+from photonfarm.renderer.tools.importing.proposal.groups import group_name, is_furniture, is_shell
+from photonfarm.renderer.tools.importing.proposal.proposed import largest_rectangle
+from photonfarm.renderer.tools.importing.proposal.surfaces import Box, Frame
 
 pytestmark = pytest.mark.usefixtures("few_points")
 

@@ -17,9 +17,9 @@ from click.testing import CliRunner, Result
 from photonfarm.core.errors import BackendError, PhotonfarmError, SpecError
 from photonfarm.core.pictures import display_values
 from photonfarm.renderer.cli.scene_verbs import scene_import
-from photonfarm.renderer.importing import importer
-from photonfarm.renderer.importing.readers import blender
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.importing import importer
+from photonfarm.renderer.tools.importing.readers import blender
 from photonfarm.scene.modification import rest, sample_modification
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import sample_view

@@ -13,9 +13,9 @@ from click.testing import CliRunner, Result
 from photonfarm.core.pictures import display_values
 from photonfarm.core.waiting import Steps, WorkLog
 from photonfarm.renderer.cli.measuring_verbs import scene_exposure
-from photonfarm.renderer.measure import exposure
-from photonfarm.renderer.measure.exposure import DarkError, Pictures, propose
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.measure import exposure
+from photonfarm.renderer.tools.measure.exposure import DarkError, Pictures, propose
 from photonfarm.scene.spec import Film, SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 

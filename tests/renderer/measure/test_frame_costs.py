@@ -16,7 +16,9 @@ from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.renderer.cli.sample_verbs import measure_frames
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.renderer.measure.frame_costs import (
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.measure.frame_costs import (
     WARM_UPS,
     PartialFilm,
     TimedFrame,
@@ -25,8 +27,6 @@ from photonfarm.renderer.measure.frame_costs import (
     part_of,
     surface_kinds,
 )
-from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec
@@ -198,7 +198,9 @@ def test_each_part_is_charged_with_its_own_seconds(
 
         return work
 
-    monkeypatch.setattr("photonfarm.renderer.measure.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(
+        "photonfarm.renderer.tools.measure.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0])
+    )
     monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
     monkeypatch.setattr(room, "guides", takes(lambda *_: 1000, lambda *_: None))

@@ -9,9 +9,9 @@ from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.measure.free_space import measure
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE
+from photonfarm.renderer.tools.measure.free_space import measure
 from photonfarm.scene.modification import sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec

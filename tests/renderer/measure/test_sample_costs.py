@@ -12,11 +12,17 @@ from click.testing import CliRunner, Result
 from photonfarm.core.errors import SpecError
 from photonfarm.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.renderer.cli.measuring_verbs import scene_cost
-from photonfarm.renderer.measure import sample_costs as measuring
-from photonfarm.renderer.measure.frame_costs import WARM_UPS
-from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs, timed
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.measure import sample_costs as measuring
+from photonfarm.renderer.tools.measure.frame_costs import WARM_UPS
+from photonfarm.renderer.tools.measure.sample_costs import (
+    fewer_samples,
+    line_through,
+    measured_costs,
+    sample_costs,
+    timed,
+)
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec

@@ -34,7 +34,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.measure.sample_costs import find_or_measure
+    from photonfarm.renderer.tools.measure.sample_costs import find_or_measure
 
     log = partial(click.echo, err=True)
     limit = math.inf if seconds is None else seconds
@@ -61,7 +61,7 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.measure.exposure import propose
+    from photonfarm.renderer.tools.measure.exposure import propose
 
     with WorkLog(partial(click.echo, err=True)) as work:
         work.begin(f"loading {loaded.name}")
@@ -86,8 +86,8 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 
     loaded = load_spec(spec, measured_again=True)
     backend.load(threads=1)
-    from photonfarm.renderer.measure.free_space import measure
     from photonfarm.renderer.tools import spec_file
+    from photonfarm.renderer.tools.measure.free_space import measure
 
     file = spec_file.writable(spec) if write else find_spec(spec)
     with WorkLog(partial(click.echo, err=True)) as work:

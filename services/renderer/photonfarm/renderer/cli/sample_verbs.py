@@ -101,7 +101,7 @@ def measure_frames(
     from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
-    from photonfarm.renderer.measure.frame_costs import write_frame_costs
+    from photonfarm.renderer.tools.measure.frame_costs import write_frame_costs
 
     with tell_waiting(partial(click.echo, err=True), f"timing {timed} frames"):
         costs = write_frame_costs(store, scene, rows, kept, timed, points, out)

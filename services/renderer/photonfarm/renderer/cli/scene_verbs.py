@@ -38,7 +38,7 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
     from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
-    from photonfarm.renderer.importing.importer import AXES, import_scene
+    from photonfarm.renderer.tools.importing.importer import AXES, import_scene
 
     made = import_scene(path, out, None if up is None else AXES[up], partial(click.echo, err=True), accept)
     if as_json:
@@ -72,7 +72,7 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 
     named = NamedSpec.load(spec)
     backend.load()
-    from photonfarm.renderer.check import page, scene_check
+    from photonfarm.renderer.tools.check import page, scene_check
 
     check, lines = scene_check.check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
     page.write(check, lines, out)
@@ -91,7 +91,7 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 def scene_shapes(spec: str, as_json: bool) -> None:
     """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
     from photonfarm.cli import show
-    from photonfarm.renderer.check import shapes
+    from photonfarm.renderer.tools.check import shapes
 
     with tell_waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
         found = shapes.listed(spec)

@@ -11,8 +11,7 @@ import pytest
 
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.guiding import grid, learning
-from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
-from photonfarm.renderer.bdpt.guiding.learning import LightGuide
+from photonfarm.renderer.bdpt.guiding.learning import DEFAULT_SHARE, LightGuide, gains
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.lights.emission import INFINITE, Lights, read_lights, sample_emission
 from tests.stability.scenes import hard_scenes

@@ -13,8 +13,8 @@ from photonfarm.cli.main import umbrella
 from photonfarm.plan.request import PlannedContent, Request, expand
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.tools.check import samples
-from photonfarm.renderer.tools.check.orthographic import PAPER, Projection, whole
 from photonfarm.renderer.tools.check.scene_check import SceneCheck, check
+from photonfarm.renderer.tools.check.shape_pictures import PAPER, Projection, whole
 from photonfarm.scene.spec_loading import NamedSpec, load_spec
 
 ROOM = """<scene version="3.0.0">

@@ -74,7 +74,7 @@ class LoadedScene:
         """
         backend.load()
         from photonfarm.renderer.scene.loading import load_scene
-        from photonfarm.renderer.scene.native.acceleration import expect_changes
+        from photonfarm.renderer.scene.native import expect_changes
 
         loaded = cls(spec, load_scene(spec, beside), **options)
         if spec.groups:

@@ -13,11 +13,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm import queue
 from photonfarm.core.errors import (
     BackendError,
     CorruptError,
-    IncompleteError,
     PhotonfarmError,
     QueueError,
     SceneNotHereError,
@@ -230,45 +228,3 @@ def _resident_bytes() -> int:
         import resource
 
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
-
-
-# ---------------------------------------------------------------------------------------------------------- at the end
-
-
-def missing_jobs(
-    store: Store, scene_ids: tuple[str, ...], *, followed: bool = False
-) -> tuple[dict[str, list[int]], dict[str, StoreError]]:
-    """The missing jobs of some scenes, or of all if none are named; and why scenes cannot be read. Both by scene id.
-
-    `followed` is as in `SceneStore.missing_jobs`. Raises StoreError if the store, or a scene that is named, cannot be
-    read.
-    """
-    if scene_ids:
-        return {scene_id: store.scene(scene_id).missing_jobs(followed=followed) for scene_id in scene_ids}, {}
-    return store.each(lambda scene: scene.missing_jobs(followed=followed))
-
-
-def is_complete(
-    missing: Mapping[str, list[int]],
-    unreadable: Mapping[str, StoreError],
-    failed: Mapping[str, str],
-    not_here: Mapping[str, SceneNotHereError],
-) -> bool:
-    """Whether a worker that is to stop when nothing is missing may stop; `failed` are reasons by the jobs' names.
-
-    Raises the error for which it should rather end, as nothing is left that it could do or wait for.
-    """
-    scene_of = {queue.job_name(scene_id, job): scene_id for scene_id, jobs in missing.items() for job in jobs}
-    not_failed = scene_of.keys() - failed.keys()
-    if not_failed and all(scene_of[name] in not_here for name in not_failed):
-        raise not_here[scene_of[min(not_failed)]]
-    if unreadable and not not_failed:  # and nothing else is left: the other scenes' jobs were taken before
-        raise unreadable[min(unreadable)]
-    if scene_of and not not_failed:
-        first = min(scene_of)
-        failures = "1 job has" if len(scene_of) == 1 else f"{len(scene_of)} jobs have"
-        raise IncompleteError(
-            f"{failures} failed; {first}: {failed[first]}. `photonfarm status` has the causes, and commands that "
-            "repeat them"
-        )
-    return not scene_of

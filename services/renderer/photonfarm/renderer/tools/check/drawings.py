@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.pictures import Picture
 from photonfarm.core.records import F32, Geometry
-from photonfarm.renderer.tools.check.orthographic import Projection, whole
+from photonfarm.renderer.tools.check.shape_pictures import Projection, whole
 from photonfarm.renderer.tools.check.shapes import Placed, group_vertices
 from photonfarm.scene.spec import Box, SceneSpec
 

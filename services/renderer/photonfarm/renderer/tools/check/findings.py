@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core.records import F32
-from photonfarm.renderer.tools.check.cameras import Cameras
-from photonfarm.renderer.tools.check.samples import Samples
+from photonfarm.renderer.tools.check.samples import Cameras, Samples
 from photonfarm.renderer.tools.check.shapes import Placed
 from photonfarm.renderer.tools.measure.exposure import TARGET
 from photonfarm.scene.plausibility import doubts, group_key

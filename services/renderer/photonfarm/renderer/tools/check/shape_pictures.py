@@ -1,22 +1,23 @@
-"""A picture of each shape alone, seen from above one corner, and the colours of all shapes.
+"""Pictures of triangles by parallel projection: each shape alone, seen from above one corner; the colours of shapes.
 
-Shape letters: S shapes.
+Shape letters: H W image, S shapes.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.core.pictures import Picture, display_values
 from photonfarm.core.records import F32, Geometry
-from photonfarm.renderer.scene.arrays import rows
+from photonfarm.renderer.scene.arrays import floats, integers, points, rows, shape_numbers
 from photonfarm.renderer.scene.base_cloud import surfaces_at
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.tools.check.orthographic import Projection, alone
 
 WIDTH = 88
 
@@ -25,6 +26,108 @@ FACES = 16
 
 GREY = 0.6
 """The colour of shapes without a diffuse part: glass, mirrors, metals."""
+
+PAPER = 248
+"""The grey of what no ray hits."""
+
+NOTHING = -1
+
+OUTLINE = 0.45
+"""The factor on the brightness of outlines."""
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Projection:
+    """Where points of the world lie in a picture: across to the right, down, and away from the viewer."""
+
+    right: Vector  # (3,) unit
+    down: Vector  # (3,) unit
+    forward: Vector  # (3,) unit: down = forward × right
+    low: Vector  # (2,) what lies in the picture's upper left corner, along right and down
+    high: Vector  # (2,) in its lower right corner
+    start: float  # nothing nearer along `forward` is shown
+
+    @classmethod
+    def around(cls, right: Vector, down: Vector, low: Vector, high: Vector, start: float) -> Self:
+        """The projection that shows a box (3,) to (3,)."""
+        corners = np.array([low, high])
+        flat = np.stack([corners @ right, corners @ down], axis=1)
+        return cls(right, down, np.cross(right, down), flat.min(axis=0), flat.max(axis=0), start)
+
+    @property
+    def size(self) -> Vector:
+        """Width and height, in scene units."""
+        return self.high - self.low
+
+    def flat(self, position: NDArray[Any]) -> Vector:
+        """Points (..., 3) as places in the picture (..., 2): 0 to 1 along its width, in the same units downwards."""
+        along = np.stack([position @ self.right, position @ self.down], axis=-1)
+        placed: Vector = (along - self.low) / self.size[0]
+        return placed
+
+    def rays(self, width: int) -> tuple[F32, tuple[int, int]]:
+        """The starts of the rays of a picture so many pixels wide, (H · W, 3), and its height and width."""
+        height = max(1, round(width * self.size[1] / self.size[0]))
+        across = self.low[0] + (np.arange(width) + 0.5) / width * self.size[0]
+        down = self.low[1] + (np.arange(height) + 0.5) / height * self.size[1]
+        place = across[None, :, None] * self.right + down[:, None, None] * self.down + self.start * self.forward
+        return place.reshape(-1, 3).astype(np.float32), (height, width)
+
+
+def whole(scene: Any, projection: Projection, width: int, colours: F32) -> Picture:
+    """The first surfaces of a scene; `colours` (S, 3) are those of its shapes, in its order."""
+    origin, size = projection.rays(width)
+    si = scene.ray_intersect(_along(projection, origin))
+    hit, normal, shape = si.is_valid(), si.n, dr.reinterpret_array(mi.UInt32, si.shape)
+    dr.eval(hit, normal, shape)
+    number = np.where(np.array(hit), shape_numbers(scene)[np.array(shape)], NOTHING).reshape(size)
+    return _shaded(number, rows(normal, *size) @ projection.forward, colours)
+
+
+def alone(vertices: F32, faces: NDArray[np.uint32], projection: Projection, width: int, colour: F32) -> Picture:
+    """The triangles (F, 3) of one shape, in one colour (3,).
+
+    It takes a scene of its own, in which a ray's triangle is found without Mitsuba's shapes: Dr.Jit traces the code of
+    all that are loaded whenever one of them is asked.
+    """
+    origin, size = projection.rays(width)
+    hit = _scene_of(vertices, faces).ray_intersect_preliminary(_along(projection, origin))
+    met, face = np.isfinite(np.array(hit.t)), np.array(hit.prim_index)
+    corners = vertices[faces[np.where(met, face, 0)]].astype(np.float64)
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    facing = (across @ projection.forward) / np.maximum(np.linalg.norm(across, axis=1), 1e-30)
+    return _shaded(np.where(met, 0, NOTHING).reshape(size), facing.reshape(size), colour[None])
+
+
+def _along(projection: Projection, origin: F32) -> Any:
+    return mi.Ray3f(o=points(origin), d=mi.Vector3f(*map(float, projection.forward)))
+
+
+def _scene_of(vertices: F32, faces: NDArray[np.uint32]) -> Any:
+    mesh = mi.Mesh("alone", len(vertices), len(faces))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = floats(vertices)
+    parameters["faces"] = integers(faces)
+    parameters.update()
+    return mi.load_dict({"type": "scene", "alone": mesh})
+
+
+def _shaded(number: NDArray[np.int64], facing: NDArray[Any], colours: F32) -> Picture:
+    """Shapes' colours, darker where a surface (H, W) is seen at an angle; outlines where shapes meet."""
+    shade = 0.55 + 0.45 * np.abs(facing)
+    picture = np.where(number[..., None] == NOTHING, PAPER, 255 * shade[..., None] * colours[number])
+    picture[_edges(number)] *= OUTLINE
+    return np.round(picture.clip(0, 255)).astype(np.uint8)
+
+
+def _edges(number: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Where the pixel to the right or below shows another shape, (H, W)."""
+    found = np.zeros(number.shape, np.bool_)
+    found[:, :-1] |= number[:, :-1] != number[:, 1:]
+    found[:-1] |= number[:-1] != number[1:]
+    return found
 
 
 def colours(scene: Any, geometry: Geometry) -> F32:

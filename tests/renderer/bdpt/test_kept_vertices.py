@@ -34,7 +34,7 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> tuple[KeptVertex, list[dict[str, np
             state = body(s)
         return state
 
-    monkeypatch.setattr(light_paths, "traced_once", stepwise)
+    monkeypatch.setattr(light_paths, "loop_once", stepwise)
     scene = mi.load_dict(hard_scenes.cornell(16), optimize=False)
     path = dr.arange(mi.UInt32, PATHS)
     sequence = randomness.stream(randomness.image_keys([3]), randomness.PHOTONS)

@@ -14,7 +14,7 @@ from photonfarm.plan.request import PlannedContent, Request, expand
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.tools.check import samples
 from photonfarm.renderer.tools.check.scene_check import SceneCheck, check
-from photonfarm.renderer.tools.check.shape_pictures import PAPER, Projection, whole
+from photonfarm.renderer.tools.check.shape_pictures import PAPER, Projection, draw_scene
 from photonfarm.scene.spec_loading import NamedSpec, load_spec
 
 ROOM = """<scene version="3.0.0">
@@ -186,7 +186,7 @@ def test_a_drawing_shows_a_shape_where_points_of_it_are_projected_to(write: Writ
     low, high = np.array([-3.0, 0, -3]), np.array([3.0, 3, 3])
     plan = Projection.around(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), low, high, -1.0)  # cut at a height of 1
     red = np.where(np.arange(4)[:, None] == 2, [1, 0, 0], [0, 0, 1]).astype(np.float32)  # the block, all else blue
-    picture = whole(scene, plan, 120, red)
+    picture = draw_scene(scene, plan, 120, red)
     for place, colour in (([0.3, 0.5, -0.3], "block"), ([1.0, 0.5, -0.3], "floor"), ([2.5, 0, 2.5], "paper")):
         x, y = (120 * plan.flat(np.array(place))).astype(int)
         expected = {"block": [True, False], "floor": [False, True]}.get(colour)

@@ -53,7 +53,7 @@ def test_roughness_is_the_green_channel_and_metallic_the_blue_one_raw_and_times_
         assert raw is not None
         assert file is not None
         assert raw.get("value") == "true"
-        stored = images.decoded(Path(file.get("value", "")).read_bytes(), "it")[0, 0, 0]
+        stored = images.decode(Path(file.get("value", "")).read_bytes(), "it")[0, 0, 0]
         assert stored * 255 == pytest.approx(value, abs=0.6)
 
 
@@ -327,7 +327,7 @@ def test_the_strength_of_a_normal_map_is_in_its_image(gltf: Any, quad: Callable[
     assert image is not None
     file = child(image, "filename")
     assert file is not None
-    x, y, z = 2 * images.decoded(Path(file.get("value", "")).read_bytes(), "it")[0, 0, :3] - 1
+    x, y, z = 2 * images.decode(Path(file.get("value", "")).read_bytes(), "it")[0, 0, :3] - 1
     assert x / z == pytest.approx(0.5, abs=0.01)
     assert x * x + y * y + z * z == pytest.approx(1, abs=0.01)
 

@@ -51,7 +51,7 @@ def encoded_as(kind: str) -> bytes:
      "GIF P", "BMP L", "TGA RGB", "TIFF 16", "TIFF F", "OpenEXR", "RGBE"],
 )  # fmt: skip
 def test_images_of_every_depth_have_their_values(kind: str) -> None:
-    image = images.decoded(encoded_as(kind), "it")
+    image = images.decode(encoded_as(kind), "it")
     assert image.shape == (1, 2, 4)
     assert np.allclose(image[0, :, :3], [[0.25] * 3, [0.75] * 3], atol=0.06)
     assert (image[..., 3] == 1).all()
@@ -64,7 +64,7 @@ def test_images_of_every_depth_have_their_values(kind: str) -> None:
 )  # fmt: skip
 def test_what_is_no_image_or_cut_off_is_told_without_addresses_and_temporary_files(data: bytes) -> None:
     with pytest.raises(SpecError, match=r"^it: is not a readable image: ") as raised:
-        images.decoded(data, "it")
+        images.decode(data, "it")
     assert not re.search(r"0x|MemoryStream|/tmp", str(raised.value))
 
 
@@ -73,10 +73,10 @@ def test_images_keep_their_depth_when_they_are_written(tmp_path: Path) -> None:
     for values, most in (
         (fine, 1e-5),
         (np.round(fine * 255) / 255, 1e-6),
-        (images.encoded(3 * images.linear(fine)), 2e-3),
+        (images.encode(3 * images.linear(fine)), 2e-3),
     ):
         file = images.save(values, tmp_path / "it.png")
-        assert np.abs(images.decoded(file.read_bytes(), "it")[..., :3] - values).max() < most
+        assert np.abs(images.decode(file.read_bytes(), "it")[..., :3] - values).max() < most
 
 
 def test_images_are_read_beyond_the_limit_of_pillow() -> None:

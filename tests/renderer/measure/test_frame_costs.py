@@ -23,9 +23,9 @@ from photonfarm.renderer.tools.measure.frame_costs import (
     PartialFilm,
     TimedFrame,
     frame_costs,
-    in_turn,
     part_of,
     surface_kinds,
+    take_turns,
 )
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
@@ -167,8 +167,8 @@ def test_a_sixteenth_of_the_pixels_takes_less_than_half_the_time_of_all() -> Non
 def test_neighbouring_frames_differ_in_configuration(somewhere: View) -> None:
     at_rest = rest(plain())
     frames = [frame(somewhere, at_rest, key, row) for row, key in enumerate("AAABBC")]
-    assert [each.row for each in islice(in_turn(frames), 10)] == [0, 3, 5, 1, 4, 5, 2, 3, 5, 0]
-    assert all(one.key != other.key for one, other in pairwise(islice(in_turn(frames), 50)))
+    assert [each.row for each in islice(take_turns(frames), 10)] == [0, 3, 5, 1, 4, 5, 2, 3, 5, 0]
+    assert all(one.key != other.key for one, other in pairwise(islice(take_turns(frames), 50)))
 
 
 @pytest.mark.parametrize("configurations", [1, 2])

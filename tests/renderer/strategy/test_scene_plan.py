@@ -62,7 +62,7 @@ def test_a_plan_for_training_says_so_and_what_its_figures_are() -> None:
 
 def test_half_estimates_for_training_share_the_fixed_part_of_a_launch() -> None:
     """Two images of 3 samples take 0.5 + 6·0.25 s in one launch."""
-    assert 2 * ImageCost(0.5, 0.25).of_a_half().time_s(3) == 2.0
+    assert 2 * ImageCost(0.5, 0.25).halve().time_s(3) == 2.0
 
 
 def test_no_measurement_for_one_purpose_is_taken_for_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

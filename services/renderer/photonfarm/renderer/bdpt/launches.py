@@ -131,9 +131,9 @@ class Lanes:
         pixels, samples, _ = self.counts
         layer = lane // pixels
         image = layer // samples if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
-        return image, layer - image * samples, self._in_squares(lane - layer * pixels)
+        return image, layer - image * samples, self._order_in_squares(lane - layer * pixels)
 
-    def _in_squares(self, place: mi.UInt32) -> mi.UInt32:
+    def _order_in_squares(self, place: mi.UInt32) -> mi.UInt32:
         """The pixel at a place of the order."""
         if self.width % SQUARE or self.height % SQUARE:
             return place

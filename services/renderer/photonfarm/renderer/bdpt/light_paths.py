@@ -28,7 +28,7 @@ from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, Record, empty_record
 from photonfarm.renderer.bdpt.lights.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.randomness import Sampler
-from photonfarm.renderer.bdpt.recording import traced_once
+from photonfarm.renderer.bdpt.recording import loop_once
 
 _MAX_THROUGHPUT_KEPT = 0.95
 
@@ -97,7 +97,7 @@ def trace_light_paths(
     start = sample_emission(lights, rng, path, paths)
     if isinstance(splat, TalliedSplat):
         splat.begin(start.cell)
-    (state,) = traced_once(
+    (state,) = loop_once(
         state=(first_state(scene, lights, start, rng, empty_record() if options.connects else ()),),
         cond=lambda s: s.active,
         body=partial(vertex_bounce, scene=scene, sensor=sensor, options=options, start=start, splat=splat),
@@ -157,13 +157,13 @@ def vertex_bounce(
     if options.traces_light:
         aperture = s.rng.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         seen = sample_sensor(sensor, si, aperture, active & smooth & ~first)
-        value, p_reverse = bsdf.eval_pdf(ctx, *exchanged(si, si.to_local(seen.d)), seen.valid)
+        value, p_reverse = bsdf.eval_pdf(ctx, *exchange_directions(si, si.to_local(seen.d)), seen.valid)
         cos_out = dr.abs(dr.dot(si.n, seen.d))
         w = weights.light_tracing(
             seen.area_density_over_cos * cos_out, options.light_ratio, s.count, p_reverse, dvcm, dvc
         )
         joined = seen.valid & (dr.max(value) > 0)
-        joined &= ~scene.ray_test(_from_lens(seen.start, si), joined)
+        joined &= ~scene.ray_test(_ray_from_lens(seen.start, si), joined)
         splat.add(seen.position, s.throughput * value * seen.weight * (w * cos_out / cos_in), joined)
 
     # ----------------------------- Keep for connections -----------------------------
@@ -190,7 +190,7 @@ def vertex_bounce(
     return (state,)
 
 
-def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
+def _ray_from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
     """The ray from ``start`` on the near plane to a point just before a surface.
 
     ``spawn_ray_to`` makes a ray in the other direction that ends before ``start``. Objects right behind the near plane
@@ -210,7 +210,7 @@ def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     d = si.to_world(bs.wo)
     cos_out = dr.abs(dr.dot(si.n, d))
-    value, p_reverse = bsdf.eval_pdf(mi.BSDFContext(), *exchanged(si, bs.wo), s.active & ~delta)
+    value, p_reverse = bsdf.eval_pdf(mi.BSDFContext(), *exchange_directions(si, bs.wo), s.active & ~delta)
 
     shading = dr.abs(mi.Frame3f.cos_theta(si.wi)) / dr.abs(mi.Frame3f.cos_theta(bs.wo))
     factor = dr.select(delta, delta_weight * shading, value / bs.pdf) * (cos_out / cos_in)
@@ -236,7 +236,7 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     s.throughput *= dr.rcp(kept)
 
 
-def exchanged(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
+def exchange_directions(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
     """The arguments that evaluate a BSDF with exchanged directions: ``si`` with ``wo`` for ``si.wi``, and ``si.wi``.
 
     With them ``bsdf.eval`` is BSDF·|cos_s(wi)| for radiance that arrives along ``si.wi`` and leaves along ``wo``, and

@@ -94,7 +94,7 @@ def scene_shapes(spec: str, as_json: bool) -> None:
     from photonfarm.renderer.tools.check import shapes
 
     with tell_waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
-        found = shapes.listed(spec)
+        found = shapes.list_shapes(spec)
     if as_json:
         show.print_json([shape.document() for shape in found])
         return

@@ -17,7 +17,7 @@ from photonfarm.renderer.jobs.render import (
     SceneRenderer,
     lit_points,
     load_scene,
-    located,
+    locate,
     visibility_of,
 )
 from photonfarm.scene.camera_path import CameraPath, Frames, check_clear, orbit
@@ -37,7 +37,7 @@ def write_buffers(store: str | Path, scene: str, modification: str | None, path:
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
     configuration = find_configuration(opened, stored, modification)
-    spec = located(stored.spec)
+    spec = locate(stored.spec)
     if isinstance(path, int):
         views = orbit(spec, path, configuration)
     else:

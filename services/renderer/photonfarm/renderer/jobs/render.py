@@ -82,7 +82,7 @@ OnProgress = Callable[[str, int, int], object]
 """A callback with the phase of a job in words, how many of its parts are done, and how many there are; 0: no parts."""
 
 
-def _ignored(phase: str, done: int, total: int) -> None:
+def _ignore_progress(phase: str, done: int, total: int) -> None:
     """No progress is asked for."""
 
 
@@ -118,7 +118,7 @@ class ShardRenderer:
     """Renders jobs of a store, keeping the most recently used scenes loaded."""
 
     def __init__(
-        self, store: Store, *, worker: str, load: SceneLoader = load_scene, on_progress: OnProgress = _ignored
+        self, store: Store, *, worker: str, load: SceneLoader = load_scene, on_progress: OnProgress = _ignore_progress
     ) -> None:
         """Take a store; `worker` is the name written into markers."""
         self._store = store
@@ -201,7 +201,7 @@ class ShardRenderer:
             self._scenes[scene_id] = known
         else:
             known = None  # freed before the next one is loaded
-            spec = located(stored.spec)  # before another scene is unloaded for it
+            spec = locate(stored.spec)  # before another scene is unloaded for it
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
             self._on_progress(LOADS, 0, 0)
@@ -210,7 +210,7 @@ class ShardRenderer:
         return self._scenes[scene_id]
 
 
-def located(spec: SceneSpec) -> SceneSpec:
+def locate(spec: SceneSpec) -> SceneSpec:
     """The spec, once its scene file has been found on this machine and is the planned one.
 
     Raises SceneNotHereError otherwise: other machines may still render the job.

@@ -131,10 +131,10 @@ def find_llvm(roots: Iterable[Path] = (Path(sys.prefix), Path("/usr"))) -> str:
     """
     named = os.environ.get(LLVM_VARIABLE)
     if named:
-        return _opened(named, f"{LLVM_VARIABLE} = {named!r} cannot be opened")
+        return _open_llvm(named, f"{LLVM_VARIABLE} = {named!r} cannot be opened")
     for version in LLVM_VERSIONS:
         for found in _libraries(roots, version):
-            return _opened(str(found), f"{found} cannot be opened")
+            return _open_llvm(str(found), f"{found} cannot be opened")
     raise BackendError(f"no libLLVM of version {' or '.join(LLVM_VERSIONS)} is installed; {_INSTALL_LLVM}")
 
 
@@ -145,7 +145,7 @@ def _libraries(roots: Iterable[Path], version: str) -> Iterable[Path]:
                 yield from sorted(root.glob(f"{folder}/{pattern}"))
 
 
-def _opened(library: str, failure: str) -> str:
+def _open_llvm(library: str, failure: str) -> str:
     try:
         ctypes.CDLL(library)
     except OSError as error:

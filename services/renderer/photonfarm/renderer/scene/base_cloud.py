@@ -101,14 +101,14 @@ def geometry_of(shapes: list[Any], group_of: Mapping[str, int], sections: int = 
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + np.uint32(start) for part, start in zip(parts, starts, strict=False)]
     return Geometry(
-        vertices=_stacked([part.vertices for part in parts], np.float32),
-        faces=_stacked(faces, np.uint32),
+        vertices=_stack([part.vertices for part in parts], np.float32),
+        faces=_stack(faces, np.uint32),
         face_shape=np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts]),
         shape_group=np.array([group_of.get(shape.id(), STATIC) for shape in shapes], np.int16),
     )
 
 
-def _stacked(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
+def _stack(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
     return np.concatenate(arrays).astype(dtype) if arrays else np.zeros((0, 3), dtype)
 
 

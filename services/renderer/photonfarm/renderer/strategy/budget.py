@@ -75,7 +75,7 @@ class Budget:
                 + (f", or {best} for all settings" if best > least else "")
             )
 
-    def within(self, share: float, items: Iterable[T], least: int) -> Iterator[T]:
+    def take_within(self, share: float, items: Iterable[T], least: int) -> Iterator[T]:
         """The items for as long as no more than a share of the whole time is used; so many in any case."""
         for count, item in enumerate(items):
             yield item
@@ -131,7 +131,7 @@ class ImageCost:
         sample_s = max((many_s - few_s) / (many - few), 0.02 * few_s / few)  # if noise hides it
         return cls(max(few_s - few * sample_s, 0.0), sample_s)
 
-    def of_a_half(self) -> ImageCost:
+    def halve(self) -> ImageCost:
         """The cost of one of two half-estimates that share a launch, and so the fixed part of an image."""
         return ImageCost(self.fixed_s / 2, self.sample_s)
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from photonfarm.core.records import F32
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, MeasuredCandidate, RelativeErrors, Render
-from photonfarm.renderer.strategy.noise import BlockSums, Weigh, missed, pair_errors, view_weights
+from photonfarm.renderer.strategy.noise import BlockSums, Weigh, charge_for_missed, pair_errors, view_weights
 
 LEAST_PAIRS = 4
 """The least number of pairs of images in the first round, over all views: fewer would give no standard error."""
@@ -195,9 +195,11 @@ class Rounds:
 
     def missed(self, candidate: Candidate) -> float:
         """The part of a candidate's error that is inferred from light that others found."""
-        return missed(self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate])
+        return charge_for_missed(
+            self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate]
+        )
 
-    def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
+    def _errors_that_count(self, candidate: Candidate) -> NDArray[np.float64]:
         """The error that counts, by pairs and views, (pairs, views)."""
         return np.stack([record.errors for record in self._records[candidate].values()], axis=1)
 
@@ -208,17 +210,17 @@ class Rounds:
     def is_suspect(self, candidate: Candidate) -> bool:
         """Whether a candidate seems to miss light that others find; the estimate grows with the number of images."""
         inferred = self.missed(candidate)
-        return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
+        return bool(inferred > SUSPICIOUS * (self._errors_that_count(candidate).mean() + inferred))
 
     def cost(self, candidate: Candidate) -> float:
         """Error × time of a candidate: less is better."""
-        return float((self._seen(candidate).mean() + self.missed(candidate)) * self._time_later(candidate))
+        return float((self._errors_that_count(candidate).mean() + self.missed(candidate)) * self._time_later(candidate))
 
     def errors(self, candidate: Candidate) -> RelativeErrors:
         """The errors beside those of plain path tracing, over the images that both rendered with equal seeds."""
-        seen = self._seen(candidate)
-        own, plain = seen + self.missed(candidate), self._seen(PLAIN)[: len(seen)] + self.missed(PLAIN)
-        return RelativeErrors(images=self.images(candidate), own=_by_views(own), plain=_by_views(plain))
+        seen = self._errors_that_count(candidate)
+        own, plain = seen + self.missed(candidate), self._errors_that_count(PLAIN)[: len(seen)] + self.missed(PLAIN)
+        return RelativeErrors(images=self.images(candidate), own=_mean_over_pairs(own), plain=_mean_over_pairs(plain))
 
     def measured(self, candidate: Candidate) -> MeasuredCandidate:
         """The error × time against plain path tracing."""
@@ -235,6 +237,6 @@ class Rounds:
         )
 
 
-def _by_views(errors: NDArray[np.float64]) -> tuple[float, ...]:
+def _mean_over_pairs(errors: NDArray[np.float64]) -> tuple[float, ...]:
     """The means over pairs, given (pairs, views); for a single view the pairs themselves."""
     return tuple((errors.mean(axis=0) if errors.shape[1] > 1 else errors[:, 0]).tolist())

@@ -46,7 +46,7 @@ def lines(plan: TransportPlan) -> list[str]:
         "Measured saving",
         *(f"  {sentence}" for sentence in _savings(plan)),
         "",
-        *_measured(plan),
+        *_describe_measurement(plan),
         f"{origin}: {m.views} views of {m.film.width} × {m.film.height} pixels, {m.spp} spp; {m.spent_s:.0f} s of CPU",
     ]
 
@@ -71,7 +71,7 @@ def _verdict(plan: TransportPlan) -> str:
 def _why(plan: TransportPlan) -> list[str]:
     if not plan.at_equal_cost:
         return [BLACK]
-    rows = _sorted(plan)
+    rows = _sort_rows(plan)
     reasons = [*reasons_for(plan.at_equal_cost[plan.candidate], rows, plan.measurement.shared), *_not_taken(plan)]
     now, half_spp = present(plan.spec), plan.spec.transport.half_spp
     if plan.half_spp != half_spp:
@@ -114,15 +114,15 @@ def _savings(plan: TransportPlan) -> Sequence[str]:
     return ["none: the spec has these settings already" if plan.candidate == now else "none: nothing to compare with"]
 
 
-def _measured(plan: TransportPlan) -> list[str]:
+def _describe_measurement(plan: TransportPlan) -> list[str]:
     """The table, its legend and an empty line each; nothing without a measurement."""
     if not plan.at_equal_cost:
         return []
     purpose = plan.measurement.purpose
-    return [*table(_sorted(plan), plan.candidate, purpose), "", *legend(plan.spec, purpose), ""]
+    return [*table(_sort_rows(plan), plan.candidate, purpose), "", *legend(plan.spec, purpose), ""]
 
 
-def _sorted(plan: TransportPlan) -> list[CandidateAtCost]:
+def _sort_rows(plan: TransportPlan) -> list[CandidateAtCost]:
     """The measured settings, in their own order instead of that of the pilot."""
     return sorted(plan.at_equal_cost.values(), key=lambda measured: measured.candidate)
 
@@ -160,10 +160,10 @@ def _against_plain(chosen: MeasuredCandidate, rows: Sequence[MeasuredCandidate])
 
 def plus_minus(value: float, spread: float | None) -> str:
     """A value and its standard error, "0.34 ± 0.02", rounded by `rounded`."""
-    return " ± ".join(filter(None, rounded(value, spread)))
+    return " ± ".join(filter(None, round_with_error(value, spread)))
 
 
-def rounded(value: float, spread: float | None) -> tuple[str, str]:
+def round_with_error(value: float, spread: float | None) -> tuple[str, str]:
     """A value and its standard error to the same decimal place; the second is empty if it is None.
 
     The place is that of the error's first digit, but tenths for errors of 1 to 10 and ones above.
@@ -179,17 +179,17 @@ def rounded(value: float, spread: float | None) -> tuple[str, str]:
 
 def table(candidates: Sequence[CandidateAtCost], chosen: Candidate, purpose: Purpose) -> list[str]:
     """A line of heads and one for each candidate."""
-    costs = [rounded(measured.relative_cost, measured.spread) for measured in candidates]
-    means, spreads = (_aligned(part) for part in zip(*costs, strict=True))
+    costs = [round_with_error(measured.relative_cost, measured.spread) for measured in candidates]
+    means, spreads = (_align(part) for part in zip(*costs, strict=True))
     columns = {
         "connections": [str(measured.candidate.connections) for measured in candidates],
-        "light ratio": _aligned(f"{measured.candidate.light_ratio:g}" for measured in candidates),
+        "light ratio": _align(f"{measured.candidate.light_ratio:g}" for measured in candidates),
         "light samples": [str(measured.candidate.light_samples) for measured in candidates],
         "guided": ["yes" if measured.candidate.guided_light else "no" for measured in candidates],
         "images": [str(measured.errors.images) for measured in candidates],
         "half_spp": [str(measured.half_spp) for measured in candidates],
-        ERROR[purpose]: _aligned(_three_digits(measured.half_error) for measured in candidates),
-        "ms": _aligned(f"{1e3 * measured.time_s:.1f}" for measured in candidates),
+        ERROR[purpose]: _align(_three_digits(measured.half_error) for measured in candidates),
+        "ms": _align(f"{1e3 * measured.time_s:.1f}" for measured in candidates),
         "error × time": [
             f"{mean} {'±' if spread.strip() else ' '} {spread}" for mean, spread in zip(means, spreads, strict=True)
         ],
@@ -234,7 +234,7 @@ def _three_digits(value: float) -> str:
     return f"{value:.{min(max(2 - math.floor(math.log10(value)), 0), 6)}f}" if value > 0 else "0"
 
 
-def _aligned(numbers: Iterable[str]) -> list[str]:
+def _align(numbers: Iterable[str]) -> list[str]:
     """Numbers padded to one width, their decimal points below each other."""
     parts = [number.partition(".") for number in numbers]
     left, right = (max(len(part[i]) for part in parts) for i in (0, 2))

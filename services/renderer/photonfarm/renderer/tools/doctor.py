@@ -37,10 +37,10 @@ def examine(store: str | Path, redis_url: str, log: Log = lambda _: None) -> Ite
     """Every check in turn; optional parts that are absent are reported and give exit code 0."""
     yield _packages()
     yield _optional(_cards(cards_here()), "needed by `--device cuda` only")
-    yield _tried("renderer", lambda: _renders(log))
-    yield _tried("store", lambda: _writes(store))
-    yield _tried("embedded Redis", _starts_redis)
-    yield _optional(_tried("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
+    yield _try("renderer", lambda: _renders(log))
+    yield _try("store", lambda: _writes(store))
+    yield _try("embedded Redis", _starts_redis)
+    yield _optional(_try("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
     yield _optional(_scenes(), "needed by the ready specs under scenes/ only")
 
 
@@ -49,7 +49,7 @@ def _packages() -> MachineCheck:
     return MachineCheck("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
 
 
-def _tried(name: str, check: Callable[[], str]) -> MachineCheck:
+def _try(name: str, check: Callable[[], str]) -> MachineCheck:
     try:
         return MachineCheck(name, True, check())
     except PhotonfarmError as error:

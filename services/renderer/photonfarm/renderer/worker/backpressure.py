@@ -41,7 +41,7 @@ class DiskReserve:
         self._clock = clock
         self._refused_until = 0.0
 
-    def refused(self) -> None:
+    def note_refusal(self) -> None:
         """Record that the disk has just refused a write; it may do so with free space left, because of a quota."""
         self._refused_until = self._clock() + FULL_S
 

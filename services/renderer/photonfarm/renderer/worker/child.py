@@ -93,8 +93,8 @@ class RenderWorker:
 
     def step(self) -> int | None:
         """Render a job, or wait for one; an exit code ends the worker."""
-        paused, left = self._outcomes.disk.reason(), self._left()
-        self._talk.pausing(paused)
+        paused, left = self._outcomes.disk.reason(), self._skipped_scenes()
+        self._talk.log_pause(paused)
         job = self._source.take(paused, left)
         if job is not None:
             self._render(job)
@@ -104,11 +104,11 @@ class RenderWorker:
         self._stop.wait(self._settings.idle_s if paused else self._source.pause_s)
         return None
 
-    def _left(self) -> Mapping[str, str]:
+    def _skipped_scenes(self) -> Mapping[str, str]:
         """Why this worker now takes no jobs of some scenes, by their ids."""
         waiting = {**self._source.ahead(), **read_leases(self._store.storage)}
-        self._talk.waiting(waiting)
-        return {**waiting, **self._outcomes.left()}
+        self._talk.log_waiting(waiting)
+        return {**waiting, **self._outcomes.skipped_scenes()}
 
     def _is_complete(self, paused: str | None) -> bool:
         """Whether nothing is left to do or to wait for, after nothing was taken.
@@ -131,15 +131,15 @@ class RenderWorker:
         self._in_hand, rendered = name, False
         ending: Ending = "done"
         reason = ""
-        with deadline(self._settings, self._pipe, name), self._talk.timing(name):
+        with deadline(self._settings, self._pipe, name), self._talk.time_job(name):
             try:
                 rendered = self._renderer.render(*job)
                 if not rendered:
                     self._store.check()  # its scene may be gone with the whole store
             except TakenError:
-                self._talk.given_up(name)
+                self._talk.log_given_up(name)
             except Exception as error:
-                ending, reason = self._outcomes.failed(name, error), f"{type(error).__name__}: {error}"
+                ending, reason = self._outcomes.judge_failure(name, error), f"{type(error).__name__}: {error}"
         self._in_hand = None
         self._outcomes.count(name, time.monotonic() - began, done=rendered, failed=ending != "done")
         if self._source.end(name, ending, reason):

@@ -26,7 +26,7 @@ from photonfarm.renderer.bdpt.camera import ImageStack
 from photonfarm.renderer.bdpt.guiding.grid import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import F64, Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import Totals, column_of, tiles_of
-from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, usefulness
+from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, estimate_usefulness
 from photonfarm.renderer.bdpt.launches import Launch
 
 DEFAULT_SHARE = 0.35
@@ -45,7 +45,7 @@ LIMITS = 1024, 65536
 """…and the least and the most of these."""
 
 
-def gains(layout: Layout, splats: F64, joined: float, starts: F64, edges: F64, probability: F64) -> F64:
+def estimate_gains(layout: Layout, splats: F64, joined: float, starts: F64, edges: F64, probability: F64) -> F64:
     """The gains [T], with the mean 1 over default sampling; all are 1 where no light path added anything. Pure numpy.
 
     ``splats`` [T] are sums of weighted squares of what splats of the ``starts`` [T] light paths, of ``edges`` [T]
@@ -55,7 +55,7 @@ def gains(layout: Layout, splats: F64, joined: float, starts: F64, edges: F64, p
     of_connections = joined / max(edges.sum(), 1.0)
     of_splats = _means(layout, splats, starts) / np.maximum(_means(layout, edges, starts), 1)
     gain = np.sqrt(of_splats + of_connections)
-    gain = gain.reshape(layout.lights, layout.of_a_light)
+    gain = gain.reshape(layout.lights, layout.cells_per_light)
     total = float((gain.mean(axis=1) * probability).sum())
     if not (np.isfinite(total) and total > 0):
         return np.ones(layout.cells)
@@ -83,7 +83,7 @@ class Effort:
     light_paths: int = 8192
 
     @classmethod
-    def of_image(cls, eye_paths: int, light_ratio: float, connections: int) -> Effort:
+    def for_image(cls, eye_paths: int, light_ratio: float, connections: int) -> Effort:
         """A few per cent of the work of an image of so many eye paths; one of few sizes, as each has its kernels.
 
         Connections teach from fewer light paths than splats do, as each light path is joined to many eye paths.
@@ -117,9 +117,7 @@ class LightGuide:
         return cls(starts, mi.Float(table.tolist()))
 
 
-def learned(
-    layout: Layout, probability: mi.Float, images: ImageStack, totals: Totals, lanes: SparseLanes
-) -> LightGuide:
+def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Totals, lanes: SparseLanes) -> LightGuide:
     """The guide that the images and the totals of a launch suggest, given default probabilities of lights [N]."""
     tiles = tiles_of(lanes.images)
     weight = _weights(images.radiance, lanes, tiles)
@@ -134,8 +132,8 @@ def learned(
 
     splat_squares, started, edges, connection_squares, connections = totals
     splats, joined = on_host(weighted(splat_squares), weighted(connection_squares))
-    gain = gains(layout, splats, float(joined.sum()), *on_host(started, edges, probability))
-    table = None if lanes.shifts is None else usefulness(joined, *on_host(connections))
+    gain = estimate_gains(layout, splats, float(joined.sum()), *on_host(started, edges, probability))
+    table = None if lanes.shifts is None else estimate_usefulness(joined, *on_host(connections))
     return LightGuide.of(StartGuide.of(layout, gain), table)
 
 

@@ -63,7 +63,7 @@ def cell_of(grid: Grid, si: mi.SurfaceInteraction3f) -> mi.UInt32:
     return grid.cell(si.p) * NORMALS + 2 * axis + dr.select(along < 0, mi.UInt32(1), mi.UInt32(0))
 
 
-def usefulness(sums: F64, connections: F64) -> F64:
+def estimate_usefulness(sums: F64, connections: F64) -> F64:
     """The table [U] from sums of weighted squares over the ``connections`` [U] to vertices of each cell. Pure numpy.
 
     It is estimated coarse to fine, as few connections go to most cells. All are 1 where no connection added anything.

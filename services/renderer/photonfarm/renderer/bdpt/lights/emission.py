@@ -109,7 +109,7 @@ class Lights:
         before = dr.gather(mi.Float, self.emit_cdf, dr.maximum(lane, 1) - 1, lane > 0)
         return (self.emit_cdf - before) / dr.gather(mi.Float, self.emit_cdf, mi.UInt32(self.count - 1))
 
-    def guided_by(self, guide: StartGuide, scene: mi.Scene) -> Lights:
+    def guide_with(self, guide: StartGuide, scene: mi.Scene) -> Lights:
         """The same lights of ``scene``, with light paths that start as ``guide`` says.
 
         Raises ValueError for a guide of another number of lights.
@@ -130,13 +130,13 @@ class Lights:
         light, d = self.guided.number_of(emitter), -ds.d
         u = mi.Point2f(0)
         if self.has(AREA):
-            u = grid.on_area(n, d)
+            u = grid.map_area_to_square(n, d)
         if self.has(INFINITE) or self.has(DIRECTION):
             at_infinity = self.is_kind(light, INFINITE) | self.is_kind(light, DIRECTION)
-            u = dr.select(at_infinity, grid.on_disk(d, (x - self.centre) / self.radius), u)
+            u = dr.select(at_infinity, grid.map_disk_to_square(d, (x - self.centre) / self.radius), u)
         if self.has(POSITION):
             axis, cutoff = dr.gather(mi.Vector3f, self.axis, light), dr.gather(mi.Float, self.cos_cutoff, light)
-            u = dr.select(self.is_kind(light, POSITION), grid.in_cone(axis, cutoff, d), u)
+            u = dr.select(self.is_kind(light, POSITION), grid.map_cone_to_square(axis, cutoff, d), u)
         return self.guided.gain_at(light, u, ds.uv, active & (dr.reinterpret_array(mi.UInt32, emitter) != 0))
 
 

@@ -66,7 +66,7 @@ class Spheres:
             return None
         centres, sides = [], []
         for shape in shapes:
-            centre, side = _measured(shape) if _is_sphere(shape) else (mi.Point3f(0), mi.Float(0))
+            centre, side = _measure_sphere(shape) if _is_sphere(shape) else (mi.Point3f(0), mi.Float(0))
             centres.append(centre)
             sides.append(side)
         n = len(shapes)
@@ -85,7 +85,7 @@ def _is_sphere(shape: Any) -> bool:
     return shape is not None and shape.class_name() == "Sphere"
 
 
-def _measured(sphere: mi.Shape) -> tuple[mi.Point3f, mi.Float]:
+def _measure_sphere(sphere: mi.Shape) -> tuple[mi.Point3f, mi.Float]:
     """(centre, side) of a sphere, [1] each."""
     to_world = mi.traverse(sphere)["to_world"]
     centre, outside = to_world @ mi.Point3f(0), dr.zeros(mi.Interaction3f)

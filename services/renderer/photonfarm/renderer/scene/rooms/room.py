@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.rooms import furniture, materials
 from photonfarm.renderer.scene.rooms.materials import diffuse, glossy, metal, textured
-from photonfarm.renderer.scene.rooms.solids import Point, box, joined, mesh, quad, rectangle_light
+from photonfarm.renderer.scene.rooms.solids import Point, box, join, mesh, quad, rectangle_light
 
 X, Y, Z = 2.6, 2.6, 2.1  # half width, height, half depth
 OVERHANG = 0.05
@@ -65,11 +65,11 @@ def _walls() -> dict[str, Any]:
 
 def _decoration() -> dict[str, Any]:
     t, h = 0.015, 0.09  # skirting board
-    skirting = joined(
+    skirting = join(
         *(box((2 * X, h, t), (0, h / 2, side * (Z - t / 2))) for side in (-1, 1)),
         *(box((t, h, 2 * Z - 2 * t), (side * (X - t / 2), h / 2, 0)) for side in (-1, 1)),
     )
-    door = joined(
+    door = join(
         box((0.02, 2.05, 0.95), (-X + 0.01, 1.025, 1.2)),
         *(box((0.01, 0.8, 0.62), (-X + 0.025, y, 1.2)) for y in (0.58, 1.50)),
     )
@@ -91,7 +91,7 @@ def _furniture() -> dict[str, Any]:
         for part, solid in parts.items():
             shape_id = f"{piece}-{part}"
             shapes[shape_id] = mesh(
-                shape_id, _placed(solid, piece), looks[part],
+                shape_id, _place(solid, piece), looks[part],
                 smooth=part in SMOOTH, radiance=LAMP_RADIANCE if part == "shade" else None,
             )  # fmt: skip
     x, _, z = PLACES["pedestal"][0]
@@ -122,7 +122,7 @@ def _pieces() -> dict[str, tuple[furniture.Parts, dict[str, dict[str, Any]]]]:
 SMOOTH = ("bowl", "cushion", "fabric", "pillows", "copper")
 
 
-def _placed(solid: Any, piece: str) -> Any:
+def _place(solid: Any, piece: str) -> Any:
     place, angle = PLACES[piece]
     solid.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 1, 0)))
     solid.apply_translation(place)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.pictures import Picture
 from photonfarm.core.records import F32, Geometry
-from photonfarm.renderer.tools.check.shape_pictures import Projection, whole
+from photonfarm.renderer.tools.check.shape_pictures import Projection, draw_scene
 from photonfarm.renderer.tools.check.shapes import Placed, group_vertices
 from photonfarm.scene.spec import Box, SceneSpec
 
@@ -105,7 +105,9 @@ def _drawing(
     unit = float(10 ** np.floor(np.log10(projection.size[0] / 3)))
     length = max(step * unit for step in (1, 2, 5) if step * unit <= projection.size[0] / 3)
     bar = WIDTH * length / float(projection.size[0])
-    return Drawing(title, whole(scene, projection, PIXELS, colours), height, _spread(marks, height), bar, f"{length:g}")
+    return Drawing(
+        title, draw_scene(scene, projection, PIXELS, colours), height, _spread(marks, height), bar, f"{length:g}"
+    )
 
 
 def _mark(

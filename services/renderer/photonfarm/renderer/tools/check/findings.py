@@ -73,18 +73,18 @@ class Measured:
     samples: Samples
 
 
-def findings(spec: SceneSpec, lights: frozenset[str], measured: Measured) -> list[Finding]:
+def collect_findings(spec: SceneSpec, lights: frozenset[str], measured: Measured) -> list[Finding]:
     """The findings, serious ones first; one for each key, and none that only follows from another."""
     found: dict[str, Finding] = {}
     cameras = measured.samples.cameras
-    _add(found, _of_place(spec, measured))
+    _add(found, _check_place(spec, measured))
     _add(found, (Finding(doubt.key, doubt.sentence) for doubt in doubts(spec, lights)))
     if not _VIEWS & found.keys():
-        _add(found, _of_cameras(spec, cameras))
+        _add(found, _check_cameras(spec, cameras))
         if not _DARKNESS & found.keys() and cameras.placed_well.mean() >= PLACED_WELL:
-            _add(found, _of_brightness(spec, measured.samples))
+            _add(found, _check_brightness(spec, measured.samples))
     for index, (group, placed) in enumerate(zip(spec.groups, measured.placed, strict=True)):
-        _add(found, _of_group(spec, group, placed, group_key(spec, index)))
+        _add(found, _check_group(spec, group, placed, group_key(spec, index)))
     return sorted(found.values(), key=lambda finding: not finding.serious)
 
 
@@ -94,7 +94,7 @@ def _add(found: dict[str, Finding], more: Iterable[Finding]) -> None:
         found.setdefault(finding.key, finding)
 
 
-def _of_place(spec: SceneSpec, measured: Measured) -> Iterator[Finding]:
+def _check_place(spec: SceneSpec, measured: Measured) -> Iterator[Finding]:
     """Scenes far from the origin; cameras and boxes far from the scene, or larger than it."""
     size = float(np.linalg.norm(measured.high - measured.low))
     away = float(np.linalg.norm(measured.high + measured.low)) / 2
@@ -117,7 +117,7 @@ def _of_place(spec: SceneSpec, measured: Measured) -> Iterator[Finding]:
             yield Finding(f"{group_key(spec, index)}.box", sentence)
 
 
-def _of_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
+def _check_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
     if cameras.nothing.mean() >= EMPTY:
         yield Finding("view.look_at", f"{percent(cameras.nothing.mean())} of the cameras see no surface at all")
     if cameras.behind.mean() >= BEHIND:
@@ -152,7 +152,7 @@ def _of_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
         )
 
 
-def _of_brightness(spec: SceneSpec, samples: Samples) -> Iterator[Finding]:
+def _check_brightness(spec: SceneSpec, samples: Samples) -> Iterator[Finding]:
     if not samples.images.halves.any():
         yield Finding("scene", f"all {len(samples.shown)} rendered views are black: no light reaches what they show")
         return
@@ -168,7 +168,7 @@ def _of_brightness(spec: SceneSpec, samples: Samples) -> Iterator[Finding]:
     )
 
 
-def _of_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> Iterator[Finding]:
+def _check_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> Iterator[Finding]:
     size = float(np.linalg.norm(placed.high - placed.low))
     at = np.array(group.at)
     off = float(np.linalg.norm(np.maximum(np.maximum(placed.low - at, at - placed.high), 0)))

@@ -86,7 +86,7 @@ def join_cameras(parts: Sequence[Cameras]) -> Cameras:
     return Cameras(tuple(name for part in parts for name in part.inside), *arrays)
 
 
-def look_from(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Cameras:
+def examine_cameras(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Cameras:
     """Cameras of the scene's present configuration; `cloud` (P, 3) are points that are there in it."""
     ids = [shape.id() or f"shape {number}" for number, shape in enumerate(scene.scene.shapes())]
     origin, target = (np.stack([getattr(view, name) for view in views]) for name in ("origin", "target"))
@@ -161,18 +161,18 @@ def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, work: Wor
     halves, seen, steps = [], [], Steps(COUNT, slow=2)
     work.begin(f"rendering {COUNT} configurations", steps.words)
     for number in range(COUNT):
-        modification, views = _drawn(spec, number)
+        modification, views = _draw_views(spec, number)
         scene.apply(modification)
         halves.append(scene.render_halves(views[0], (2 * number, 2 * number + 1), half_spp))
         position, there = rebuild(cloud, modification)
-        seen.append(look_from(scene, views, position[there]))
+        seen.append(examine_cameras(scene, views, position[there]))
         picture = display(halves[-1].mean(axis=0), spec.exposure)
         shown.append(Shown(number, modification, views[0], picture))
         steps.reach(len(shown))
     return Samples(shown, exposure.Pictures(np.stack(halves)), join_cameras(seen))
 
 
-def _drawn(spec: SceneSpec, number: int) -> tuple[Modification, list[View]]:
+def _draw_views(spec: SceneSpec, number: int) -> tuple[Modification, list[View]]:
     """A configuration, and its views; the first is that of the configuration's sample."""
     modification = sample_modification(spec, exposure.SEED, number)
     key = modification.key(spec.radiance_id)

@@ -76,32 +76,32 @@ class Projection:
         return place.reshape(-1, 3).astype(np.float32), (height, width)
 
 
-def whole(scene: Any, projection: Projection, width: int, colours: F32) -> Picture:
+def draw_scene(scene: Any, projection: Projection, width: int, colours: F32) -> Picture:
     """The first surfaces of a scene; `colours` (S, 3) are those of its shapes, in its order."""
     origin, size = projection.rays(width)
-    si = scene.ray_intersect(_along(projection, origin))
+    si = scene.ray_intersect(_rays_along(projection, origin))
     hit, normal, shape = si.is_valid(), si.n, dr.reinterpret_array(mi.UInt32, si.shape)
     dr.eval(hit, normal, shape)
     number = np.where(np.array(hit), shape_numbers(scene)[np.array(shape)], NOTHING).reshape(size)
-    return _shaded(number, rows(normal, *size) @ projection.forward, colours)
+    return _shade(number, rows(normal, *size) @ projection.forward, colours)
 
 
-def alone(vertices: F32, faces: NDArray[np.uint32], projection: Projection, width: int, colour: F32) -> Picture:
+def draw_shape(vertices: F32, faces: NDArray[np.uint32], projection: Projection, width: int, colour: F32) -> Picture:
     """The triangles (F, 3) of one shape, in one colour (3,).
 
     It takes a scene of its own, in which a ray's triangle is found without Mitsuba's shapes: Dr.Jit traces the code of
     all that are loaded whenever one of them is asked.
     """
     origin, size = projection.rays(width)
-    hit = _scene_of(vertices, faces).ray_intersect_preliminary(_along(projection, origin))
+    hit = _scene_of(vertices, faces).ray_intersect_preliminary(_rays_along(projection, origin))
     met, face = np.isfinite(np.array(hit.t)), np.array(hit.prim_index)
     corners = vertices[faces[np.where(met, face, 0)]].astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     facing = (across @ projection.forward) / np.maximum(np.linalg.norm(across, axis=1), 1e-30)
-    return _shaded(np.where(met, 0, NOTHING).reshape(size), facing.reshape(size), colour[None])
+    return _shade(np.where(met, 0, NOTHING).reshape(size), facing.reshape(size), colour[None])
 
 
-def _along(projection: Projection, origin: F32) -> Any:
+def _rays_along(projection: Projection, origin: F32) -> Any:
     return mi.Ray3f(o=points(origin), d=mi.Vector3f(*map(float, projection.forward)))
 
 
@@ -114,7 +114,7 @@ def _scene_of(vertices: F32, faces: NDArray[np.uint32]) -> Any:
     return mi.load_dict({"type": "scene", "alone": mesh})
 
 
-def _shaded(number: NDArray[np.int64], facing: NDArray[Any], colours: F32) -> Picture:
+def _shade(number: NDArray[np.int64], facing: NDArray[Any], colours: F32) -> Picture:
     """Shapes' colours, darker where a surface (H, W) is seen at an angle; outlines where shapes meet."""
     shade = 0.55 + 0.45 * np.abs(facing)
     picture = np.where(number[..., None] == NOTHING, PAPER, 255 * shade[..., None] * colours[number])
@@ -130,7 +130,7 @@ def _edges(number: NDArray[np.int64]) -> NDArray[np.bool_]:
     return found
 
 
-def colours(scene: Any, geometry: Geometry) -> F32:
+def shape_colours(scene: Any, geometry: Geometry) -> F32:
     """A colour for each shape of a scene at rest, as displays are given it, (S, 3): its mean diffuse reflectance."""
     count = len(geometry.shape_group)
     first, last = (np.searchsorted(geometry.face_shape, np.arange(count), side) for side in ("left", "right"))
@@ -143,21 +143,21 @@ def colours(scene: Any, geometry: Geometry) -> F32:
     return np.where(mean.max(axis=1, keepdims=True) > 0, 0.12 + 0.88 * display_values(mean), GREY).astype(np.float32)
 
 
-def picture(geometry: Geometry, number: int, colour: F32, up: int) -> Picture:
+def draw_from_corner(geometry: Geometry, number: int, colour: F32, up: int) -> Picture:
     """One shape alone, in one colour (3,)."""
     first, last = np.searchsorted(geometry.face_shape, [number, number + 1])
     used, faces = np.unique(geometry.faces[first:last], return_inverse=True)
     vertices = geometry.vertices[used]
     box = np.array([vertices.min(axis=0), vertices.max(axis=0)], np.float64)
     middle, radius = box.mean(axis=0), max(0.5 * float(np.linalg.norm(box[1] - box[0])), 1e-9)
-    right, down, forward = _from_a_corner(up)
+    right, down, forward = _axes_from_a_corner(up)
     centre = np.array([middle @ right, middle @ down])
     start = float(middle @ forward) - 2 * radius
     projection = Projection(right, down, forward, centre - radius, centre + radius, start)
-    return alone(vertices, faces.reshape(-1, 3).astype(np.uint32), projection, WIDTH, colour)
+    return draw_shape(vertices, faces.reshape(-1, 3).astype(np.uint32), projection, WIDTH, colour)
 
 
-def _from_a_corner(up: int) -> tuple[Any, Any, Any]:
+def _axes_from_a_corner(up: int) -> tuple[Any, Any, Any]:
     """Right, down and forward of a viewer above a corner, where axis `up` points up."""
     across, along = (np.eye(3)[axis] for axis in range(3) if axis != up)
     upwards = np.eye(3)[up]

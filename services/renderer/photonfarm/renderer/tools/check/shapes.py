@@ -84,7 +84,7 @@ def groups_by_shape(spec: SceneSpec) -> dict[str, str]:
     return {shape: group.name for group in spec.groups for shape in shape_ids(group)}
 
 
-def listed(name: str) -> list[ShapeFacts]:
+def list_shapes(name: str) -> list[ShapeFacts]:
     """The shapes of a spec's scene, or of a Mitsuba scene file (`.xml`), without rendering anything.
 
     Raises SpecError as loading does.
@@ -175,7 +175,7 @@ def placements(scene: LoadedScene, geometry: Geometry) -> list[Placed]:
     up = np.array(scene.spec.view.up, np.float32)
     carpet = CARPET * float(np.ptp(scene.boxes @ up))
     groups = enumerate(scene.spec.groups)
-    return [_placed(fixed, hollow, group_vertices(geometry, number), group, up, carpet) for number, group in groups]
+    return [_place(fixed, hollow, group_vertices(geometry, number), group, up, carpet) for number, group in groups]
 
 
 def _corners(group: Movable) -> F32:
@@ -190,7 +190,7 @@ def group_vertices(geometry: Geometry, number: int) -> F32:
     return geometry.vertices[np.unique(faces)]
 
 
-def _placed(
+def _place(
     fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable, up: F32, carpet: float
 ) -> Placed:  # fmt: skip
     low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -203,7 +203,7 @@ def _placed(
     middle = (low + high) / 2
     there = surroundings(fixed, middle + moves, hollow).open
     spread = vertices[np.linspace(0, len(vertices) - 1, min(POINTS, len(vertices))).astype(np.int64)]
-    behind, shapes = _behind(fixed, middle, _lifted(spread, up, carpet), moves)
+    behind, shapes = _behind(fixed, middle, _lift(spread, up, carpet), moves)
     cut = np.maximum(behind - behind[0], 0)
     random, worst = slice(1 + len(corners), None), int(cut.argmax())
     return Placed(
@@ -217,7 +217,7 @@ def _placed(
     )
 
 
-def _lifted(vertices: F32, up: F32, carpet: float) -> F32:
+def _lift(vertices: F32, up: F32, carpet: float) -> F32:
     """Vertices (V, 3) of a group, raised by as much as a carpet is high, or to half the group's height."""
     height = vertices @ up
     least = height.min() + min(carpet, np.ptp(height) / 2)

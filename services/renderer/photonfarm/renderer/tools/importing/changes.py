@@ -23,7 +23,7 @@ class Change:
     places: list[str] = field(default_factory=list)  # nodes, materials or lines
 
     def __str__(self) -> str:
-        where = f" ({listed(self.places)})" if self.places else ""
+        where = f" ({name_some(self.places)})" if self.places else ""
         if self.effect is None:
             return f"{self.name}: {self.meaning}{where}" if self.name else f"{self.meaning}{where}"
         return f"{self.effect} differs: {self.name}: {self.meaning}{where}"
@@ -69,7 +69,7 @@ class Changes:
         )
 
 
-def listed(names: Sequence[str], most: int = 4) -> str:
+def name_some(names: Sequence[str], most: int = 4) -> str:
     """The first names of some, and how many more there are."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

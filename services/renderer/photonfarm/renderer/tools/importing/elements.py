@@ -102,13 +102,13 @@ def place(node: Element) -> str:
     return f"{where}<{node.tag}>{f' {name!r}' if name else ''}"
 
 
-def copied(node: Element) -> Element:
+def copy_element(node: Element) -> Element:
     """A copy of an element and all in it without ids, which must be unique; references keep theirs."""
     copy = type(node)(node.tag, {key: value for key, value in node.attrib.items() if key != "id" or node.tag == "ref"})
     if isinstance(node, Located) and isinstance(copy, Located):
         copy.file, copy.line = node.file, node.line
     copy.text, copy.tail = node.text, node.tail
-    copy.extend(copied(part) for part in node)
+    copy.extend(copy_element(part) for part in node)
     return copy
 
 

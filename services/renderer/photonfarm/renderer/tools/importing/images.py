@@ -26,7 +26,7 @@ RGB_OF_XYZ = np.array([[3.24048, -1.53715, -0.498535], [-0.969256, 1.87599, 0.04
 """Linear sRGB of CIE XYZ (ITU-R BT.709's primaries)."""
 
 
-def decoded(data: bytes, what: str, *, raw: bool = False) -> Image:
+def decode(data: bytes, what: str, *, raw: bool = False) -> Image:
     """An encoded image of any depth as RGBA (H, W, 4), its values as they are stored; profiles of colour are ignored.
 
     Images of floats hold linear light, and their colours are encoded here, unless `raw`. Raises SpecError if an image
@@ -44,7 +44,7 @@ def decoded(data: bytes, what: str, *, raw: bool = False) -> Image:
     except (OSError, ValueError, SyntaxError) as error:
         raise SpecError(f"{what}: is not a readable image: {error}") from error
     if is_light and not raw:
-        values[..., :3] = encoded(values[..., :3])
+        values[..., :3] = encode(values[..., :3])
     return values
 
 
@@ -71,7 +71,7 @@ def linear(encoded: Image) -> Image:
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
-def encoded(values: Image) -> Image:
+def encode(values: Image) -> Image:
     """The sRGB values of linear ones, by the same curve above 1."""
     values = values.clip(0)
     return np.where(values <= 0.0031308, values * 12.92, 1.055 * values ** (1 / 2.4) - 0.055).astype(np.float32)

@@ -78,7 +78,7 @@ class ImportedScene:
             shape = elements.mesh_shape(self.root, shape_id, faceted=mesh.normals is None)
             SubElement(shape, "ref", id=material)
             if light is not None:
-                shape.append(elements.copied(light))
+                shape.append(elements.copy_element(light))
             self.meshes[shape_id] = mesh
             self.objects[shape_id] = owner
 

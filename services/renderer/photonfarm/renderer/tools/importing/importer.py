@@ -121,7 +121,7 @@ def _import(
     shutil.move(scratch / folder.name, folder)
     write_whole(spec, text.text())
     load_spec(spec)
-    return Imported(spec, folder, scene.changes, text.found())
+    return Imported(spec, folder, scene.changes, text.describe())
 
 
 def _write_scene(scene: ImportedScene, folder: Path) -> None:
@@ -150,7 +150,7 @@ def _lit(text: SpecText, scene: ImportedScene, loaded: Any, draft: Path, work: W
     room = text.proposal.room
     if loaded.emitters():
         try:
-            return _measured(text, draft, LIT[room.has_ceiling], work)
+            return _measure(text, draft, LIT[room.has_ceiling], work)
         except DarkError:
             work.begin("the scene's own lights do not reach what cameras see; one is added")
     if room.has_ceiling or loaded.environment() is not None:
@@ -160,13 +160,13 @@ def _lit(text: SpecText, scene: ImportedScene, loaded: Any, draft: Path, work: W
         elements.write(scene.root, draft.parent / text.file)
         scene.changes.note("no light reaches what cameras see, and there is no ceiling; the scene got a white sky")
     try:
-        return _measured(text, draft, 0.01, work)
+        return _measure(text, draft, 0.01, work)
     except DarkError:
         scene.changes.note(f"no view was found that shows anything lit; {BY_HAND}")
         return text
 
 
-def _measured(text: SpecText, draft: Path, least: float, work: WorkLog) -> SpecText:
+def _measure(text: SpecText, draft: Path, least: float, work: WorkLog) -> SpecText:
     """The spec with the first view of which enough is free, where cameras may stand, and the exposure.
 
     Raises DarkError where fewer pixels than the share `least` are lit, or hardly.

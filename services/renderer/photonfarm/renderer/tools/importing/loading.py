@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing import elements
-from photonfarm.renderer.tools.importing.changes import listed
+from photonfarm.renderer.tools.importing.changes import name_some
 from photonfarm.renderer.tools.importing.imported import Ids, ImportedScene
-from photonfarm.renderer.tools.importing.meshes import Floats, Mesh, of_shape
+from photonfarm.renderer.tools.importing.meshes import Floats, Mesh, read_mesh
 from photonfarm.renderer.tools.importing.readers.mitsuba_parts import effect_of
 
 FAR = 10.0
@@ -40,16 +40,16 @@ def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
     """
     log(f"loading {len(scene.root.findall('shape'))} shapes")
     scene.write_meshes(folder / "meshes")
-    loaded = _loaded(scene)
+    loaded = _load(scene)
     for mended in (_fit, _make_normals_usable):
         if mended(scene, loaded):
             scene.write_meshes(folder / "meshes")
-            loaded = _loaded(scene)
+            loaded = _load(scene)
     _flatten_lights(scene, loaded)
     return loaded
 
 
-def _loaded(scene: ImportedScene) -> Any:
+def _load(scene: ImportedScene) -> Any:
     import mitsuba as mi
 
     from photonfarm.renderer.scene.loading import threads_to_read_with
@@ -66,12 +66,12 @@ def _loaded(scene: ImportedScene) -> Any:
         with threads_to_read_with():
             loaded = mi.parser.instantiate(config, state)
     except (RuntimeError, ValueError) as error:
-        raise SpecError(_told(str(error), state, objects)) from error
+        raise SpecError(_explain(str(error), state, objects)) from error
     _drop_unknown(scene, objects, [node.props.unqueried() for node in state.nodes])
     return loaded
 
 
-def _told(message: str, state: Any, objects: list[Element]) -> str:
+def _explain(message: str, state: Any, objects: list[Element]) -> str:
     """What Mitsuba refuses, by the element in place of its line in our document."""
     import mitsuba as mi
 
@@ -181,7 +181,7 @@ def _make_normals_usable(scene: ImportedScene, loaded: Any) -> bool:
         normals = np.array(shape.vertex_normals_buffer(), np.float32).reshape(-1, 3)
         if not (np.abs(normals).max(axis=1, initial=0) > 0).all():  # also for NaN
             mended = True
-            _replace(scene, shape.id(), {shape.id(): of_shape(shape).usable(shape.id(), scene.changes)})
+            _replace(scene, shape.id(), {shape.id(): read_mesh(shape).usable(shape.id(), scene.changes)})
     return mended
 
 
@@ -197,7 +197,7 @@ def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
             elements.put_value(element, "face_normals", True)
     if smooth:
         meaning = "lights are flat here: smooth normals of their meshes are left out"
-        scene.changes.note(f"{listed(sorted(smooth))}: {meaning}")
+        scene.changes.note(f"{name_some(sorted(smooth))}: {meaning}")
 
 
 def shapes_of_things(
@@ -216,13 +216,13 @@ def shapes_of_things(
         if len(parts) > 1:
             split.append(shape.id())
             parts = {thing: ids.make(f"{shape.id()}_part") for thing in parts}
-            mesh = of_shape(shape)
+            mesh = read_mesh(shape)
             _replace(scene, shape.id(), {made: mesh.part(faces == thing) for thing, made in parts.items()})
         for thing, made in parts.items():
             if thing >= 0:
                 found[thing].append(made)
     if split:
-        scene.changes.note(f"{listed(split)}: held separate things in one mesh, and became a shape for each")
+        scene.changes.note(f"{name_some(split)}: held separate things in one mesh, and became a shape for each")
     return found
 
 
@@ -239,4 +239,4 @@ def _replace(scene: ImportedScene, shape_id: str, meshes: dict[str, Mesh]) -> No
             new = elements.mesh_shape(elements.scene(), made, faceted=flat)
             new.extend(kept)
             scene.root.insert(place, new)
-            kept = [elements.copied(node) for node in kept]
+            kept = [elements.copy_element(node) for node in kept]

@@ -32,9 +32,9 @@ class Mesh:
     def part(self, faces: NDArray[np.bool_]) -> Mesh:
         """The mesh of some of its faces, a mask (F,)."""
         used, corner = np.unique(self.faces[faces], return_inverse=True)
-        return self._taken(used, faces, corner.reshape(-1, 3))
+        return self._take(used, faces, corner.reshape(-1, 3))
 
-    def _taken(self, vertices: NDArray[Any], faces: NDArray[np.bool_], corners: NDArray[Any]) -> Mesh:
+    def _take(self, vertices: NDArray[Any], faces: NDArray[np.bool_], corners: NDArray[Any]) -> Mesh:
         """The mesh of some vertices and faces; `corners` are the faces, by the numbers that vertices have then."""
         normals, uv = (None if values is None else values[vertices] for values in (self.normals, self.uv))
         attributes = {
@@ -42,7 +42,7 @@ class Mesh:
         }
         return Mesh(self.vertices[vertices], corners.astype(np.uint32), normals, uv, attributes)
 
-    def moved(self, matrix: Floats) -> Mesh:
+    def transform(self, matrix: Floats) -> Mesh:
         """The mesh under an affine map (4, 4); where that mirrors, faces turn so that their fronts stay fronts."""
         linear = matrix[:3, :3]
         faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
@@ -71,17 +71,17 @@ class Mesh:
         if bad.all():
             mesh = replace(mesh, normals=None)
         elif bad.any():
-            mesh = mesh._with_own_normals(bad)
+            mesh = mesh._separate_normals(bad)
         if bad.any():
             meaning = "faces whose normals are zero or no numbers get their own"
             changes.note(meaning, f"{what}: {bad.sum()} of {len(bad)}")
         return mesh
 
-    def _with_own_normals(self, flat: NDArray[np.bool_]) -> Mesh:
+    def _separate_normals(self, flat: NDArray[np.bool_]) -> Mesh:
         """The mesh with corners of their own, and the face's normal on them, for some faces, a mask (F,)."""
         count, every, corners = len(self.vertices), np.ones(len(self.faces), np.bool_), self.faces.copy()
         corners[flat] = count + np.arange(3 * flat.sum()).reshape(-1, 3)
-        mesh = self._taken(np.concatenate([np.arange(count), self.faces[flat].ravel()]), every, corners)
+        mesh = self._take(np.concatenate([np.arange(count), self.faces[flat].ravel()]), every, corners)
         if mesh.normals is not None:
             mesh.normals[count:] = np.repeat(unit(self._across()[flat]), 3, axis=0)
         return mesh.part(every)
@@ -118,7 +118,7 @@ def unit(vectors: Floats) -> Floats:
     return made
 
 
-def of_shape(shape: Any) -> Mesh:
+def read_mesh(shape: Any) -> Mesh:
     """The mesh of a shape that Mitsuba has loaded."""
     import mitsuba as mi
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.renderer.tools.importing.changes import Changes, listed
+from photonfarm.renderer.tools.importing.changes import Changes, name_some
 from photonfarm.renderer.tools.importing.proposal.proposed import RADIANCE, Proposal, View
 from photonfarm.renderer.tools.importing.proposal.surfaces import Box, Frame, Points
 from photonfarm.renderer.tools.spec_file import put
@@ -49,7 +49,7 @@ class SpecText:
         room, view = self.proposal.room, self.view
         corners = np.concatenate([*self.proposal.extent, *view.origin]).reshape(-1, 3)
         reach = max(4 * np.linalg.norm(room.size), np.linalg.norm(np.ptp(corners, axis=0)))
-        lights = _comment(*(f"Lights: {sentence}." for sentence in self._fixed_lights()))
+        lights = _comment(*(f"Lights: {sentence}." for sentence in self._describe_fixed_lights()))
         text = f"""\
 {_comment(*self._head())}\
 name = {json.dumps(self.name)}
@@ -81,7 +81,7 @@ depth = 4
 """
         return put(text, {"view": {"free_space": self.free_space}}, where=self.name) if self.free_space else text
 
-    def found(self) -> list[str]:
+    def describe(self) -> list[str]:
         """What is proposed, a line each."""
         moves = self.proposal.movables
         things = [movable.thing.name for movable in moves if not movable.thing.emits]
@@ -91,7 +91,7 @@ depth = 4
             static += ", and no object is split: separate it in your program, by loose parts, to let these move"
         if self.source.lower().endswith(".obj"):
             static += "; if the scene lies on its side, try --up z, as OBJ does not say what is up"
-        lights = [f"{listed(lamps, len(lamps))} may move"] * bool(lamps) + list(self._fixed_lights())
+        lights = [f"{name_some(lamps, len(lamps))} may move"] * bool(lamps) + list(self._describe_fixed_lights())
         lights += ["one is added above what cameras see"] * self.adds_light
         return [
             self._extent(),
@@ -111,11 +111,11 @@ depth = 4
         guess = "".join(f"; lengths look like {unit}, and stay so" for unit in units)
         return f"room: {x} × {y}, and {z} high{'' if room.has_ceiling else ', without a ceiling'}{guess}"
 
-    def _fixed_lights(self) -> Iterator[str]:
+    def _describe_fixed_lights(self) -> Iterator[str]:
         for reason, names in self.proposal.stays.items():
-            yield f"{listed(names)}: {'stays' if len(names) == 1 else 'stay'}, {reason}"
+            yield f"{name_some(names)}: {'stays' if len(names) == 1 else 'stay'}, {reason}"
         if self.shapeless:
-            yield f"{listed(self.shapeless)}: cannot move, as a spec moves shapes"
+            yield f"{name_some(self.shapeless)}: cannot move, as a spec moves shapes"
 
     def _head(self) -> Iterator[str]:
         yield (

@@ -66,13 +66,13 @@ class Writer:
             numbers = part.values.ravel().tolist()
             elements.put_value(parent, name, numbers if len(numbers) > 1 else numbers[0])
             return
-        (values, lie), file = self._wrapped(part.values, part.lie), part.file
+        (values, lie), file = self._wrap(part.values, part.lie), part.file
         if file is None:
             file = self.stem.with_name(f"{self.stem.name}_{name}.{'exr' if kind == 'light' else 'png'}")
             if kind == "light":
                 file = images.save_radiance(values, file)
             else:
-                file = images.save(images.encoded(values) if kind == "colour" else values.clip(0, 1), file)
+                file = images.save(images.encode(values) if kind == "colour" else values.clip(0, 1), file)
         bitmap = elements.put_bitmap(parent, name, file, raw=kind != "colour")
         if lie.nearest:
             elements.put_value(bitmap, "filter_type", "nearest")
@@ -82,7 +82,7 @@ class Writer:
             rows = [(a, b, 0, c) for a, b, c in lie.rows]
             elements.put_matrix(bitmap, "to_uv", [*rows, (0, 0, 1, 0), (0, 0, 0, 1)])
 
-    def _wrapped(self, values: images.Image, lie: Lie) -> tuple[images.Image, Lie]:
+    def _wrap(self, values: images.Image, lie: Lie) -> tuple[images.Image, Lie]:
         """An image that goes on in one way along both axes, as Mitsuba's do.
 
         Clamped along one axis it gets a border as wide as its coordinates reach; mirrored, its mirror image beside it.
@@ -106,7 +106,7 @@ class Writer:
         values = np.take(values, texels.clip(0, size - 1), axis=1 - axis)
         return values, replace(lie, rows=tuple(rows), wraps=(other, other))
 
-    def joined(self, one: Map, other: Map, effect: Effect, name: str) -> tuple[images.Image, images.Image, Lie | None]:
+    def join(self, one: Map, other: Map, effect: Effect, name: str) -> tuple[images.Image, images.Image, Lie | None]:
         """The values of two properties at the same texels, and how these lie; the mean of what lies differently."""
         if one.lie and other.lie and one.lie != other.lie:
             meaning = "lies unlike the image that it is joined with, whose mean is taken"
@@ -159,7 +159,7 @@ class Writer:
     def light(self, glow: Map, opacity: Map | None, name: str) -> Element | None:
         """What a surface emits, if anything: Mitsuba's lights shine where their material lets light through."""
         if opacity is not None and glow.values.any():
-            values, alpha, lie = self.joined(glow, opacity, "light", name)
+            values, alpha, lie = self.join(glow, opacity, "light", name)
             glow = Map(values * alpha, lie)
         if glow.values.max() <= 0:
             return None

@@ -95,13 +95,13 @@ class Pictures:
         whole image has half the variance of its halves: what they lose against it, it loses against the noise-free
         image.
         """
-        return self.noisy_means(exposure) + self._lowered(exposure)
+        return self.noisy_means(exposure) + self._lower(exposure)
 
     def noisy_means(self, exposure: float) -> NDArray[np.float64]:
         """The display mean of each view's whole image with its noise, (N,)."""
         return _means(self.halves.mean(axis=1), exposure)
 
-    def _lowered(self, exposure: float) -> NDArray[np.float64]:
+    def _lower(self, exposure: float) -> NDArray[np.float64]:
         halves = [_means(self.halves[:, half], exposure) for half in (0, 1)]
         return self.noisy_means(exposure) - np.mean(halves, axis=0)
 
@@ -136,7 +136,7 @@ def propose(
     scene, steps = LoadedScene.load(small, beside), Steps(frames, slow=1)
     size = f"{small.film.width} × {small.film.height}"
     work.begin(f"rendering {frames} views of {spec.name}, {size}, 2 × {spp} spp", steps.words)
-    pictures = Pictures(np.stack(list(_rendered(scene, frames, spp, steps))))
+    pictures = Pictures(np.stack(list(_render_pairs(scene, frames, spp, steps))))
     exposure = pictures.exposure(target)
     if exposure is None:
         reached = float(pictures.display_means(2 ** RANGE[1]).mean())
@@ -176,7 +176,7 @@ def shrunk(spec: SceneSpec, side: int) -> SceneSpec:
     return spec.model_copy(update={"film": Film(width=width, height=height), "photons": photons})
 
 
-def _rendered(scene: LoadedScene, frames: int, spp: int, steps: Steps) -> Iterator[F32]:
+def _render_pairs(scene: LoadedScene, frames: int, spp: int, steps: Steps) -> Iterator[F32]:
     """Two halves of each view, (2, H, W, 3)."""
     spec = scene.spec
     for number in range(frames):

@@ -35,7 +35,7 @@ from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.core.keys import Key, view_key
 from photonfarm.core.records import F32, BasePointCloud, Guides, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
-from photonfarm.renderer.jobs.render import lit_points, located
+from photonfarm.renderer.jobs.render import lit_points, locate
 from photonfarm.renderer.scene.gbuffer import first_surfaces
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
@@ -50,12 +50,12 @@ def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:
     """The kind of surface at each pixel's centre, (H, W) of `Surface`, between the view's clipping planes."""
     camera = Camera.of(view, spec)
     si = first_surfaces(scene, camera, camera.rays(), spec)
-    kind = dr.select(si.shape.is_emitter(), mi.UInt32(Surface.EMITTER), _by_lobes(si.bsdf().flags()))
+    kind = dr.select(si.shape.is_emitter(), mi.UInt32(Surface.EMITTER), _kind_of_lobes(si.bsdf().flags()))
     found = np.array(dr.select(si.is_valid(), kind, int(Surface.NOTHING)))
     return found.astype(np.uint8).reshape(camera.height, camera.width)
 
 
-def _by_lobes(flags: Any) -> Any:
+def _kind_of_lobes(flags: Any) -> Any:
     """The kind DIFFUSE, SPECULAR or MIRROR (UInt32), by a BSDF's flags."""
     diffuse = mi.has_flag(flags, mi.BSDFFlags.Diffuse)
     glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy)
@@ -126,7 +126,7 @@ def write_frame_costs(
     _check_complete(reader, rows)
     frames = [_frame(reader, row) for row in rows]
     used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
-    spec = located(reader.spec)
+    spec = locate(reader.spec)
     costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed)
     costs.write(out)
     return costs
@@ -170,7 +170,7 @@ def frame_costs(
     )
 
 
-def in_turn(frames: Sequence[TimedFrame]) -> Iterator[TimedFrame]:
+def take_turns(frames: Sequence[TimedFrame]) -> Iterator[TimedFrame]:
     """The frames without end, one of each configuration in turn: neighbours differ in it, unless all have the same."""
     of_configuration: dict[Key, list[TimedFrame]] = {}
     for frame in frames:
@@ -193,7 +193,7 @@ def _seconds(
     """The times of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
     stays = len({frame.key for frame in frames}) == 1
     measured = []
-    for seed, frame in enumerate(islice(in_turn(frames), WARM_UPS + timed)):
+    for seed, frame in enumerate(islice(take_turns(frames), WARM_UPS + timed)):
         if stays:  # else there would be nothing to edit
             scene.apply(rest(scene.spec))
         measured.append(_time_frame(scene, cloud, films, frame, seed))

@@ -128,11 +128,11 @@ def _group_boxes(scene: LoadedScene) -> dict[str, tuple[tuple[float, float, floa
     for group in spec.groups:
         own = boxes[[number[shape] for shape in shape_ids(group)]]
         low, high = (own[:, 0].min(axis=0) - margin, own[:, 1].max(axis=0) + margin)
-        found[group.name] = (_rounded(low - np.array(group.at)), _rounded(high - np.array(group.at)))
+        found[group.name] = (_round(low - np.array(group.at)), _round(high - np.array(group.at)))
     return found
 
 
-def _rounded(corner: NDArray[np.float64]) -> tuple[float, float, float]:
+def _round(corner: NDArray[np.float64]) -> tuple[float, float, float]:
     x, y, z = (float(f"{value:.5g}") for value in corner)
     return x, y, z
 

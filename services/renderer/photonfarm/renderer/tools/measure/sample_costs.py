@@ -77,7 +77,7 @@ def find_or_measure(
     of = "sample costs", spec.scene_id, spec.transport.model_dump_json(), str(frames)
     whole, part = (file_of("costs", digest_here(*of, *also)) for also in ((), ("in few seconds",)))
     for file in [] if again else [whole, part] if math.isfinite(seconds) else [whole]:
-        if (kept := _kept(file)) is not None:
+        if (kept := _read_kept(file)) is not None:
             return kept
     with WorkLog(log) as work_log:
         work_log.begin(f"loading {spec.name}")
@@ -91,14 +91,14 @@ def find_or_measure(
     return costs
 
 
-def _kept(file: Path) -> SampleCosts | None:
+def _read_kept(file: Path) -> SampleCosts | None:
     try:
         return SampleCosts.read(file.read_bytes())
     except (OSError, StoreError):  # no measurement, or an unusable one
         return None
 
 
-def measured_costs(spec: SceneSpec, frames: int = FRAMES) -> SampleCosts:
+def measure_costs(spec: SceneSpec, frames: int = FRAMES) -> SampleCosts:
     """Load the scene of a spec, with a thread pool of one as workers have, and measure; raises as loading does."""
     backend.load(threads=1)
     return sample_costs(LoadedScene.load(spec), frames)
@@ -130,7 +130,7 @@ def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: Work
                 f"{name}: loading it took {before:.0f} s of processor time, more than the {budget.seconds:.0f} s for "
                 "measuring its costs; `photonfarm scene cost` measures them without a limit, and keeps them"
             )
-        measured.append(_measured(scene, cloud, number))
+        measured.append(_measure_frame(scene, cloud, number))
         views.reach(len(measured))
         last_s = budget.spent_s - before
     measured = measured[min(WARM_UPS, len(measured) - 1) :]
@@ -161,16 +161,16 @@ def _medians(scene_id: str, measured: list[_Frame]) -> SampleCosts:
     )
 
 
-def _measured(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
+def _measure_frame(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
     spec = scene.spec
     modification = sample_modification(spec, SEED, number)
     view = sample_view(spec, modification.key(spec.radiance_id), SEED, number, modification)
-    configuration_s, (points, photons) = timed(partial(_configure, scene, cloud, modification))
-    view_s, _ = timed(partial(_look, scene, view, points, photons))
-    guides_s, _ = timed(partial(_guide, scene, view, cloud, modification))
+    configuration_s, (points, photons) = time_work(partial(_configure, scene, cloud, modification))
+    view_s, _ = time_work(partial(_look, scene, view, points, photons))
+    guides_s, _ = time_work(partial(_guide, scene, view, cloud, modification))
     few = fewer_samples(spec)
-    few_s, halves = timed(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
-    many_s, _ = timed(partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few))
+    few_s, halves = time_work(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
+    many_s, _ = time_work(partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few))
     pass_s, spp_s = line_through(2 * few, few_s, 2 * RANGE * few, many_s)
     noise = relative_variance(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
     return _Frame(configuration_s, view_s + guides_s, guides_s, pass_s, spp_s, noise)
@@ -197,7 +197,7 @@ def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: 
     scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
 
 
-def timed(work: Callable[[], T]) -> tuple[float, T]:
+def time_work(work: Callable[[], T]) -> tuple[float, T]:
     """The processor seconds of some work, and its result."""
     begun = backend.work_s()
     result = work()

@@ -13,7 +13,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.renderer.tools.importing.proposal.room import Room
-from photonfarm.renderer.tools.importing.proposal.surfaces import Labels, Pieces, Points, Surfaces, bounds, numbered
+from photonfarm.renderer.tools.importing.proposal.surfaces import (
+    Labels,
+    Pieces,
+    Points,
+    Surfaces,
+    bounds,
+    number_components,
+)
 
 # Shares of the room's height, where nothing else is said.
 CELL = 1 / 150  # surfaces touch up to this distance: 1.8 cm in a room of 2.7 m
@@ -114,9 +121,9 @@ class _Search:
         pieces, glows = self.pieces, self.surfaces.emits[self.pieces.shape]
         why = np.where(glows, self._why_fixed(), MOVES)
         loose = np.where(glows, why == MOVES, ~self._is_shell()) & (not self.room.is_stage)
-        group = self._grouped(loose, glows)
-        things, lit = [], self._at_lights(group)
-        for number, built_in in enumerate(self._built_in(group)):
+        group = self._group(loose, glows)
+        things, lit = [], self._beside_lights(group)
+        for number, built_in in enumerate(self._find_built_in(group)):
             thing = self._thing(np.flatnonzero(group == number), bool(built_in))
             if isinstance(thing, Thing) and not lit[number]:
                 things.append(thing)
@@ -129,10 +136,10 @@ class _Search:
                 why[thing.pieces] = MANY
         stays: dict[str, list[str]] = {}
         told = np.flatnonzero(glows | (why == AT_LIGHT))
-        for name, reason in {self._called(pieces.shape[one]): why[one] for one in told}.items():
+        for name, reason in {self._name_of(pieces.shape[one]): why[one] for one in told}.items():
             if reason != MOVES:
                 stays.setdefault(str(reason), []).append(name)
-        return Found(self.room, pieces, _named_apart(kept), stays)
+        return Found(self.room, pieces, _name_apart(kept), stays)
 
     def _in_walls(self, gap: float) -> NDArray[np.bool_]:
         """Which pieces have their middle close to a wall or beyond it, and are no farther from it than a gap, (N,)."""
@@ -149,7 +156,12 @@ class _Search:
         wide = (size[:, :2].prod(axis=1) > HUGE * room.size[:2].prod()) & (size[:, 2] < 0.5 * room.height)
         above = (pieces.high[:, 2] > room.high[2] + PLANE * room.height) & room.has_ceiling
         apart = np.maximum(pieces.low - room.high, room.low - pieces.high) > BEHIND * room.size
-        cases = {LARGE: wide, OUTSIDE: apart[:, :2].any(axis=1), IN_WALL: self._in_walls(np.inf), IN_CEILING: above}
+        cases = {
+            LARGE: wide,
+            OUTSIDE: apart[:, :2].any(axis=1),
+            IN_WALL: self._in_walls(np.inf),
+            IN_CEILING: above,
+        }
         if room.is_stage:
             cases = {NO_ROOM: np.ones(len(size), np.bool_)}
         return np.select([*cases.values()], [*cases], MOVES).astype(object)
@@ -159,7 +171,7 @@ class _Search:
         volume = np.maximum(thing.size, 0.02 * self.room.height).prod()
         return -float(f"{volume:.3g}"), int(self.pieces.shape[thing.pieces].min())
 
-    def _called(self, shape: int) -> str:
+    def _name_of(self, shape: int) -> str:
         return self.names[shape] or self.surfaces.ids[shape]
 
     def _is_shell(self) -> NDArray[np.bool_]:
@@ -189,11 +201,11 @@ class _Search:
         """The number of each piece's object, (N,)."""
         return np.unique(self.names, return_inverse=True)[1][self.pieces.shape]
 
-    def _grouped(self, loose: NDArray[np.bool_], glows: NDArray[np.bool_]) -> Labels:
+    def _group(self, loose: NDArray[np.bool_], glows: NDArray[np.bool_]) -> Labels:
         """The groups of loose pieces, −1 for others, (N,)."""
         group = self.pieces.touching(CELL * self.room.height, loose, self._owner())
-        group = _merged(group, self._touching(group))
-        return _merged(group, self._floating(group, glows))
+        group = _merge(group, self._touching(group))
+        return _merge(group, self._floating(group, glows))
 
     def _touching(self, group: Labels) -> Labels:
         """Pairs of groups that touch, unless both stand for themselves."""
@@ -219,14 +231,14 @@ class _Search:
                 joined.append((number, others[int(np.argmin(distance))]))
         return np.array(joined, np.int64).reshape(-1, 2)
 
-    def _at_lights(self, group: Labels) -> NDArray[np.bool_]:
+    def _beside_lights(self, group: Labels) -> NDArray[np.bool_]:
         """Which groups are around a light without a shape or, where none is, nearest to it and near, (T,)."""
         light = self.surfaces.lights[:, None]
         distance = _distance(*self._bounds(group), light, light)
         nearest = distance.min(axis=1, initial=FLOATS * self.room.height, keepdims=True)
         return np.asarray((distance <= nearest).any(axis=0))
 
-    def _built_in(self, group: Labels) -> NDArray[np.bool_]:
+    def _find_built_in(self, group: Labels) -> NDArray[np.bool_]:
         """Which groups share much of their surface with the room, above the floor, or reach into its walls, (T,)."""
         room, (low, high) = self.room, self._bounds(group)
         cells = self.pieces.contacts(CELL * room.height, group, room.floor + 2 * STANDS * room.height)
@@ -300,11 +312,11 @@ class _Search:
         """The object or shape that has most of its area; names of furniture before others, and then of lamps."""
         area: dict[str, float] = {}
         for piece in members:
-            name = self._called(self.pieces.shape[piece])
+            name = self._name_of(self.pieces.shape[piece])
             area[name] = area.get(name, 0.0) + float(self.pieces.area[piece])
         ordered = sorted(area, key=lambda name: -area[name])
         counting = [name for name in ordered if area[name] > NAMING_SHARE * sum(area.values())]
-        shining = {self._called(shape) for shape in self.pieces.shape[members] if self.surfaces.emits[shape]}
+        shining = {self._name_of(shape) for shape in self.pieces.shape[members] if self.surfaces.emits[shape]}
         wishes = [name for name in counting if is_furniture(name)] + [name for name in ordered if name in shining]
         return group_name([*wishes, ordered[0]][0])
 
@@ -315,14 +327,14 @@ def _distance(low: Points, high: Points, from_low: Points, from_high: Points) ->
     return np.asarray(np.linalg.norm(gap, axis=-1))
 
 
-def _merged(group: Labels, pairs: Labels) -> Labels:
+def _merge(group: Labels, pairs: Labels) -> Labels:
     """Groups (N,) renumbered, those of a pair as one."""
     count = int(group.max(initial=-1)) + 1
-    number = numbered(pairs, count, np.ones(count, np.bool_)) if count else group
+    number = number_components(pairs, count, np.ones(count, np.bool_)) if count else group
     return np.where(group >= 0, number[group], -1)
 
 
-def _named_apart(things: list[Thing]) -> list[Thing]:
+def _name_apart(things: list[Thing]) -> list[Thing]:
     """The same with distinct names."""
     own, taken, made = {thing.name for thing in things}, {"ceiling-light"}, []
     for thing in things:

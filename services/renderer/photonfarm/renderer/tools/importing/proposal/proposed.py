@@ -58,17 +58,17 @@ class FloorPlan:
         chosen = fixed_pieces[pieces.sample_piece]
         return cls(room, pieces.sample[chosen], pieces.sample_flat[chosen], lights, cell, (a, b))
 
-    def _marked(self, points: Points) -> Mask:
+    def _mark(self, points: Points) -> Mask:
         place = np.floor((points[:, :2] - self.room.low[:2]) / self.cell).astype(np.int64)
         inside = ((place >= 0) & (place < self.shape)).all(axis=1)
         mask: Mask = np.zeros(self.shape, np.bool_)
         mask[tuple(place[inside].T)] = True
         return mask
 
-    def met(self, points: Points, half: Points) -> Mask:
+    def blocks(self, points: Points, half: Points) -> Mask:
         """Where a box of half-lengths `half` (2,), by its middle, holds one of the points, or leaves the room."""
         size = 2 * np.ceil(half / self.cell).astype(int) + 1
-        return np.asarray(ndimage.maximum_filter(self._marked(points), size=tuple(size), mode="constant", cval=1))
+        return np.asarray(ndimage.maximum_filter(self._mark(points), size=tuple(size), mode="constant", cval=1))
 
     def free(self, bottom: float, top: float, half: Points, level: float) -> Mask:
         """Where the middle of a box of half-lengths `half` (2,) may be: at a floor or ceiling, and nothing in its way.
@@ -76,8 +76,8 @@ class FloorPlan:
         `level` is the height of that, which may have small gaps, and does not count if there is next to none.
         """
         height = self.fixed[:, 2]
-        blocked = self.met(self.fixed[(height > bottom) & (height < top)], half)
-        there = self._marked(self.fixed[self.flat & (np.abs(height - level) < NEAR_FLOOR * self.room.height)])
+        blocked = self.blocks(self.fixed[(height > bottom) & (height < top)], half)
+        there = self._mark(self.fixed[self.flat & (np.abs(height - level) < NEAR_FLOOR * self.room.height)])
         there |= ndimage.binary_closing(there, iterations=2, border_value=0)
         free: Mask = ~blocked & (there | (there.mean() <= 0.05))
         return free
@@ -234,7 +234,7 @@ def _place(
         bottom = min(bottom, top - clear)
     else:
         bottom += clear
-    free = plan.free(bottom, top, size / 2, room.high[2] if hangs else room.floor) & ~plan.met(lights, size / 2)
+    free = plan.free(bottom, top, size / 2, room.high[2] if hangs else room.floor) & ~plan.blocks(lights, size / 2)
     return plan.box_around(free, middle, RANGE * room.size[:2])
 
 
@@ -251,14 +251,14 @@ def _origin(plan: FloorPlan, scene: Any, frame: Frame) -> Box:
     room = plan.room
     low, high = (room.floor + share * room.height for share in EYES)
     clear = plan.free(low, high, np.full(2, MARGIN * float(room.size[:2].min())), room.floor)
-    wishes = [clear & _open(plan, scene, frame, (low, high)), clear, np.ones_like(clear)]
+    wishes = [clear & _find_open(plan, scene, frame, (low, high)), clear, np.ones_like(clear)]
     free = next(wish for wish in wishes if wish.any())
     found = plan.box_around(free, plan.widest_place(free), room.size[:2])
     first, last = found or (room.low[:2], room.high[:2])
     return Box(np.array([*first, low]), np.array([*last, high]))
 
 
-def _open(plan: FloorPlan, scene: Any, frame: Frame, heights: tuple[float, ...]) -> Mask:
+def _find_open(plan: FloorPlan, scene: Any, frame: Frame, heights: tuple[float, ...]) -> Mask:
     """Where cameras stand in the open at all heights: inside no solid, not outside, and not behind something."""
     found, room = np.ones(plan.shape, np.bool_), plan.room
     for height in heights:

@@ -73,7 +73,7 @@ def find_room(
     rng, main, around = np.random.default_rng(0), surfaces.main(), outdoors(scene, surfaces, frame)
     if camera is not None:
         outside = ((camera < main.low) | (camera > main.high)).any()
-        camera = None if outside or _in_solid(scene, frame, camera[None])[0] else camera
+        camera = None if outside or _find_in_solid(scene, frame, camera[None])[0] else camera
     within = around.subject or main
     viewpoints = _best_viewpoint(scene, frame, within, rng, others) if camera is None else camera[None]
     if not len(viewpoints):
@@ -116,7 +116,7 @@ def outdoors(scene: Any, surfaces: Surfaces, frame: Frame) -> Room:
     return Room(low, high, has_ceiling=False, subject=Box(np.array([*first[:2], floor]), last))
 
 
-def _in_solid(scene: Any, frame: Frame, points: Points) -> NDArray[np.bool_]:
+def _find_in_solid(scene: Any, frame: Frame, points: Points) -> NDArray[np.bool_]:
     """Which points (N, 3) are in a solid, (N,)."""
     return np.asarray(surroundings(scene, frame.world(points).astype(np.float32)).solid != NONE)
 
@@ -132,7 +132,7 @@ def _best_viewpoint(
     distance, back = (values.reshape(len(grid), -1) for values in (hits.distance, hits.is_back))
     met = np.isfinite(distance)
     enclosed = met.mean(axis=1)
-    solid = _in_solid(scene, frame, grid)
+    solid = _find_in_solid(scene, frame, grid)
     enclosed[solid & ((back & met).sum(axis=1) > PART * met.sum(axis=1))] = -1
     for room in others:
         enclosed[((grid > room.low) & (grid < room.high)).all(axis=1)] = -1

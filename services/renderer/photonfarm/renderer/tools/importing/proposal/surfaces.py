@@ -146,7 +146,7 @@ class Pieces:
     @classmethod
     def of(cls, surfaces: Surfaces, cell: float, widest: float) -> Self:
         """The pieces of all shapes, with points about half a cell apart, or more on faces above `widest`²."""
-        label = _connected(surfaces)
+        label = _connect(surfaces)
         count = int(label.max()) + 1
         low, high = bounds(label, count, surfaces.corners.min(axis=1), surfaces.corners.max(axis=1))
         shape = np.zeros(count, np.int64)
@@ -165,7 +165,7 @@ class Pieces:
         chosen = among[self.sample_piece]
         piece = self.sample_piece[chosen]
         cells = len(among) + _cells(self.sample[chosen], cell, owner[piece])
-        return numbered(np.column_stack([np.tile(piece, 2), cells]), len(among), among)
+        return number_components(np.column_stack([np.tile(piece, 2), cells]), len(among), among)
 
     def contacts(self, cell: float, group: Labels, above: float = -np.inf) -> Any:
         """In how many cells `above` a height groups (N,) meet, and each is: a sparse matrix (T + 1, T + 1).
@@ -184,11 +184,11 @@ class Pieces:
 def _cells(position: Points, size: float, owner: Labels) -> Labels:
     """The numbers of the cells that points (M, 3) of owners (M,) are in, of one grid and then of another, (2 M,)."""
     shifted = np.concatenate([position / size, position / size + 0.5])
-    key = _hashed([*np.floor(shifted).astype(np.int64).T, np.tile(owner, 2), np.repeat([0, 1], len(owner))])
+    key = _hash_rows([*np.floor(shifted).astype(np.int64).T, np.tile(owner, 2), np.repeat([0, 1], len(owner))])
     return np.unique(key, return_inverse=True)[1]
 
 
-def numbered(pairs: Labels, count: int, among: NDArray[np.bool_]) -> Labels:
+def number_components(pairs: Labels, count: int, among: NDArray[np.bool_]) -> Labels:
     """Consecutive numbers (count,) of what pairs (K, 2) connect; −1 for what is not `among` what counts.
 
     Pairs may name others, from `count` on, which connect as well.
@@ -201,18 +201,18 @@ def numbered(pairs: Labels, count: int, among: NDArray[np.bool_]) -> Labels:
     return made
 
 
-def _connected(surfaces: Surfaces) -> Labels:
+def _connect(surfaces: Surfaces) -> Labels:
     """The connected piece of each face; corners in one place are one corner."""
     corners, count = surfaces.corners.reshape(-1, 3), len(surfaces.shape)
     extent = float(np.ptp(corners, axis=0).max()) or 1.0
     place = np.round(corners / (1e-6 * extent)).astype(np.int64)
-    key = _hashed([*place.T, np.repeat(surfaces.shape.astype(np.int64), 3)])
+    key = _hash_rows([*place.T, np.repeat(surfaces.shape.astype(np.int64), 3)])
     corner = np.unique(key, return_inverse=True)[1]
     pairs = np.column_stack([np.repeat(np.arange(count), 3), count + corner])
-    return numbered(pairs, count, np.ones(count, np.bool_))
+    return number_components(pairs, count, np.ones(count, np.bool_))
 
 
-def _hashed(columns: list[Labels]) -> Labels:
+def _hash_rows(columns: list[Labels]) -> Labels:
     """One number for each row of whole numbers; different rows have the same one with a chance of 2⁻⁶⁴."""
     mixed = np.zeros(len(columns[0]), np.uint64)
     for column in columns:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
-from photonfarm.renderer.tools.importing.changes import listed
+from photonfarm.renderer.tools.importing.changes import name_some
 from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 BLENDER = (".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
@@ -24,7 +24,7 @@ def reader_of(path: Path) -> Reader:
     """The reader of a file, by its ending; raises SpecError for an unknown one, and for no file or an empty one."""
     if path.is_dir():
         there = sorted(each.name for each in path.iterdir() if each.suffix.lower() in _READERS)
-        remedy = f"; name the scene's file in it: {listed(there)}" if there else ", and holds no scene"
+        remedy = f"; name the scene's file in it: {name_some(there)}" if there else ", and holds no scene"
         raise SpecError(f"{path}: is a folder{remedy}")
     suffix = path.suffix.lower()
     if suffix not in _READERS:

@@ -185,13 +185,13 @@ def _lamp(drawn: Any, matrix: list[list[float]]) -> dict[str, Any]:
         say("light", "light_linking", "it lights all", place)
     power = data.energy * 2.0**data.exposure
     tint = data.temperature_color if data.use_temperature else (1, 1, 1)
-    factor = _of_nodes(data.node_tree, place) if data.use_nodes else (1, 1, 1)
+    factor = _colour_of_nodes(data.node_tree, place) if data.use_nodes else (1, 1, 1)
     strength = [power * a * b * c for a, b, c in zip(data.color, tint, factor, strict=True)]
     numbers = {key: getattr(data, key) for key in _OF_LAMPS if hasattr(data, key)}
     return {"name": name, "kind": data.type, "matrix": matrix, "strength": strength, **numbers}
 
 
-def _of_nodes(tree: Any, place: str) -> list[float]:
+def _colour_of_nodes(tree: Any, place: str) -> list[float]:
     """The colour that a lamp's nodes multiply its own by, without what varies."""
     output = tree.get_output_node("CYCLES") if tree else None
     shader = source(output.inputs["Surface"]) if output else None

@@ -52,7 +52,7 @@ class Lamps:
 
     def put_sky(self, sky: Sky) -> None:
         """Surround the scene by a radiance, or by an image of all directions with Blender's +y in the middle; last."""
-        sky = self._with_discs(sky) if self._discs else sky
+        sky = self._draw_discs(sky) if self._discs else sky
         if isinstance(sky, str):
             image = self._emitter("envmap", "sky")
             elements.put_value(image, "filename", sky)
@@ -60,9 +60,9 @@ class Lamps:
         elif max(sky) > 0:
             elements.put_value(self._emitter("constant", "sky"), "radiance", sky)
 
-    def _with_discs(self, sky: Sky) -> str:
+    def _draw_discs(self, sky: Sky) -> str:
         """An image of a sky with the discs of suns, each with its irradiance."""
-        light = images.decoded(Path(sky).read_bytes(), sky, raw=True)[..., :3] if isinstance(sky, str) else sky
+        light = images.decode(Path(sky).read_bytes(), sky, raw=True)[..., :3] if isinstance(sky, str) else sky
         height, width = 1024, 2048
         values = np.broadcast_to(light, (height, width, 3)).astype(np.float64)
         down = (np.arange(height) + 0.5)[:, None] * math.pi / height

@@ -45,7 +45,7 @@ def prepare(material: Any, lose: Lose) -> None:
     node = source(output.inputs["Surface"])
     if node is None and has_volume:  # which has no surface
         node = tree.nodes.new("ShaderNodeBsdfTransparent")
-    surface = _principled(tree, node, lose)
+    surface = _make_principled(tree, node, lose)
     tree.links.new(surface.outputs[0], output.inputs["Surface"])
     for part in surface.inputs:
         unfit = _unfit(part)
@@ -68,13 +68,13 @@ def source(part: Any) -> Any:
     return part.links[0].from_node if part.is_linked else None
 
 
-def _principled(tree: Any, node: Any, lose: Lose) -> Any:
+def _make_principled(tree: Any, node: Any, lose: Lose) -> Any:
     """The Principled BSDF that does what a shader does, as far as one can."""
     kind = node.type if node else ""
     if kind == "BSDF_PRINCIPLED":
         return node
     if kind in ("MIX_SHADER", "ADD_SHADER"):
-        return _mixed(tree, node, lose)
+        return _mix(tree, node, lose)
     if kind not in _SHADERS:
         lose("colour", node.bl_label, "became diffuse; bake it to images to keep it")
     takes, values = _SHADERS.get(kind, _SHADERS["BSDF_DIFFUSE"])
@@ -91,7 +91,7 @@ def _principled(tree: Any, node: Any, lose: Lose) -> Any:
     return made
 
 
-def _mixed(tree: Any, node: Any, lose: Lose) -> Any:
+def _mix(tree: Any, node: Any, lose: Lose) -> Any:
     """One shader for two: opacity for one that is transparent, the light of one that emits; else the heavier."""
     pair = [source(part) for part in list(node.inputs)[-2:]]
     kinds = [part.type if part else "" for part in pair]
@@ -101,8 +101,8 @@ def _mixed(tree: Any, node: Any, lose: Lose) -> Any:
     if place < 0 or (place == 1 and not adds and share.is_linked):
         effect = "light" if "EMISSION" in kinds else "colour"
         lose(effect, node.bl_label, "only the heavier of its two shaders is carried over")
-        return _principled(tree, pair[not adds and share.default_value > 0.5], lose)
-    made = _principled(tree, pair[1 - place], lose)
+        return _make_principled(tree, pair[not adds and share.default_value > 0.5], lose)
+    made = _make_principled(tree, pair[1 - place], lose)
     if adds:
         if made.inputs["Emission Strength"].default_value > 0 or made.inputs["Emission Strength"].is_linked:
             lose("light", node.bl_label, "only one of its two lights is carried over")

@@ -25,7 +25,7 @@ from photonfarm.renderer.tools.importing.readers.gltf_file import (
     GltfFile,
     Node,
     extension,
-    normalised,
+    normalise,
     numbers,
 )
 from photonfarm.renderer.tools.importing.readers.gltf_materials import Look, Materials, Textures
@@ -161,7 +161,7 @@ class _Reader:
                         yield self.scene.ids.make(called), owner, part, look
 
     def _put_piece(self, made: str, owner: str, mesh: Mesh, look: Look) -> None:
-        material = self.materials.made(look)
+        material = self.materials.make(look)
         if material is None:
             self.scene.changes.note("what is wholly transparent is left out", f"node {made!r}", name="alphaMode")
         else:
@@ -201,14 +201,14 @@ class _Reader:
         values = {name: self._attribute(attributes[name], name, position["count"]) for name in known}
         mesh = Mesh(values["POSITION"], self._faces(primitive, mode, position["count"]), values.get("NORMAL"))
         mesh = replace(mesh, uv=self._uv(values, material, place))
-        piece = self._coloured(mesh, values.get("COLOR_0"), material, place)
-        return self._placed(piece, values.get("TANGENT"), matrix, place)
+        piece = self._colour(mesh, values.get("COLOR_0"), material, place)
+        return self._place(piece, values.get("TANGENT"), matrix, place)
 
     def _attribute(self, number: int, name: str, count: int) -> Floats:
         """An attribute (V, width)."""
         values = self.file.attribute(number, name, count, _WIDTHS[name.split("_")[0]])
         if name.startswith("COLOR"):
-            values = normalised(values)  # integers mean nothing else here, whether they say so or not
+            values = normalise(values)  # integers mean nothing else here, whether they say so or not
         return values.astype(np.float64)
 
     def _faces(self, primitive: Node, mode: int, vertices: int) -> NDArray[np.uint32]:
@@ -239,7 +239,7 @@ class _Reader:
         self.materials.extend(material, values[first])
         return values[first]
 
-    def _coloured(self, mesh: Mesh, colours: Floats | None, number: int | None, place: str) -> _Piece:
+    def _colour(self, mesh: Mesh, colours: Floats | None, number: int | None, place: str) -> _Piece:
         """A mesh with its colours of vertices, if they differ, or a material with their one colour."""
         if colours is None or not len(mesh.faces):
             if number is not None:
@@ -261,9 +261,9 @@ class _Reader:
         painted = {"vertex_color": (colours[:, :3] * factor[:3]).clip(0, 1)}
         return replace(mesh, attributes=painted), look._replace(painted=True)
 
-    def _placed(self, piece: _Piece, tangents: Floats | None, matrix: Floats, place: str) -> list[_Piece]:
+    def _place(self, piece: _Piece, tangents: Floats | None, matrix: Floats, place: str) -> list[_Piece]:
         """A mesh in the world; where its images are mirrored, its normal map is."""
-        mesh, look = piece[0].moved(matrix), piece[1]
+        mesh, look = piece[0].transform(matrix), piece[1]
         if mesh.uv is None or "normalTexture" not in self.materials.entry(look.number):
             return [(mesh, look)]
         along, areas = _images(mesh, mesh.uv)

@@ -65,7 +65,7 @@ class GltfFile:
         self.path, self.changes = path, changes
         self._buffers: dict[int, bytes] = {}
         with self.at():
-            self.document, self._binary = _opened(path)
+            self.document, self._binary = _open(path)
             version = str(self.document.get("asset", {}).get("version", "unknown"))
             if not version.startswith("2."):
                 raise SpecError(f"is glTF of version {version!r}; only version 2 is read")
@@ -151,12 +151,12 @@ class GltfFile:
         accessor = self.entry("accessors", number)
         self.report(accessor, "geometry", f"accessor {number}")
         width, kind = _WIDTHS[accessor["type"]], np.dtype(_TYPES[accessor["componentType"]])
-        values = self._strided(accessor, kind, accessor["count"], width)
+        values = self._read_strided(accessor, kind, accessor["count"], width)
         if "sparse" in accessor:
             count, where, what = (accessor["sparse"][key] for key in ("count", "indices", "values"))
-            rows = self._strided(where, np.dtype(_TYPES[where["componentType"]]), count, 1)
-            values[rows[:, 0]] = self._strided(what, kind, count, width)
-        return normalised(values) if accessor.get("normalized") else values
+            rows = self._read_strided(where, np.dtype(_TYPES[where["componentType"]]), count, 1)
+            values[rows[:, 0]] = self._read_strided(what, kind, count, width)
+        return normalise(values) if accessor.get("normalized") else values
 
     def attribute(self, number: int, name: str, count: int, widths: Collection[int]) -> NDArray[Any]:
         """The values of an accessor (count, width) that is an attribute, whose width is one of some."""
@@ -168,7 +168,7 @@ class GltfFile:
             raise SpecError(f"{name} has {values.shape[1]} numbers a value; glTF has {allowed}")
         return values
 
-    def _strided(self, entry: Node, kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
+    def _read_strided(self, entry: Node, kind: np.dtype[Any], count: int, width: int) -> NDArray[Any]:
         """Values in a buffer view (count, width); zeros without one."""
         if "bufferView" not in entry:
             return np.zeros((count, width), kind)
@@ -207,7 +207,7 @@ def numbers(entry: Node, key: str, default: Sequence[float]) -> Floats:
     return values.astype(np.float64)
 
 
-def normalised(values: NDArray[Any]) -> NDArray[np.float64]:
+def normalise(values: NDArray[Any]) -> NDArray[np.float64]:
     """Integers as fractions of the largest one of their kind; floats as they are."""
     if values.dtype.kind == "f":
         return values.astype(np.float64)
@@ -219,7 +219,7 @@ def _unknown(names: Collection[str]) -> list[str]:
     return [name for name in names if name not in _READ and not name.startswith(_HARMLESS)]
 
 
-def _opened(path: Path) -> tuple[dict[str, Any], bytes]:
+def _open(path: Path) -> tuple[dict[str, Any], bytes]:
     """The document of a file, and its binary chunk, which follows the document's in GLB."""
     data = path.read_bytes()
     text, binary = data, b""

@@ -81,7 +81,7 @@ class Textures:
             if data is None:
                 return None
             what = f"{self.file.path}: image {source} ({name})"
-            self._last = {(source, colour): images.decoded(data, what, raw=not colour)}
+            self._last = {(source, colour): images.decode(data, what, raw=not colour)}
         return self._last[source, colour]
 
     def _lie(self, found: Node) -> Lie:
@@ -115,7 +115,7 @@ class Materials:
     _made: dict[Look, tuple[str, Element | None] | None] = field(default_factory=dict)
     _reach: dict[int | None, Floats] = field(default_factory=dict)
 
-    def made(self, look: Look) -> tuple[str, Element | None] | None:
+    def make(self, look: Look) -> tuple[str, Element | None] | None:
         """A material's id in the Mitsuba scene, and the emitter of what shines with it; None if it cannot be seen."""
         if look not in self._made:
             self._made[look] = self._make(look)
@@ -227,14 +227,14 @@ class Materials:
             writer.lose("clearcoatNormalTexture", "the coat has the normals of what is under it")
         gloss = parts["clearcoat_gloss"]  # whose α is 0.1 without gloss, and 0.001 with all
         parts["clearcoat_gloss"] = replace(gloss, values=((0.1 - gloss.values**2) / 0.099).clip(0, 1))
-        return parts | (self._converted(colour, entry[_OLD], writer) if _OLD in entry else {})
+        return parts | (self._convert(colour, entry[_OLD], writer) if _OLD in entry else {})
 
-    def _converted(self, colour: Map, old: Node, writer: Writer) -> dict[str, Map]:
+    def _convert(self, colour: Map, old: Node, writer: Writer) -> dict[str, Map]:
         """The properties of `principled` for specular-glossiness, texel by texel."""
         factor = (*numbers(old, "specularFactor", _WHITE[:3]), old.get("glossinessFactor", 1.0))
         specular = self.textures.map(old.get("specularGlossinessTexture"), factor, _RGBA, colour=True)
-        diffuse, gloss, lie = writer.joined(colour, specular, "colour", _OLD)
-        base, metal = from_specular_glossiness(diffuse[..., _RGB], gloss[..., _RGB])
+        diffuse, gloss, lie = writer.join(colour, specular, "colour", _OLD)
+        base, metal = convert_specular_glossiness(diffuse[..., _RGB], gloss[..., _RGB])
         writer.note("becomes metal and roughness by Khronos' formulas", _OLD)
         rough = replace(specular, values=1 - specular.values[..., _ALPHA])
         return {"base_color": Map(base, lie), "roughness": rough, "metallic": Map(metal, lie)}
@@ -263,7 +263,7 @@ def _eta(entry: Node, passes: bool, writer: Writer) -> Map:
     return constant(max(float(ior) if passes else eta, _DULLEST))
 
 
-def from_specular_glossiness(diffuse: images.Image, specular: images.Image) -> tuple[images.Image, images.Image]:
+def convert_specular_glossiness(diffuse: images.Image, specular: images.Image) -> tuple[images.Image, images.Image]:
     """Base colour (H, W, 3) and metal (H, W, 1), by the formulas in the appendix of the extension."""
     bright_diffuse, bright = (np.sqrt(c**2 @ np.array([[0.299], [0.587], [0.114]])) for c in (diffuse, specular))
     left = (1 - specular.max(axis=-1, keepdims=True)) / (1 - _F0)

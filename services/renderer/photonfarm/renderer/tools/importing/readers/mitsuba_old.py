@@ -17,7 +17,7 @@ import numpy as np
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import elements, images
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
-from photonfarm.renderer.tools.importing.readers.mitsuba_spectra import numbers_of, of_old, put
+from photonfarm.renderer.tools.importing.readers.mitsuba_spectra import numbers_of, put, read_old
 
 _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
@@ -86,7 +86,7 @@ class Upgrade:
             part.set("up", _any_up(*(numbers_of(part.get(key, "")) for key in ("origin", "target"))))
         elif name == "ext_eta" and part.get("value") in ("air", "vacuum", "1", "1.0"):
             node.remove(part)
-        elif (colour := of_old(part)) is not None:
+        elif (colour := read_old(part)) is not None:
             if node.tag == "bsdf" and re.search("reflectance|transmittance", name):
                 colour = colour / max(1.0, float(colour.max()))  # as 0.6 does, to conserve energy
             put(part, colour)
@@ -104,7 +104,7 @@ def _any_up(origin: list[float], target: list[float]) -> str:
     return elements.numbers(np.cross((z, 0, -x) if abs(x) > abs(y) else (0, z, -y), (x, y, z)).tolist())
 
 
-def _taken(node: Element, name: str, otherwise: str) -> str:
+def _take(node: Element, name: str, otherwise: str) -> str:
     """The value of a property, which is taken out."""
     found = elements.child(node, name)
     if found is None:
@@ -121,9 +121,9 @@ def value_of(node: Element, name: str) -> str:
 
 def _texture(_: Upgrade, texture: Element) -> None:
     """Scale and offset of texture coordinates, which were numbers of their own: uv · scale + offset."""
-    both = _taken(texture, "uvscale", "1")
-    scale = {axis: _taken(texture, f"{uv}scale", both) for axis, uv in zip("xy", "uv", strict=True)}
-    offset = {axis: _taken(texture, f"{uv}offset", "0") for axis, uv in zip("xy", "uv", strict=True)}
+    both = _take(texture, "uvscale", "1")
+    scale = {axis: _take(texture, f"{uv}scale", both) for axis, uv in zip("xy", "uv", strict=True)}
+    offset = {axis: _take(texture, f"{uv}offset", "0") for axis, uv in zip("xy", "uv", strict=True)}
     if {*scale.values()} != {"1"} or {*offset.values()} != {"0"}:
         SubElement(texture, "transform", name="to_uv").extend([Element("scale", scale), Element("translate", offset)])
 
@@ -133,8 +133,8 @@ def _bitmap(upgrade: Upgrade, texture: Element) -> None:
     _texture(upgrade, texture)
     name = value_of(texture, "filename")
     is_float = Path(name).suffix.lower() in (".exr", ".hdr", ".rgbe", ".pfm")
-    gamma = float(_taken(texture, "gamma", "1" if is_float else "-1"))
-    channels = _taken(texture, "channel", "rgb") if not is_float else "rgb"
+    gamma = float(_take(texture, "gamma", "1" if is_float else "-1"))
+    channels = _take(texture, "channel", "rgb") if not is_float else "rgb"
     if channels not in (*"rgba", "rgb", "rgba"):
         upgrade.lose("colour", "channel", f"{channels!r} is left out", texture)
     if gamma == 1 or channels == "a":
@@ -143,12 +143,12 @@ def _bitmap(upgrade: Upgrade, texture: Element) -> None:
         upgrade.lose("colour", "gamma", f"{gamma:g} is left out: texels are read as their file says", texture)
     elif (channels in tuple("rgba") or gamma not in (1, -1)) and (file := upgrade.find(name)):
         to = upgrade.scratch / f"{len(list(upgrade.scratch.iterdir()))}-{file.stem}.png"
-        _taken(texture, "filename", "")
-        elements.put_value(texture, "filename", str(_baked(file, gamma, channels, to)))
-    if _taken(texture, "filter_type", "ewa") == "nearest":
+        _take(texture, "filename", "")
+        elements.put_value(texture, "filename", str(_bake(file, gamma, channels, to)))
+    if _take(texture, "filter_type", "ewa") == "nearest":
         elements.put_value(texture, "filter_type", "nearest")
-    both = _taken(texture, "wrap_mode", "repeat")
-    u, v = (_taken(texture, f"wrap_mode_{axis}", both) for axis in "uv")
+    both = _take(texture, "wrap_mode", "repeat")
+    u, v = (_take(texture, f"wrap_mode_{axis}", both) for axis in "uv")
     mode = v if v in ("repeat", "mirror") else "clamp"
     if u != mode or v != mode:
         said = f"{u} and {v} became {mode}: Mitsuba 3 repeats, mirrors or clamps, both axes alike"
@@ -156,17 +156,17 @@ def _bitmap(upgrade: Upgrade, texture: Element) -> None:
     elements.put_value(texture, "wrap_mode", mode)
 
 
-def _baked(file: Path, gamma: float, channels: str, to: Path) -> Path:
+def _bake(file: Path, gamma: float, channels: str, to: Path) -> Path:
     """An image of some channels of another, with sRGB in place of another gamma."""
-    texels = images.decoded(file.read_bytes(), str(file), raw=True)
+    texels = images.decode(file.read_bytes(), str(file), raw=True)
     if gamma not in (1, -1):
-        texels[..., :3] = images.encoded(texels[..., :3] ** gamma)
+        texels[..., :3] = images.encode(texels[..., :3] ** gamma)
     return images.save(texels[..., ["rgba".index(channel) for channel in channels]], to)
 
 
-def _scaled_texture(upgrade: Upgrade, texture: Element) -> None:
+def _scale_texture(upgrade: Upgrade, texture: Element) -> None:
     """The texture that was scaled; a height's factor becomes that of its bump map."""
-    factor = np.array(numbers_of(_taken(texture, "scale", "1")))
+    factor = np.array(numbers_of(_take(texture, "scale", "1")))
     inner = next((part for part in texture if part.tag in ("texture", "ref")), None)
     if inner is None:
         raise ValueError("it has no texture to scale; put one in, or a colour in its place")
@@ -212,10 +212,10 @@ def _glossy(upgrade: Upgrade, bsdf: Element) -> None:
     for name in ("exponent", "specular_reflectance"):
         if (found := elements.child(bsdf, name)) is not None and found.tag in ("texture", "ref"):
             upgrade.lose("colour", name, "its texture became the default: a blend has numbers here", bsdf)
-    shine = np.array(numbers_of(_taken(bsdf, "specular_reflectance", "0.2")))
+    shine = np.array(numbers_of(_take(bsdf, "specular_reflectance", "0.2")))
     diffuse, metal = Element("bsdf", type="diffuse"), Element("bsdf", type="roughconductor")
     if bsdf.get("type") == "phong":
-        elements.put_value(metal, "alpha", math.sqrt(0.5 / (float(_taken(bsdf, "exponent", "30")) + 2)))
+        elements.put_value(metal, "alpha", math.sqrt(0.5 / (float(_take(bsdf, "exponent", "30")) + 2)))
     else:
         metal.extend(part for part in bsdf if part.get("name") in ("alpha_u", "alpha_v"))  # 0.1 by default in both
     stated = elements.child(bsdf, "diffuse_reflectance")
@@ -246,7 +246,7 @@ def _mixture(_: Upgrade, bsdf: Element) -> None:
     """A blend, where all of two materials is mixed; Mitsuba 3 has no other mixture."""
     weights = numbers_of(value_of(bsdf, "weights"))
     if len(weights) == 2 and math.isclose(sum(weights), 1, abs_tol=1e-3):
-        _taken(bsdf, "weights", "")
+        _take(bsdf, "weights", "")
         bsdf.set("type", "blendbsdf")
         elements.put_value(bsdf, "weight", weights[1])
 
@@ -264,11 +264,11 @@ def _sky(upgrade: Upgrade, emitter: Element) -> None:
     Of a place and time, 0.6 has east at +X and north at −Z, and Mitsuba 3 south at +X and west at +Y.
     """
     kind = emitter.get("type", "")
-    scale = _taken(emitter, "scale", "1")
+    scale = _take(emitter, "scale", "1")
     for part in ("sun", "sky"):
-        own = _taken(emitter, f"{part}_scale", scale)
+        own = _take(emitter, f"{part}_scale", scale)
         elements.put_value(emitter, f"{part}_scale", float(own) if part in kind else 0.0)
-    elements.put_value(emitter, "sun_aperture", 0.5358 * (float(_taken(emitter, "sun_radius_scale", "1")) or 0.02))
+    elements.put_value(emitter, "sun_aperture", 0.5358 * (float(_take(emitter, "sun_radius_scale", "1")) or 0.02))
     if (placed := elements.child(emitter, "to_world")) is None:
         placed = SubElement(emitter, "transform", name="to_world")
     of_place = Element("matrix", value="0 -1 0 0 0 1 1 0 0")
@@ -280,7 +280,7 @@ def _sky(upgrade: Upgrade, emitter: Element) -> None:
 
 
 _UPGRADES: dict[str, Callable[[Upgrade, Element], None]] = {
-    "bitmap": _bitmap, "checkerboard": _texture, "scale": _scaled_texture, "obj": _obj,
+    "bitmap": _bitmap, "checkerboard": _texture, "scale": _scale_texture, "obj": _obj,
     "conductor": _conductor, "roughconductor": _conductor, "phong": _glossy, "ward": _glossy, "mask": _mask,
     "mixturebsdf": _mixture, "normalmap": _normalmap, "sky": _sky, "sun": _sky, "sunsky": _sky,
 }  # fmt: skip

@@ -13,7 +13,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
 from photonfarm.renderer.tools.importing.imported import Ids
-from photonfarm.renderer.tools.importing.meshes import Floats, of_shape, write_ply
+from photonfarm.renderer.tools.importing.meshes import Floats, read_mesh, write_ply
 from photonfarm.renderer.tools.importing.readers import mitsuba_spectra
 from photonfarm.scene.files import POLARISED, SHAPES
 
@@ -125,7 +125,7 @@ def _replace(bsdf: Element) -> str:
     bsdf[:] = []
     if under:  # a blend of it with itself, as there may be an id for the material as a whole
         bsdf.set("type", "blendbsdf")
-        bsdf.extend([under[0], elements.copied(under[0])])
+        bsdf.extend([under[0], elements.copy_element(under[0])])
         elements.put_value(bsdf, "weight", 0.0)
         return "what it is on"
     bsdf.set("type", "diffuse")
@@ -141,7 +141,7 @@ def _integrate_spectra(root: Element, above: dict[Element, Element]) -> None:
         for user in users or [node]:
             shines = effect_of(above[user] if users else node, above) == "light"
             try:
-                colour = mitsuba_spectra.of_new(node, shines=shines)
+                colour = mitsuba_spectra.read_new(node, shines=shines)
             except ValueError as error:
                 raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
             if colour is not None:
@@ -155,13 +155,13 @@ def expand(root: Element, changes: Changes, scratch: Path) -> None:
     groups = {group.get("id"): group for group in root.findall("shape[@type='shapegroup']")}
     copies: dict[Element, list[Element]] = {}
     ids, made = Ids(root), 0
-    mirrored = cache(partial(_mirrored, scratch=scratch))
+    mirrored = cache(partial(_mirror, scratch=scratch))
     for number, instance in enumerate(root.findall("shape[@type='instance']"), 1):
         ref, placed = instance.find("ref"), elements.child(instance, "to_world")
         group = instance.find("shape") if ref is None else groups.get(ref.get("id"))
         matrix = _IDENTITY if placed is None else np.array(placed[0].get("value", "").split(), np.float64)
         shapes = [] if group is None or made >= MOST else group.findall("shape")
-        copies[instance] = [_placed(shape, matrix.reshape(4, 4), mirrored, changes) for shape in shapes]
+        copies[instance] = [_place(shape, matrix.reshape(4, 4), mirrored, changes) for shape in shapes]
         for shape, copy in zip(shapes, copies[instance], strict=True):
             name = shape.get("id") or (ref is not None and ref.get("id")) or "instance"
             copy.set("id", ids.make(f"{name}_{number}"))
@@ -174,7 +174,7 @@ def expand(root: Element, changes: Changes, scratch: Path) -> None:
         changes.lose("geometry", "instance", meaning)
 
 
-def _placed(shape: Element, matrix: Floats, mirrored: Callable[[Element], Element], changes: Changes) -> Element:
+def _place(shape: Element, matrix: Floats, mirrored: Callable[[Element], Element], changes: Changes) -> Element:
     """A copy of a shape, moved by the matrix of an instance; its front stays its front, as in Mitsuba's instances."""
     kind, is_mirrored = shape.get("type", ""), np.linalg.det(matrix[:3, :3]) < 0
     square = matrix[:3, :3].T @ matrix[:3, :3]
@@ -183,7 +183,7 @@ def _placed(shape: Element, matrix: Floats, mirrored: Callable[[Element], Elemen
         changes.lose("geometry", kind, meaning, elements.place(shape))
     if is_mirrored and kind in _MESHES:
         shape, matrix = mirrored(shape), matrix @ _MIRROR
-    copy = elements.copied(shape)
+    copy = elements.copy_element(shape)
     if (own := elements.child(copy, "to_world")) is None:
         own = SubElement(copy, "transform", name="to_world")
     SubElement(own, "matrix", value=" ".join(map(repr, matrix.ravel().tolist())))
@@ -194,11 +194,11 @@ def _placed(shape: Element, matrix: Floats, mirrored: Callable[[Element], Elemen
     return copy
 
 
-def _mirrored(shape: Element, scratch: Path) -> Element:
+def _mirror(shape: Element, scratch: Path) -> Element:
     """A mesh as a mirror at x = 0 shows it, with its fronts; one that Mitsuba refuses stays, and is told later."""
     import mitsuba as mi
 
-    alone = elements.copied(shape)
+    alone = elements.copy_element(shape)
     alone[:] = [part for part in alone if part.tag not in ("bsdf", "emitter", "ref")]
     alone.set("version", "3.0.0")
     config = mi.parser.ParserConfig(mi.variant())
@@ -206,12 +206,12 @@ def _mirrored(shape: Element, scratch: Path) -> Element:
     try:
         state = mi.parser.parse_string(config, elements.text(alone).replace("$", r"\$"))
         mi.parser.transform_all(config, state)
-        mesh = of_shape(mi.parser.instantiate(config, state)).moved(_MIRROR)
+        mesh = read_mesh(mi.parser.instantiate(config, state)).transform(_MIRROR)
     except RuntimeError:
         return shape
     made = Element("shape", type="ply")
     file = write_ply(mesh, scratch / f"{len(list(scratch.iterdir()))}-mirrored.ply")
     elements.put_value(made, "filename", str(file))
     elements.put_value(made, "face_normals", mesh.normals is None)
-    made.extend(elements.copied(part) for part in shape if part.tag in ("bsdf", "emitter", "ref"))
+    made.extend(elements.copy_element(part) for part in shape if part.tag in ("bsdf", "emitter", "ref"))
     return made

@@ -14,7 +14,7 @@ Colour = NDArray[np.float64]
 """Linear sRGB, (3,)."""
 
 
-def of_old(node: Element) -> Colour | None:
+def read_old(node: Element) -> Colour | None:
     """The colour of an element of Mitsuba 0.6, None for what is none; raises ValueError for numbers that are none.
 
     `rgb` is linear also in hexadecimal digits, and `srgb` is not. Spectra and black bodies are integrated against the
@@ -27,10 +27,10 @@ def of_old(node: Element) -> Colour | None:
     if node.tag == "spectrum" and node.get("filename"):
         import mitsuba as mi
 
-        return _integrated(*mi.spectrum_from_file(node.get("filename", "")))
+        return _integrate(*mi.spectrum_from_file(node.get("filename", "")))
     if node.tag == "spectrum" and ":" in text:
         samples = numbers_of(text.replace(":", " "))
-        return _integrated(samples[::2], samples[1::2])
+        return _integrate(samples[::2], samples[1::2])
     if node.tag not in ("rgb", "srgb", "xyz", "spectrum"):
         return None
     digits = re.fullmatch("#([0-9a-fA-F]{6})", text)
@@ -43,7 +43,7 @@ def of_old(node: Element) -> Colour | None:
     return images.linear(values.astype(np.float32)).astype(np.float64) if node.tag == "srgb" else values
 
 
-def of_new(texture: Element, *, shines: bool) -> Colour | None:
+def read_new(texture: Element, *, shines: bool) -> Colour | None:
     """The colour of a texture that Mitsuba 3 evaluates in its spectral modes alone, None for others."""
     values = {part.get("name", ""): part.get("value", "") for part in texture}
     kind = texture.get("type")
@@ -56,7 +56,7 @@ def of_new(texture: Element, *, shines: bool) -> Colour | None:
     at = np.linspace(*ends, len(samples)).tolist() if kind == "regular" else numbers_of(values.get("wavelengths", ""))
     if len(at) != len(samples):
         raise ValueError(f"it has {len(samples)} values and {len(at)} wavelengths")
-    return _integrated(at, samples, reflects=not shines)
+    return _integrate(at, samples, reflects=not shines)
 
 
 def put(node: Element, colour: Colour) -> None:
@@ -78,10 +78,10 @@ def _blackbody(kelvin: float) -> Colour:
     wavelengths = np.linspace(360.0, 830.0, 95)
     metres = wavelengths * 1e-9
     radiance = 1.191042972e-25 / metres**5 / np.expm1(0.01438776877 / (metres * kelvin))
-    return _integrated(wavelengths.tolist(), radiance.tolist())
+    return _integrate(wavelengths.tolist(), radiance.tolist())
 
 
-def _integrated(wavelengths: list[float], values: list[float], *, reflects: bool = False) -> Colour:
+def _integrate(wavelengths: list[float], values: list[float], *, reflects: bool = False) -> Colour:
     """The colour of light; of what reflects, as Mitsuba 3 has it: under daylight, and within 0 and 1."""
     import mitsuba as mi
 

@@ -14,7 +14,7 @@ import numpy as np
 from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing import elements
-from photonfarm.renderer.tools.importing.changes import Changes, listed
+from photonfarm.renderer.tools.importing.changes import Changes, name_some
 from photonfarm.renderer.tools.importing.imported import Ids, ImportedScene, Vector
 from photonfarm.renderer.tools.importing.readers import mitsuba_old, mitsuba_parts
 from photonfarm.renderer.tools.importing.readers.mitsuba_old import value_of
@@ -47,7 +47,7 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     log(f"reading {path.name}")
     scene = ImportedScene()
     files = _Files(mitsuba_old.Upgrade(scene.changes, scene.names, scratch))
-    scene.root = _elements(files.parsed(path), files)
+    scene.root = _elements(files.parse(path), files)
     if scene.root.tag != "scene":
         raise SpecError(f"{path}: begins with <{scene.root.tag}>; a Mitsuba scene begins with <scene>")
     scene.root.set("version", "3.0.0")
@@ -72,7 +72,7 @@ class _Files:
     originals: dict[str, Path] = field(default_factory=dict)  # of the copies
     values: dict[str, str] = field(default_factory=dict)  # of <default>, for the names of included files
 
-    def parsed(self, path: Path) -> Any:
+    def parse(self, path: Path) -> Any:
         """Mitsuba's nodes of a scene; raises SpecError, with lines of the user's files, for what it cannot read."""
         import mitsuba as mi
 
@@ -87,12 +87,12 @@ class _Files:
             mi.parser.transform_resolve(config, mi.parser.ParserState(state))  # raises for names of nothing
             return state
         except RuntimeError as error:
-            said = self._told(error).replace(f"{path}: ", "")
+            said = self._explain(error).replace(f"{path}: ", "")
             raise SpecError(f"{path}: Mitsuba cannot read it: {said}") from error
         finally:
             mi.Thread.set_file_resolver(before)
 
-    def _told(self, error: Exception) -> str:
+    def _explain(self, error: Exception) -> str:
         """What Mitsuba says, with the files and lines of the user."""
         text = re.sub(r"\[\w+\.(cpp|h):\d+\] |Error while loading ", "", " ".join(str(error).split()))
         for copy, original in self.originals.items():
@@ -115,7 +115,7 @@ class _Files:
             raise SpecError(f"{file}: is not a readable Mitsuba scene file: {error}") from error
         for node in root.iter():
             vars(node)["file"] = str(file)
-            node.attrib.update({key: self._filled(text) for key, text in node.attrib.items() if "$" in text})
+            node.attrib.update({key: self._fill(text) for key, text in node.attrib.items() if "$" in text})
             if node.tag == "default":
                 self.values.setdefault(node.get("name", ""), node.get("value", ""))
             elif node.tag == "path":
@@ -139,7 +139,7 @@ class _Files:
         self.originals[str(copy)] = file
         return copy
 
-    def _filled(self, text: str) -> str:
+    def _fill(self, text: str) -> str:
         for name in sorted(self.values, key=len, reverse=True):  # $max_depth before $max, as Mitsuba does
             text = re.sub(rf"(?<!\\)\${re.escape(name)}", self.values[name].replace("\\", r"\\"), text)
         return text
@@ -281,7 +281,7 @@ def _name_shapes(scene: ImportedScene) -> None:
     for shape in unnamed:
         shape.set("id", ids.make(_material(shape), "shape"))
     if unnamed:
-        made = listed([shape.get("id", "") for shape in unnamed])
+        made = name_some([shape.get("id", "") for shape in unnamed])
         count = f"{len(unnamed)} of {len(shapes)} shapes"
         scene.changes.note(f"{count} had no id of their own, and got one by material and order: {made}")
 

@@ -78,23 +78,23 @@ def _libraries(folder: Path, stated: str, changes: Changes) -> Iterator[Path]:
     words = stated.split()
     while words:
         ends = range(len(words), 0, -1)
-        end = next((end for end in ends if _found(folder, " ".join(words[:end]))), len(words))
-        if file := _located(folder, " ".join(words[:end]), changes):
+        end = next((end for end in ends if _find(folder, " ".join(words[:end]))), len(words))
+        if file := _locate(folder, " ".join(words[:end]), changes):
             yield file
         else:
             changes.lose("colour", "mtllib", "material files are not there", " ".join(words))
         words = words[end:]
 
 
-def _located(folder: Path, name: str, changes: Changes) -> Path | None:
+def _locate(folder: Path, name: str, changes: Changes) -> Path | None:
     """The file of a name, or else the one of its last part in the folder, as paths may be those of another machine."""
-    file = _found(folder, name)
-    if file is None and (last := re.split(r"[/\\]", name.strip("\"'"))[-1]) and (file := _found(folder, last)):
+    file = _find(folder, name)
+    if file is None and (last := re.split(r"[/\\]", name.strip("\"'"))[-1]) and (file := _find(folder, last)):
         changes.note(f"'{name}' is not there; '{file.name}' beside the file is taken")
     return file
 
 
-def _found(folder: Path, name: str) -> Path | None:
+def _find(folder: Path, name: str) -> Path | None:
     """The file of a name, which may have the separators of Windows, quotes and other capitals."""
     file = folder
     try:
@@ -153,10 +153,10 @@ class Material:
         if not rest:
             return None
         options: dict[str, str] = {}
-        while (found := _OPTION.match(rest)) and not _found(self.file.parent, rest):
+        while (found := _OPTION.match(rest)) and not _find(self.file.parent, rest):
             options[(found[1] or found[3]).lower()] = (found[2] or found[4]).strip().lower()
             rest = rest[found.end() :]
-        file = _located(self.file.parent, rest, self.changes)
+        file = _locate(self.file.parent, rest, self.changes)
         if file is None:
             self.changes.lose("colour", word, "images are not there", f"{self.file.name}: line {line}: {rest}")
             return None
@@ -213,7 +213,7 @@ class Image:
 
     def values(self, *, raw: bool = False) -> images.Image:
         """Its values as they are stored (H, W, 4)."""
-        return images.decoded(self.file.read_bytes(), str(self.file), raw=raw)
+        return images.decode(self.file.read_bytes(), str(self.file), raw=raw)
 
     def map(self, factor: Sequence[float] = WHITE, *, raw: bool = False) -> Map:
         """Its colours times a factor, linear unless raw."""

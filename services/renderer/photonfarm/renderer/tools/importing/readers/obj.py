@@ -253,11 +253,11 @@ def _mesh(corner: _Ints, tables: _Tables, material: Material) -> Mesh:
         which.reshape(-1, 3).astype(np.uint32),
         normals[vn] if (vn >= 0).any() else None,
         np.where(placed, uvs[vt], (0.0, 1.0)) if material.has_images or placed.any() else None,
-        _painted(points[v, 3:], material),
+        _paint(points[v, 3:], material),
     )
 
 
-def _painted(colours: Floats, material: Material) -> dict[str, Floats]:
+def _paint(colours: Floats, material: Material) -> dict[str, Floats]:
     """The colours of a mesh's vertices, if it has some, and its material no image."""
     if not np.isfinite(colours).any():
         return {}

@@ -186,9 +186,14 @@ def _is_unoccluded(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: DirectSa
 
 
 def _more_direct_light(
-    scene: mi.Scene, lights: Lights, options: PathOptions, s: EyeState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr,
+    scene: mi.Scene,
+    lights: Lights,
+    options: PathOptions,
+    s: EyeState,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
     active: mi.Bool,
-) -> mi.Spectrum:  # fmt: skip
+) -> mi.Spectrum:
     """Radiance at the first vertex from all samples of the lights but one; a light can only be hit instead (s=0)."""
     n = options.light_samples
     rng = s.rng.apart()  # so that eye paths are the same for every n

@@ -329,9 +329,16 @@ def trace(
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
         offset = randomness.sampler(randomness.stream(lanes.keys, randomness.SLOTS), lanes.first_light_path)
         vertices = trace_light_paths(
-            scene, lens, lights, options,
-            rng=rng, path=path, paths=lanes.counts[2], offset=offset.next_independent(), splat=splat,
-        )  # fmt: skip
+            scene,
+            lens,
+            lights,
+            options,
+            rng=rng,
+            path=path,
+            paths=lanes.counts[2],
+            offset=offset.next_independent(),
+            splat=splat,
+        )
         dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
 
     image, sample, pixel = lanes.eye()

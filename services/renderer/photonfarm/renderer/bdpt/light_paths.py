@@ -51,9 +51,14 @@ class PathOptions:
     def kind(self) -> tuple[int, ...]:
         """The numbers for which the kernels are compiled."""
         return (
-            self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light, self.light_samples,
+            self.max_depth,
+            self.rr_depth,
+            self.connections,
+            self.connects,
+            self.traces_light,
+            self.light_samples,
             self.useful is not None,
-        )  # fmt: skip
+        )
 
     def usefulness(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """How useful light vertices are for connections, 1 on average; 1 for all where it is not known."""
@@ -123,9 +128,18 @@ def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler, 
     active &= hit.is_valid()
     dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
     return LightState(
-        active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.Float(1), mi.UInt32(1), mi.Float(0),
+        active,
+        rng,
+        start.ray,
+        hit,
+        mi.Spectrum(start.throughput),
+        dvcm,
+        dvc,
+        mi.Float(1),
+        mi.UInt32(1),
+        mi.Float(0),
         kept,
-    )  # fmt: skip
+    )
 
 
 def vertex_bounce(

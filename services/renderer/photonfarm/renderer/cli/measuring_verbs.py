@@ -15,10 +15,18 @@ from photonfarm.core.waiting import WorkLog
 
 @click.command()
 @click.argument("spec")
-@click.option("--frames", type=click.IntRange(1, 1000), default=6, show_default=True,
-              help="Random configurations to measure, a view of each, after some that do not count.")  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(0, min_open=True),
-              help="Processor time for all of it; less of it, fewer views.  [default: no limit]")  # fmt: skip
+@click.option(
+    "--frames",
+    type=click.IntRange(1, 1000),
+    default=6,
+    show_default=True,
+    help="Random configurations to measure, a view of each, after some that do not count.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    help="Processor time for all of it; less of it, fewer views.  [default: no limit]",
+)
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @device_option
 @json_option
@@ -44,10 +52,20 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
 
 @click.command()
 @click.argument("spec")
-@click.option("--target", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.45, show_default=True,
-              help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.")  # fmt: skip
-@click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
-              help="Random configurations to render, a view of each.")  # fmt: skip
+@click.option(
+    "--target",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.45,
+    show_default=True,
+    help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.",
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(2, 1000),
+    default=24,
+    show_default=True,
+    help="Random configurations to render, a view of each.",
+)
 @device_option
 @json_option
 @end_on_ctrl_c()

@@ -16,14 +16,22 @@ from photonfarm.core.waiting import tell_waiting
 
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="SPEC",
-              help="The spec to write; the scene goes into a folder beside it.  "
-                   "[default: in this folder, named as PATH]")  # fmt: skip
-@click.option("--up", type=click.Choice(["x", "y", "z"]),
-              help="The axis that points up.  [default: as the file says, or else y]")  # fmt: skip
-@click.option("--accept", multiple=True, metavar="NAME",
-              help="A change of the picture that may be made: by its name, as the refusal gives it; geometry, light or "
-                   "colour for all of a kind. May be given several times.")  # fmt: skip
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="SPEC",
+    help="The spec to write; the scene goes into a folder beside it.  [default: in this folder, named as PATH]",
+)
+@click.option(
+    "--up", type=click.Choice(["x", "y", "z"]), help="The axis that points up.  [default: as the file says, or else y]"
+)
+@click.option(
+    "--accept",
+    multiple=True,
+    metavar="NAME",
+    help="A change of the picture that may be made: by its name, as the refusal gives it; geometry, light or "
+    "colour for all of a kind. May be given several times.",
+)
 @json_option
 def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str, ...], as_json: bool) -> None:
     """Make a spec of a scene of another program, and a copy of the scene that photonfarm can render.
@@ -53,8 +61,9 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
 
 @click.command()
 @click.argument("spec")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True,
-              help="The page.")  # fmt: skip
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True, help="The page."
+)
 @device_option
 @json_option
 @end_on_ctrl_c()

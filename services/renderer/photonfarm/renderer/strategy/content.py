@@ -149,10 +149,12 @@ def light_reach(scenes: Iterable[Any], view: ViewSpec, seed: int) -> LightReach:
         photons = trace_photons(scene, seed=seed + i, paths=PATHS, depth=DEPTH)
         near = _inside(photons.position, view)
         of_bounce = [photons.bounce == d for d in range(DEPTH)]
-        rows.append([
-            [float(np.sum(at & near)) / PATHS for at in of_bounce],
-            [float(np.sum(photons.power[at & near], dtype=np.float64)) for at in of_bounce],
-        ])  # fmt: skip
+        rows.append(
+            [
+                [float(np.sum(at & near)) / PATHS for at in of_bounce],
+                [float(np.sum(photons.power[at & near], dtype=np.float64)) for at in of_bounce],
+            ]
+        )
         hits.append(np.sum(of_bounce[0]) / PATHS)
     near_share, power = np.array(rows).transpose(1, 0, 2)
     arrived = power.sum(axis=1, keepdims=True)

@@ -181,9 +181,20 @@ def read_lights(scene: mi.Scene) -> Lights:
     dr.scatter(emission_by_id, emission, index)
     dr.eval(alive, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
     return Lights(
-        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius,
+        pointers,
+        n,
+        kinds,
+        kind,
+        selection,
+        alive,
+        emit_cdf,
+        emission_by_id,
+        axis,
+        cos_cutoff,
+        centre,
+        radius,
         Spheres.of([shapes.get(key) for key in ids]),
-    )  # fmt: skip
+    )
 
 
 def _registry_id(emitter: mi.Emitter) -> int:
@@ -271,9 +282,14 @@ def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumber
 
 
 def hit_densities(
-    scene: mi.Scene, lights: Lights, emitter: mi.EmitterPtr, si: mi.SurfaceInteraction3f,
-    origin: mi.Point3f, vertex: mi.Point3f, active: mi.Bool,
-) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+    scene: mi.Scene,
+    lights: Lights,
+    emitter: mi.EmitterPtr,
+    si: mi.SurfaceInteraction3f,
+    origin: mi.Point3f,
+    vertex: mi.Point3f,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Float]:
     """(p_NEE in solid angle, e) of the light hit at ``si`` by a ray from ``origin``, which was spawned at ``vertex``.
 
     Next event estimation would have chosen the light at the vertex itself: the ray's origin may lie in another cell.

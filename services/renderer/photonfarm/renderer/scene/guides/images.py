@@ -30,9 +30,15 @@ PURPOSE = "direct"
 
 
 def view_guides(
-    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, materials: Materials, arrives: F32,
+    scene: Any,
+    view: View,
+    spec: SceneSpec,
+    wanted: GuideSpec,
+    key: Key,
+    materials: Materials,
+    arrives: F32,
     recorder: Recorder | None = None,
-) -> Guides:  # fmt: skip
+) -> Guides:
     """The guides of a view in the scene's present configuration; `key` is the view's.
 
     `arrives` is the result of `point_light`. With a `recorder` of `trace` Python runs only once for all views.

@@ -22,9 +22,17 @@ from photonfarm.renderer.scene.materials import is_pure_delta
 
 
 def trace(
-    scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
+    scene: Any,
+    _: Any,
+    lights: Lights | None,
+    tables: Any,
+    o: Any,
+    d: Any,
+    reach: Any,
+    along: Any,
+    shift: Any,
     settings: GuideSettings,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The quantities that `images` averages, by name, for each ray; zeros where there is nothing.
 
     `tables` are the roughness of BSDFs, their `diffuse_kept`, and three columns of points; rays begin on the near

@@ -71,8 +71,13 @@ def lamp() -> Parts:
 
 def pedestal() -> Parts:
     """A pedestal for a glass ball (which is a sphere, not a mesh)."""
-    return {"stone": join(standing_box((0.40, 0.06, 0.40), (0, 0, 0)), standing_box((0.30, 0.62, 0.30), (0, 0.06, 0)),
-                            standing_box((0.38, 0.04, 0.38), (0, 0.68, 0)))}  # fmt: skip
+    return {
+        "stone": join(
+            standing_box((0.40, 0.06, 0.40), (0, 0, 0)),
+            standing_box((0.30, 0.62, 0.30), (0, 0.06, 0)),
+            standing_box((0.38, 0.04, 0.38), (0, 0.68, 0)),
+        )
+    }
 
 
 def standing_mirror() -> Parts:

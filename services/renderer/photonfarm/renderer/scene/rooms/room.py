@@ -91,12 +91,19 @@ def _furniture() -> dict[str, Any]:
         for part, solid in parts.items():
             shape_id = f"{piece}-{part}"
             shapes[shape_id] = mesh(
-                shape_id, _place(solid, piece), looks[part],
-                smooth=part in SMOOTH, radiance=LAMP_RADIANCE if part == "shade" else None,
-            )  # fmt: skip
+                shape_id,
+                _place(solid, piece),
+                looks[part],
+                smooth=part in SMOOTH,
+                radiance=LAMP_RADIANCE if part == "shade" else None,
+            )
     x, _, z = PLACES["pedestal"][0]
-    shapes["pedestal-ball"] = {"type": "sphere", "center": mi.ScalarPoint3f(x, 0.72 + 0.17, z), "radius": 0.17,
-                               "bsdf": materials.glass()}  # fmt: skip
+    shapes["pedestal-ball"] = {
+        "type": "sphere",
+        "center": mi.ScalarPoint3f(x, 0.72 + 0.17, z),
+        "radius": 0.17,
+        "bsdf": materials.glass(),
+    }
     return shapes
 
 

@@ -24,8 +24,17 @@ EXTREMES = 48
 """The directions in which an outline is looked for."""
 
 COLOURS = (
-    "#1b66c9", "#c62828", "#1f8a3b", "#7b3fb5", "#d96a00", "#00838f", "#b5267e", "#6d4c41", "#8a8a00", "#455a64",
-)  # fmt: skip
+    "#1b66c9",
+    "#c62828",
+    "#1f8a3b",
+    "#7b3fb5",
+    "#d96a00",
+    "#00838f",
+    "#b5267e",
+    "#6d4c41",
+    "#8a8a00",
+    "#455a64",
+)
 """The colours of movable groups, in turn."""
 
 

@@ -90,9 +90,13 @@ def _camera_facts(check: SceneCheck) -> list[Fact]:
         Fact("stand inside objects", percent(cameras.inside_share), holders, cameras.inside_share >= INSIDE),
         Fact("look through a wall from outside", percent(cameras.behind.mean()), "", bool(cameras.behind.any())),
         Fact("see no surface", percent(cameras.nothing.mean()), "", bool(cameras.nothing.any())),
-        Fact("points that a view sees", f"{median * points:.0f} of {points}", f"5 % of views: below {low * points:.0f}",
-             bool(low < LEAST_SEEN)),
-    ]  # fmt: skip
+        Fact(
+            "points that a view sees",
+            f"{median * points:.0f} of {points}",
+            f"5 % of views: below {low * points:.0f}",
+            bool(low < LEAST_SEEN),
+        ),
+    ]
 
 
 def _light_facts(check: SceneCheck) -> list[Fact]:

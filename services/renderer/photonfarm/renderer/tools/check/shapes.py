@@ -190,9 +190,7 @@ def group_vertices(geometry: Geometry, number: int) -> F32:
     return geometry.vertices[np.unique(faces)]
 
 
-def _place(
-    fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable, up: F32, carpet: float
-) -> Placed:  # fmt: skip
+def _place(fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable, up: F32, carpet: float) -> Placed:
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     corners = _corners(group)
     if fixed is None:

@@ -62,9 +62,7 @@ class Imported:
         return {"spec": str(self.spec), "folder": str(self.folder), "changes": changes, "found": self.found}
 
 
-def import_scene(
-    path: Path, out: Path | None, up: Vector | None, log: Log, accept: Collection[str] = ()
-) -> Imported:  # fmt: skip
+def import_scene(path: Path, out: Path | None, up: Vector | None, log: Log, accept: Collection[str] = ()) -> Imported:
     """Import a file: write a spec and, beside it, a folder with the scene.
 
     `accept` names changes of the picture that may be made, or their effects. Mitsuba must have been loaded. Raises
@@ -100,9 +98,15 @@ def _place(path: Path, out: Path | None) -> Path:
 
 
 def _import(
-    scene: ImportedScene, loaded: Any, path: Path, spec: Path, folder: Path, scratch: Path, up: Vector | None,
+    scene: ImportedScene,
+    loaded: Any,
+    path: Path,
+    spec: Path,
+    folder: Path,
+    scratch: Path,
+    up: Vector | None,
     work: WorkLog,
-) -> Imported:  # fmt: skip
+) -> Imported:
     frame = Frame(up or scene.up)
     camera = None if scene.camera is None else frame.inward(np.array(scene.camera))
     proposal = propose(loaded, frame, camera, scene.objects, work.begin)

@@ -202,7 +202,7 @@ def _flatten_lights(scene: ImportedScene, loaded: Any) -> None:
 
 def shapes_of_things(
     scene: ImportedScene, loaded: Any, shape_of: NDArray[np.int32], thing_of: NDArray[np.int64]
-) -> list[list[str]]:  # fmt: skip
+) -> list[list[str]]:
     """The ids of the shapes of each thing; shapes of several things, or of one and the room, are split in `scene`.
 
     `shape_of` and `thing_of` (F,) are the numbers of each face's shape and thing, which is −1 for the room.

@@ -122,9 +122,14 @@ def _means(images: F32, exposure: float) -> NDArray[np.float64]:
 
 
 def propose(
-    spec: SceneSpec, beside: Path | None, work: WorkLog, *, target: float = TARGET, frames: int = FRAMES,
+    spec: SceneSpec,
+    beside: Path | None,
+    work: WorkLog,
+    *,
+    target: float = TARGET,
+    frames: int = FRAMES,
     least: float | None = None,
-) -> Proposal:  # fmt: skip
+) -> Proposal:
     """Render some views, each of a random configuration of its own, and search for the exposure.
 
     The backend must have been loaded. Raises SpecError as loading does, and DarkError where too much is black for any

@@ -168,7 +168,7 @@ def propose(scene: Any, frame: Frame, camera: Points | None, objects: Mapping[st
 
 def _find(
     scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | None, objects: Mapping[str, str]
-) -> tuple[Found, bool]:  # fmt: skip
+) -> tuple[Found, bool]:
     """The room with what is in it, and whether things stand in others, too.
 
     Of rooms in doubt it is that with the largest area that may move; if nothing may move, it is all outdoors.
@@ -225,7 +225,7 @@ def _light(scene: Any, frame: Frame, room: Room, origin: Box, plan: FloorPlan | 
 
 def _place(
     plan: FloorPlan, middle: Points, size: Points, bottom: float, top: float, *, hangs: bool
-) -> tuple[Points, Points] | None:  # fmt: skip
+) -> tuple[Points, Points] | None:
     """The corners (2,) of where the middle (2,) of something may be, near to where it is; None if nowhere."""
     room, clear, height = plan.room, NEAR * plan.room.height, plan.lights[:, 2]
     lights = plan.lights[(height > bottom - clear) & (height < top + clear)]

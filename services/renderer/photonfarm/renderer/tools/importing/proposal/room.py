@@ -63,9 +63,7 @@ class _Hits(NamedTuple):
     is_back: NDArray[np.bool_]  # (N,): whether it is a surface's back that was hit
 
 
-def find_room(
-    scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | None, others: Sequence[Room] = ()
-) -> Room:  # fmt: skip
+def find_room(scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | None, others: Sequence[Room] = ()) -> Room:
     """The room around the camera, or around a point that is chosen; what is outdoors where nothing encloses that.
 
     `others` are rooms that the point must not be in.
@@ -121,9 +119,7 @@ def _find_in_solid(scene: Any, frame: Frame, points: Points) -> NDArray[np.bool_
     return np.asarray(surroundings(scene, frame.world(points).astype(np.float32)).solid != NONE)
 
 
-def _best_viewpoint(
-    scene: Any, frame: Frame, within: Box, rng: np.random.Generator, others: Sequence[Room]
-) -> Points:  # fmt: skip
+def _best_viewpoint(scene: Any, frame: Frame, within: Box, rng: np.random.Generator, others: Sequence[Room]) -> Points:
     """The point from which most rays hit something far away, in no solid and no other room: (1, 3), or (0, 3)."""
     steps = [(np.arange(n) + 0.5) / n for n in (8, 8, 4)]
     shares = np.stack(np.meshgrid(*steps, indexing="ij"), axis=-1).reshape(-1, 3)

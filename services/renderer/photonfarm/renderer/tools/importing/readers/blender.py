@@ -21,11 +21,14 @@ from photonfarm.renderer.tools.importing.readers import gltf
 from photonfarm.renderer.tools.importing.readers.blender_lamps import Lamps
 
 _NAMES = {
-    "KHR_materials_anisotropy": "Anisotropic", "KHR_materials_clearcoat": "Coat Weight",
-    "KHR_materials_sheen": "Sheen Weight", "KHR_materials_specular": "Specular Tint",
-    "KHR_materials_transmission": "Transmission Weight", "clearcoatNormalTexture": "Coat Normal",
+    "KHR_materials_anisotropy": "Anisotropic",
+    "KHR_materials_clearcoat": "Coat Weight",
+    "KHR_materials_sheen": "Sheen Weight",
+    "KHR_materials_specular": "Specular Tint",
+    "KHR_materials_transmission": "Transmission Weight",
+    "clearcoatNormalTexture": "Coat Normal",
     "emissiveTexture": "Emission Color",
-}  # fmt: skip
+}
 """What Blender calls that which glTF has of its surfaces."""
 
 VARIABLE = "PHOTONFARM_BLENDER"

@@ -27,8 +27,13 @@ from blender_materials import DULL, prepare, source  # type: ignore[import-not-f
 OLDEST = (4, 5)
 """The first Blender whose lamps have an exposure, a temperature and `normalize`."""
 
-_NO_MESHES = {"CURVES": "hair", "HAIR": "particles", "POINTCLOUD": "points", "VOLUME": "a volume",
-              "GREASEPENCIL": "drawn lines"}  # fmt: skip
+_NO_MESHES = {
+    "CURVES": "hair",
+    "HAIR": "particles",
+    "POINTCLOUD": "points",
+    "VOLUME": "a volume",
+    "GREASEPENCIL": "drawn lines",
+}
 _RAYS = dict.fromkeys(("camera", "diffuse", "glossy", "transmission"), True)
 _LIT = dict.fromkeys(("visible_diffuse", "visible_glossy", "visible_transmission", "visible_shadow"), True)
 _SEEN = {"visible_camera": True, **_LIT, "is_holdout": False, "is_shadow_catcher": False}

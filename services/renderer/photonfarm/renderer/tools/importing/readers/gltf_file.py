@@ -23,26 +23,71 @@ _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126:
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 
 _READ = frozenset(
-    {"EXT_mesh_gpu_instancing", "EXT_texture_avif", "EXT_texture_webp", "KHR_lights_punctual", "KHR_mesh_quantization",
-     "KHR_materials_clearcoat", "KHR_materials_emissive_strength", "KHR_materials_ior",
-     "KHR_materials_pbrSpecularGlossiness", "KHR_materials_specular", "KHR_materials_transmission",
-     "KHR_materials_volume", "KHR_node_visibility", "KHR_texture_transform", "MSFT_texture_dds"}
-)  # fmt: skip
+    {
+        "EXT_mesh_gpu_instancing",
+        "EXT_texture_avif",
+        "EXT_texture_webp",
+        "KHR_lights_punctual",
+        "KHR_mesh_quantization",
+        "KHR_materials_clearcoat",
+        "KHR_materials_emissive_strength",
+        "KHR_materials_ior",
+        "KHR_materials_pbrSpecularGlossiness",
+        "KHR_materials_specular",
+        "KHR_materials_transmission",
+        "KHR_materials_volume",
+        "KHR_node_visibility",
+        "KHR_texture_transform",
+        "MSFT_texture_dds",
+    }
+)
 """The extensions that are carried over; what of one is not is said where it is read."""
 
 _HARMLESS = (
-    "AGI_", "EXT_instance_features", "EXT_mesh_features", "EXT_structural_metadata", "FB_geometry_metadata",
-    "KHR_animation_pointer", "KHR_audio", "KHR_implicit_shapes", "KHR_interactivity", "KHR_materials_variants",
-    "KHR_node_hover", "KHR_node_select", "KHR_physics", "KHR_xmp", "MSFT_lod", "MSFT_packing", "OMI_collider",
-    "OMI_physics", "VRMC_node_constraint", "VRMC_springBone",
-)  # fmt: skip
+    "AGI_",
+    "EXT_instance_features",
+    "EXT_mesh_features",
+    "EXT_structural_metadata",
+    "FB_geometry_metadata",
+    "KHR_animation_pointer",
+    "KHR_audio",
+    "KHR_implicit_shapes",
+    "KHR_interactivity",
+    "KHR_materials_variants",
+    "KHR_node_hover",
+    "KHR_node_select",
+    "KHR_physics",
+    "KHR_xmp",
+    "MSFT_lod",
+    "MSFT_packing",
+    "OMI_collider",
+    "OMI_physics",
+    "VRMC_node_constraint",
+    "VRMC_springBone",
+)
 """How the names of those begin that leave a picture of what is shown first as it is."""
 
 _OF_TYPES: dict[str, type] = {
-    **dict.fromkeys(("accessors", "buffers", "bufferViews", "children", "extensionsRequired", "images", "materials",
-                     "meshes", "nodes", "primitives", "samplers", "scenes", "textures"), list),
+    **dict.fromkeys(
+        (
+            "accessors",
+            "buffers",
+            "bufferViews",
+            "children",
+            "extensionsRequired",
+            "images",
+            "materials",
+            "meshes",
+            "nodes",
+            "primitives",
+            "samplers",
+            "scenes",
+            "textures",
+        ),
+        list,
+    ),
     **dict.fromkeys(("asset", "attributes", "extensions", "pbrMetallicRoughness", "sparse"), dict),
-}  # fmt: skip
+}
 """Keys that hold others, and what they are in JSON."""
 
 COMPRESSED = {"EXT_meshopt_compression", "KHR_draco_mesh_compression", "KHR_meshopt_compression", "KHR_texture_basisu"}

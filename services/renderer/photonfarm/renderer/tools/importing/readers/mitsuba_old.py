@@ -280,8 +280,19 @@ def _sky(upgrade: Upgrade, emitter: Element) -> None:
 
 
 _UPGRADES: dict[str, Callable[[Upgrade, Element], None]] = {
-    "bitmap": _bitmap, "checkerboard": _texture, "scale": _scale_texture, "obj": _obj,
-    "conductor": _conductor, "roughconductor": _conductor, "phong": _glossy, "ward": _glossy, "mask": _mask,
-    "mixturebsdf": _mixture, "normalmap": _normalmap, "sky": _sky, "sun": _sky, "sunsky": _sky,
-}  # fmt: skip
+    "bitmap": _bitmap,
+    "checkerboard": _texture,
+    "scale": _scale_texture,
+    "obj": _obj,
+    "conductor": _conductor,
+    "roughconductor": _conductor,
+    "phong": _glossy,
+    "ward": _glossy,
+    "mask": _mask,
+    "mixturebsdf": _mixture,
+    "normalmap": _normalmap,
+    "sky": _sky,
+    "sun": _sky,
+    "sunsky": _sky,
+}
 """What means something else in Mitsuba 3, or is no longer there, by type."""

@@ -37,8 +37,25 @@ _AROUND = ("constant", "envmap", "sunsky", "timed_sunsky")
 
 _HERE = {"integrator": "all light is computed here", "sensor": "cameras are perspective here"}
 
-_USUAL = ("perspective", "path", "bdpt", "volpath", "volpathmis", "mlt", "pssmlt", "erpt", "ptracer",
-          "photonmapper", "ppm", "sppm", "vpl", "adaptive", "irrcache", "prb", "prb_basic")  # fmt: skip
+_USUAL = (
+    "perspective",
+    "path",
+    "bdpt",
+    "volpath",
+    "volpathmis",
+    "mlt",
+    "pssmlt",
+    "erpt",
+    "ptracer",
+    "photonmapper",
+    "ppm",
+    "sppm",
+    "vpl",
+    "adaptive",
+    "irrcache",
+    "prb",
+    "prb_basic",
+)
 """The cameras and integrators that mean the same picture as photonfarm's own."""
 
 

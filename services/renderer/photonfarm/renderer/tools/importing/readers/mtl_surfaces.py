@@ -14,14 +14,39 @@ from photonfarm.renderer.tools.importing.changes import Effect
 from photonfarm.renderer.tools.importing.readers.mtl import RELIEFS, WHITE, Material, Meaning
 from photonfarm.renderer.tools.importing.surfaces import Map, Writer, constant
 
-_PRINCIPLED = {"pr": ("roughness", 0.5), "pm": ("metallic", 0.0), "ps": ("sheen", 0.0), "pc": ("clearcoat", 0.0),
-               "aniso": ("anisotropic", 0.0)}  # fmt: skip
+_PRINCIPLED = {
+    "pr": ("roughness", 0.5),
+    "pm": ("metallic", 0.0),
+    "ps": ("sheen", 0.0),
+    "pc": ("clearcoat", 0.0),
+    "aniso": ("anisotropic", 0.0),
+}
 """Parameters of `principled`, each a number or an image, and what they are without a line."""
 
 _PBR = {*_PRINCIPLED, *(f"map_{key}" for key in _PRINCIPLED)}
 
-_CARRIED = {*_PBR, *RELIEFS, "ka", "kd", "ks", "ke", "ns", "ni", "d", "tr", "tf", "illum", "sharpness", "map_aat",
-            "map_kd", "map_ke", "map_d", "map_tr", "pcr", "anisor"}  # fmt: skip
+_CARRIED = {
+    *_PBR,
+    *RELIEFS,
+    "ka",
+    "kd",
+    "ks",
+    "ke",
+    "ns",
+    "ni",
+    "d",
+    "tr",
+    "tf",
+    "illum",
+    "sharpness",
+    "map_aat",
+    "map_kd",
+    "map_ke",
+    "map_d",
+    "map_tr",
+    "pcr",
+    "anisor",
+}
 """What has its meaning here, or none where light and reflections are those of the scene."""
 
 _LOST: dict[str, Meaning] = {

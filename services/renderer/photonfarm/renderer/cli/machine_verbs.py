@@ -27,22 +27,22 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     from photonfarm.cli import show
     from photonfarm.renderer.tools.doctor import examine
 
-    console, found = Console(soft_wrap=True), []
+    console, checks = Console(soft_wrap=True), []
     for check in examine(store, redis_url, partial(click.echo, err=True)):
-        found.append(check)
+        checks.append(check)
         if not as_json:
             mark = "[green]ok[/]  " if check.works else ("[red]FAIL[/]" if check.exit_code else "[yellow]none[/]")
             console.print(f"{mark} [bold]{check.name}[/]: {markup.escape(check.detail)}", highlight=False)
     if as_json:
-        show.print_json([{"name": check.name, "works": check.works, "detail": check.detail} for check in found])
-    sys.exit(next((check.exit_code for check in found if not check.works and check.exit_code), 0))
+        show.print_json([{"name": check.name, "works": check.works, "detail": check.detail} for check in checks])
+    sys.exit(next((check.exit_code for check in checks if not check.works and check.exit_code), 0))
 
 
 def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noqa: ARG001
-    found = re.fullmatch(r"(\d+(?:\.\d+)?) *([kMGT]?)B?", size.strip())
-    if found is None:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) *([kMGT]?)B?", size.strip())
+    if match is None:
         raise click.BadParameter(f"{size!r} is not a size; write it like 500MB or 2GB")
-    return int(float(found[1]) * 1000 ** " kMGT".index(found[2] or " "))
+    return int(float(match[1]) * 1000 ** " kMGT".index(match[2] or " "))
 
 
 def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:  # noqa: ARG001

@@ -83,8 +83,8 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 
     with WorkLog(partial(click.echo, err=True)) as work:
         work.begin(f"loading {loaded.name}")
-        found = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
-    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
+        proposal = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
+    click.echo(json.dumps(proposal.document(), indent=1) if as_json else proposal.line())
 
 
 @click.command()
@@ -109,10 +109,10 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 
     file = spec_file.writable(spec) if write else find_spec(spec)
     with WorkLog(partial(click.echo, err=True)) as work:
-        found = measure(loaded, file.parent, work.begin)
-    click.echo(json.dumps(found.entry()) if as_json else found.line())
+        measured = measure(loaded, file.parent, work.begin)
+    click.echo(json.dumps(measured.entry()) if as_json else measured.line())
     if write:
-        spec_file.write(file, {"view": {"free_space": found.entry()}})
+        spec_file.write(file, {"view": {"free_space": measured.entry()}})
         click.echo(f"{file}: [view.free_space] written", err=True)
 
 

@@ -166,9 +166,9 @@ def render(scene: str, store: str | Path, row: int, pass_number: int | None, out
 
     if out is not None:
         check_suffix(out)
-    found = repeat(store, scene, row, pass_number, partial(click.echo, err=True))
+    repeated = repeat(store, scene, row, pass_number, partial(click.echo, err=True))
     if out is not None:
-        found.write(out)
+        repeated.write(out)
         click.echo(f"written to {out}", err=True)
-    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
-    sys.exit(found.exit_code)
+    click.echo(json.dumps(repeated.document(), indent=1) if as_json else repeated.line())
+    sys.exit(repeated.exit_code)

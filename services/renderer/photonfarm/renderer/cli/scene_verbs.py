@@ -103,11 +103,11 @@ def scene_shapes(spec: str, as_json: bool) -> None:
     from photonfarm.renderer.tools.check import shapes
 
     with tell_waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
-        found = shapes.list_shapes(spec)
+        facts = shapes.list_shapes(spec)
     if as_json:
-        show.print_json([shape.document() for shape in found])
+        show.print_json([shape.document() for shape in facts])
         return
-    show.print_table((shape.row() for shape in found), shapes.HEAD)
-    unnamed = sum(not shape.id for shape in found)
+    show.print_table((shape.row() for shape in facts), shapes.HEAD)
+    unnamed = sum(not shape.id for shape in facts)
     if unnamed:
-        click.echo(f"{unnamed} of {len(found)} shapes have no id, without which no group can name them", err=True)
+        click.echo(f"{unnamed} of {len(facts)} shapes have no id, without which no group can name them", err=True)

@@ -82,5 +82,5 @@ def _guides(
 ) -> Guides:
     """The guides of all views, stacked."""
     key, lit = modification.key(spec.radiance_id), lit_points(cloud, modification)
-    found = [arrays_of(scene.guides(view, view_key(key, view.vector), spec.guides, lit)) for view in views]
-    return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})
+    guides = [arrays_of(scene.guides(view, view_key(key, view.vector), spec.guides, lit)) for view in views]
+    return Guides(**{name: np.stack([each[name] for each in guides]).astype(np.float32) for name in guides[0]})

@@ -230,13 +230,13 @@ def locate(spec: SceneSpec) -> SceneSpec:
 @cache
 def versions() -> Mapping[str, str]:
     """The versions of the packages that affect renders."""
-    found = {}
+    installed = {}
     for package in _PACKAGES:
         try:
-            found[package] = version(package)
+            installed[package] = version(package)
         except PackageNotFoundError:  # run from a checkout
             continue
-    return found
+    return installed
 
 
 # -------------------------------------------------------------------------------------------------------- rendering
@@ -317,8 +317,8 @@ class _Rendering:
             samples = [sample for sample in samples if not self._takes_over(sample, self._others)]
         if not samples:
             return
-        found = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in samples])
-        for sample, (halves, thrown) in zip(samples, found, strict=True):
+        estimates = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in samples])
+        for sample, (halves, thrown) in zip(samples, estimates, strict=True):
             self.redrawn += thrown
             self._out.radiance(sample.row, halves)
 

@@ -80,11 +80,11 @@ def _device(name: str, variant: str) -> Device:
         raise BackendError(
             f"{VARIANT_VARIABLE} = {variant!r} is no variant for the device {name}; leave one of the two out"
         )
-    found = devices.cards_here() if name != CPU else devices.Cards()
-    card = found.card(name)
-    if card is None and found.cards:
-        log.warning("rendering on the CPU, as %s", found.trouble)
-    return Device(variant or (CARD_VARIANT if card else DEFAULT_VARIANT), card, found.driver if card else "")
+    cards = devices.cards_here() if name != CPU else devices.Cards()
+    card = cards.card(name)
+    if card is None and cards.cards:
+        log.warning("rendering on the CPU, as %s", cards.trouble)
+    return Device(variant or (CARD_VARIANT if card else DEFAULT_VARIANT), card, cards.driver if card else "")
 
 
 def paths_at_once() -> int | None:
@@ -133,8 +133,8 @@ def find_llvm(roots: Iterable[Path] = (Path(sys.prefix), Path("/usr"))) -> str:
     if named:
         return _open_llvm(named, f"{LLVM_VARIABLE} = {named!r} cannot be opened")
     for version in LLVM_VERSIONS:
-        for found in _libraries(roots, version):
-            return _open_llvm(str(found), f"{found} cannot be opened")
+        for library in _libraries(roots, version):
+            return _open_llvm(str(library), f"{library} cannot be opened")
     raise BackendError(f"no libLLVM of version {' or '.join(LLVM_VERSIONS)} is installed; {_INSTALL_LLVM}")
 
 

@@ -88,19 +88,19 @@ def _record_look(what: What, scene: Any, rays: Rays, recorder: Recorder | None) 
     """The result of `look`, recorded by `what` and the number of rays."""
     if recorder is None:
         return look(scene, None, *rays, what)
-    found: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
-    return found
+    columns: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
+    return columns
 
 
 def look(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
     """The hits, normals and distances of the first surfaces that rays meet, or their albedo; zeros without a hit."""
     si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
     hit = si.is_valid()
-    found: tuple[Any, ...] = (dr.select(hit, seen_reflectance(si, hit), 0),)
+    columns: tuple[Any, ...] = (dr.select(hit, seen_reflectance(si, hit), 0),)
     if what == "centre":
-        found = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
-    dr.eval(found)
-    return found
+        columns = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
+    dr.eval(columns)
+    return columns
 
 
 def first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
@@ -173,5 +173,5 @@ def sight_shares(scene: Any, origins: F32, targets: F32) -> F32:
 
 def _is_in_a_pixel(place: NDArray[np.float64], pixels: int) -> NDArray[np.bool_]:
     """Whether places along one axis, in pixels from the image's centre, are in one of its pixels."""
-    found: NDArray[np.bool_] = (place >= -0.5 * pixels) & (place < 0.5 * pixels)
-    return found
+    inside: NDArray[np.bool_] = (place >= -0.5 * pixels) & (place < 0.5 * pixels)
+    return inside

@@ -51,12 +51,12 @@ def has_other_lobes(flags: Any) -> Any:
 
 def _alpha(bsdf: Any) -> float:
     """The α of a BSDF: the mean of its roughness parameters; without any, 0 for pure delta lobes, otherwise 1."""
-    found = [
+    alphas = [
         mean ** (2 if "roughness" in key else 1)  # of `principled`: α = roughness²
         for key, mean in _read_means(bsdf, ROUGHNESS).items()
     ]
-    if found:
-        return float(np.clip(np.mean(found), 0, 1))
+    if alphas:
+        return float(np.clip(np.mean(alphas), 0, 1))
     return 0.0 if is_pure_delta(bsdf.flags()) else 1.0
 
 

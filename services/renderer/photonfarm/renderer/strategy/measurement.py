@@ -158,11 +158,11 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         scene = PilotScene(spec, beside)
         budget.require(f"{spec.name}: loading it", 0.0, budget.spent_s)
         work_log.begin(f"following the light of {spec.name}", budget.words)
-        found, depth = content.read(scene.loaded.scene, scene.camera()), spec.transport.max_depth
+        scene_content, depth = content.read(scene.loaded.scene, scene.camera()), spec.transport.max_depth
         loaded_s = budget.spent_s
         reach = content.light_reach(budget.take_within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
         edit_s = (budget.spent_s - loaded_s) / len(reach.near)
-        useful, left_out = content.restrict(found, depth, reach.hit, GRID)
+        useful, left_out = content.restrict(scene_content, depth, reach.hit, GRID)
 
         now, half_spp = present(spec), spec.transport.half_spp
         every = list(dict.fromkeys([*useful, now]))
@@ -205,7 +205,7 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         spp=spp,
         half_s=half_s,
         views=choice.views,
-        modelled=(*content.sentences(found, depth), *[fewer] * (len(candidates) < len(every))),
+        modelled=(*content.sentences(scene_content, depth), *[fewer] * (len(candidates) < len(every))),
         left_out=tuple(left_out),
         rows=tuple(
             CandidateRow(

@@ -99,10 +99,10 @@ def settle(measurement: Measurement, candidate: Candidate, half_spp: int) -> tup
 
 def _better(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int] | None:
     candidates = candidates_at_equal_cost(measurement, measurement.row(candidate).cost.time_s(half_spp))
-    found = best(fitting(candidates))
-    if found.candidate == candidate or not saving(found, over=candidates[candidate]).significant:
+    chosen = best(fitting(candidates))
+    if chosen.candidate == candidate or not saving(chosen, over=candidates[candidate]).significant:
         return None
-    return found.candidate, found.half_spp
+    return chosen.candidate, chosen.half_spp
 
 
 # -------------------------------------------------------------------------------------------------- the plan
@@ -173,9 +173,9 @@ def make_plan(
     spec: SceneSpec, beside: Path | None, purpose: Purpose, *, seconds: float, again: bool, log: Log
 ) -> TransportPlan:
     """The plan of a spec for a purpose; a cached measurement is used if it took `seconds`, unless `again` is set."""
-    found = None if again else find(spec, purpose)
-    if found is not None and found.asked_s >= seconds and _knows(found, spec):
-        return plan_of(spec, found, cached=True)
+    kept = None if again else find(spec, purpose)
+    if kept is not None and kept.asked_s >= seconds and _knows(kept, spec):
+        return plan_of(spec, kept, cached=True)
     measurement = measure(spec, beside, purpose, seconds, log)
     try:
         keep(spec, measurement)

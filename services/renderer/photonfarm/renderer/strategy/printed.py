@@ -56,10 +56,10 @@ def _verdict(plan: TransportPlan) -> str:
     if not plan.at_equal_cost:
         return "nothing was measured: every view is black"
     if plan.candidate == now:
-        found = best(fitting(plan.at_equal_cost))
+        chosen = best(fitting(plan.at_equal_cost))
         better = (
             "the spec's settings are the best of those measured longest"
-            if found.candidate == now
+            if chosen.candidate == now
             else "no significant gain over the spec's settings"
         )
         return f"{better}: keep them"

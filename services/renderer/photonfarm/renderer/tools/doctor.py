@@ -60,15 +60,15 @@ def _optional(finding: MachineCheck, note: str) -> MachineCheck:
     return finding if finding.works else MachineCheck(finding.name, False, f"{finding.detail} ({note})")
 
 
-def _cards(found: Cards) -> MachineCheck:
+def _cards(here: Cards) -> MachineCheck:
     """The NVIDIA cards, their driver and OptiX; without them the processor renders."""
-    driver = f"driver {found.driver or 'of unknown version'}, CUDA {found.cuda // 100}.{found.cuda % 100}"
+    driver = f"driver {here.driver or 'of unknown version'}, CUDA {here.cuda // 100}.{here.cuda % 100}"
     cards = [
         f"cuda:{card.number} {card.name}, compute capability {card.capability}, {card.memory_bytes / 2**30:.0f} GiB"
-        for card in found.cards
+        for card in here.cards
     ]
-    if found.trouble:
-        return MachineCheck("GPU", False, "; ".join([found.trouble, *([driver] if cards else []), *cards]))
+    if here.trouble:
+        return MachineCheck("GPU", False, "; ".join([here.trouble, *([driver] if cards else []), *cards]))
     return MachineCheck("GPU", True, "; ".join([*cards, driver, "OptiX"]))
 
 
@@ -140,6 +140,6 @@ def _scenes() -> MachineCheck:
     from photonfarm.scene.spec_loading import SCENES_VARIABLE
 
     folders = [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
-    found = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))
-    detail = ", ".join(found) or f"no scene files; set {SCENES_VARIABLE} to the folder that holds them"
-    return MachineCheck("scenes", bool(found), detail)
+    names = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))
+    detail = ", ".join(names) or f"no scene files; set {SCENES_VARIABLE} to the folder that holds them"
+    return MachineCheck("scenes", bool(names), detail)

@@ -170,10 +170,10 @@ class QueueSource(JobSource):
 
     def has_more(self, *, may_leave: bool) -> bool:
         """Whether something was missing and is queued now, or is in the hands of others."""
-        found = queue.fill_seldom(
+        state = queue.fill_seldom(
             self._store, self._connection, scene_id=self._settings.scene_id, every_s=self._settings.idle_s
         )
-        return found == "queued" or (found == "waits" and not may_leave)
+        return state == "queued" or (state == "waits" and not may_leave)
 
     def set_aside(self) -> Mapping[str, str]:
         """Why jobs failed too often."""
@@ -217,13 +217,13 @@ class ShareSource(JobSource):
         self._unreadable = unreadable
         with store_errors("look for failures", self._store.storage.where):
             times = queue.count_failures(self._store) | dict.fromkeys(self._not_kept, TRIES)
-        found = [
+        candidates = [
             (times.get(job_name(scene_id, job), 0), not self._share.owns(job), RenderArguments(scene_id, job))
             for scene_id, jobs in missing.items()
             for job in self._share.order(jobs)
         ]
-        found.sort(key=lambda each: each[:2])
-        self._waiting = deque(job for failed, _, job in found if failed < TRIES)
+        candidates.sort(key=lambda each: each[:2])
+        self._waiting = deque(job for failed, _, job in candidates if failed < TRIES)
         self._look_due = time.monotonic() + max(LOOK_S, self.pause_s)
 
     def _scenes(self) -> tuple[str, ...]:

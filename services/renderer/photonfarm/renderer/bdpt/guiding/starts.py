@@ -100,7 +100,7 @@ class GuidedStarts:
             raise ValueError(
                 f"bdpt: the guide was learned with {layout.lights} lights, the scene has {len(ids)}; learn another one"
             )
-        rectangle = mi.UInt32([int(found) for found in rectangles])
+        rectangle = mi.UInt32([int(is_rectangle) for is_rectangle in rectangles])
         light = dr.arange(mi.UInt32, layout.cells) // layout.cells_per_light
         places = layout.positions**2
         gain = guide.gain

@@ -68,11 +68,11 @@ def estimate_usefulness(sums: F64, connections: F64) -> F64:
 
     It is estimated coarse to fine, as few connections go to most cells. All are 1 where no connection added anything.
     """
-    found = np.sqrt(_means(*(a.reshape(SIDE, SIDE, SIDE, NORMALS) for a in (sums, connections)))).ravel()
-    mean = (found * connections).sum() / max(connections.sum(), 1.0)
+    root_means = np.sqrt(_means(*(a.reshape(SIDE, SIDE, SIDE, NORMALS) for a in (sums, connections)))).ravel()
+    mean = (root_means * connections).sum() / max(connections.sum(), 1.0)
     if not (np.isfinite(mean) and mean > 0):
         return np.ones(CELLS)
-    return np.asarray(np.maximum(found / mean, LEAST))
+    return np.asarray(np.maximum(root_means / mean, LEAST))
 
 
 def _means(sums: F64, counts: F64) -> F64:

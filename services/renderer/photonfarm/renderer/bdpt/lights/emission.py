@@ -158,8 +158,8 @@ def read_lights(scene: mi.Scene) -> Lights:
     weights = [sampling_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
-            found = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if _is_textured(emitters[i]) else True)
-            weights[i] = dr.select(found, weights[i], 0)
+            has_densities = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if _is_textured(emitters[i]) else True)
+            weights[i] = dr.select(has_densities, weights[i], 0)
         elif kinds[i] == AREA and shapes[key].class_name() == "Cylinder":
             weights[i] = dr.select(is_unmirrored(shapes[key]), weights[i], 0)
     weight = column(n, weights)

@@ -48,8 +48,8 @@ def point_light(
     at, facing = (np.repeat(each, SUB_PIXELS, axis=0) for each in (position, normal))
     arguments = lights, points(at), points(facing), [floats(column) for column in u.reshape(-1, 3).T]
     traced = functools.partial(recorder, (len(at), lights.kinds)) if recorder else irradiance
-    found = traced(scene, None, *arguments)
-    mean: F32 = rows(found, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
+    irradiances = traced(scene, None, *arguments)
+    mean: F32 = rows(irradiances, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
     return mean
 
 
@@ -64,9 +64,9 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
     shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
     lit = light.valid & (cosine > 0)
     lit &= ~scene.ray_test(shadow, lit)
-    found = dr.select(lit, light.radiance_over_density * cosine, 0)
-    dr.eval(found)
-    return found
+    arriving = dr.select(lit, light.radiance_over_density * cosine, 0)
+    dr.eval(arriving)
+    return arriving
 
 
 # -------------------------------------------------------------------------------------------------------- on surfaces
@@ -166,12 +166,12 @@ def _sample_bsdf(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     u = shift_pattern(pattern, shift, mi.UInt32(at.settings.light_samples))
     bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
     ray = at.si.spawn_ray(at.si.to_world(bs.wo))
-    found = at.scene.ray_intersect(ray, active=at.other)
-    emitter = found.emitter(at.scene, at.other)
-    by_light, _ = hit_densities(at.scene, at.lights, emitter, found, ray.o, at.si.p, at.other)
+    hit = at.scene.ray_intersect(ray, active=at.other)
+    emitter = hit.emitter(at.scene, at.other)
+    by_light, _ = hit_densities(at.scene, at.lights, emitter, hit, ray.o, at.si.p, at.other)
     is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
-    emitted = emitter.eval(found, at.other)
+    emitted = emitter.eval(hit, at.other)
     return ReflectedLight(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
 
 

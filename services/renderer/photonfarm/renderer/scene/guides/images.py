@@ -50,8 +50,8 @@ def view_guides(
     at_once = max(1, RAYS // SUB_PIXELS)  # pixels
     blocks = [slice(start, start + at_once) for start in range(0, pixels, at_once)]
     parts = [_trace(scene, camera, spec, (directions[block], shifts[block]), materials, recorder) for block in blocks]
-    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _guides(found, camera, arrives)
+    sums = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return _guides(sums, camera, arrives)
 
 
 def _grid(camera: Camera) -> F32:
@@ -86,8 +86,8 @@ def _trace(
 
 
 def _rows(column: Any) -> NDArray[np.float64]:
-    found = np.array(column, np.float64)
-    return found.T if found.ndim > 1 else found
+    values = np.array(column, np.float64)
+    return values.T if values.ndim > 1 else values
 
 
 def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) -> Guides:

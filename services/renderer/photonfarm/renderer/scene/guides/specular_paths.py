@@ -47,7 +47,7 @@ def trace(
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
     albedo = seen_reflectance(last, met)
     arrives = direct_light(scene, lights, last, RayArrival(met, path.ray.d, path.followed), pattern, shift, settings)
-    found = {
+    columns = {
         "hits": dr.select(hit, mi.Float(1), 0),
         "depth": dr.select(hit, settings.near + first.t * along, 0),
         "normal": dr.select(hit, turn_towards(first.sh_frame.n, d), 0),
@@ -62,8 +62,8 @@ def trace(
         "beyond_normal": dr.select(is_beyond & met, turn_towards(last.sh_frame.n, path.ray.d), 0),
         "beyond_depth": dr.select(is_beyond & met, path.length + last.t, 0),
     }
-    dr.eval(found)
-    return found
+    dr.eval(columns)
+    return columns
 
 
 @dataclass(slots=True)

@@ -71,12 +71,12 @@ def drawings(
     across = np.eye(3)[0 if upwards[0] == 0 else 1]
     low, high = _extent(spec, placed, room)
     boxes = np.array([spec.view.origin.low, spec.view.origin.high, spec.view.look_at.low, spec.view.look_at.high])
-    found = []
+    sheets = []
     for title, down in (("Plan", np.cross(-upwards, across)), ("Elevation", -upwards)):
         start = float((boxes @ np.cross(across, down)).min())
         projection = Projection.around(across, down, low, high, start)
-        found.append(_drawing(title, scene, spec, geometry, colours, projection))
-    return found
+        sheets.append(_drawing(title, scene, spec, geometry, colours, projection))
+    return sheets
 
 
 def _extent(spec: SceneSpec, placed: Sequence[Placed], room: NDArray[Any]) -> NDArray[np.float64]:

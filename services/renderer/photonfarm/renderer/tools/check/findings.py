@@ -75,23 +75,23 @@ class Measured:
 
 def collect_findings(spec: SceneSpec, lights: frozenset[str], measured: Measured) -> list[Finding]:
     """The findings, serious ones first; one for each key, and none that only follows from another."""
-    found: dict[str, Finding] = {}
+    by_key: dict[str, Finding] = {}
     cameras = measured.samples.cameras
-    _add(found, _check_place(spec, measured))
-    _add(found, (Finding(doubt.key, doubt.sentence) for doubt in doubts(spec, lights)))
-    if not _VIEWS & found.keys():
-        _add(found, _check_cameras(spec, cameras))
-        if not _DARKNESS & found.keys() and cameras.placed_well.mean() >= PLACED_WELL:
-            _add(found, _check_brightness(spec, measured.samples))
+    _add(by_key, _check_place(spec, measured))
+    _add(by_key, (Finding(doubt.key, doubt.sentence) for doubt in doubts(spec, lights)))
+    if not _VIEWS & by_key.keys():
+        _add(by_key, _check_cameras(spec, cameras))
+        if not _DARKNESS & by_key.keys() and cameras.placed_well.mean() >= PLACED_WELL:
+            _add(by_key, _check_brightness(spec, measured.samples))
     for index, (group, placed) in enumerate(zip(spec.groups, measured.placed, strict=True)):
-        _add(found, _check_group(spec, group, placed, group_key(spec, index)))
-    return sorted(found.values(), key=lambda finding: not finding.serious)
+        _add(by_key, _check_group(spec, group, placed, group_key(spec, index)))
+    return sorted(by_key.values(), key=lambda finding: not finding.serious)
 
 
-def _add(found: dict[str, Finding], more: Iterable[Finding]) -> None:
+def _add(by_key: dict[str, Finding], more: Iterable[Finding]) -> None:
     """Add findings whose keys have none yet."""
     for finding in more:
-        found.setdefault(finding.key, finding)
+        by_key.setdefault(finding.key, finding)
 
 
 def _check_place(spec: SceneSpec, measured: Measured) -> Iterator[Finding]:

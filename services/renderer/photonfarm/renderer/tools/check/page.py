@@ -117,12 +117,12 @@ def _sections(check: SceneCheck) -> list[tuple[str, list[Tile], list[Tile]]]:
     """Shapes by movable group, and then those that do not move: with pictures, and without."""
     names = [group.name for group in check.spec.groups]
     order = sorted(range(len(check.shapes)), key=lambda number: _place(check.shapes[number], names))
-    found = []
+    sections = []
     for name, numbers in groupby(order, key=lambda number: check.shapes[number].group):
         tiles = [_tile(check, number) for number in numbers]
         with_picture = [tile for tile in tiles if tile.picture is not None]
-        found.append((name or "", with_picture, [tile for tile in tiles if tile.picture is None]))
-    return found
+        sections.append((name or "", with_picture, [tile for tile in tiles if tile.picture is None]))
+    return sections
 
 
 def _place(shape: ShapeFacts, names: Sequence[str]) -> int:

@@ -71,8 +71,8 @@ class Cameras:
     @property
     def placed_well(self) -> NDArray[np.bool_]:
         """Which cameras are neither inside a shape nor behind a wall, (N,)."""
-        found: NDArray[np.bool_] = np.array([name is None for name in self.inside]) & ~self.behind
-        return found
+        well: NDArray[np.bool_] = np.array([name is None for name in self.inside]) & ~self.behind
+        return well
 
     @property
     def inside_share(self) -> float:
@@ -115,7 +115,7 @@ def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
     lit = reflects_here(si) | (si.shape.is_emitter()) | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
     dark = hit & ~lit
     dr.eval(hit, dark)
-    shares = [np.array(found).reshape(len(views), -1).mean(axis=1, dtype=np.float32) for found in (hit, dark)]
+    shares = [np.array(mask).reshape(len(views), -1).mean(axis=1, dtype=np.float32) for mask in (hit, dark)]
     return shares[0], shares[1]
 
 

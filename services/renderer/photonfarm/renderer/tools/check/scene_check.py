@@ -61,8 +61,8 @@ def _check(named: NamedSpec, work: WorkLog) -> SceneCheck:
     rendered = samples.render(scene, spec, cloud, work)
     low, high = _around(boxes)
     measured = Measured(low, high, placed, rendered)
-    found = collect_findings(spec, named.lights, measured)
-    return SceneCheck(spec, shapes, pictures, room, measured, drawn, found, time.monotonic() - begun)
+    findings = collect_findings(spec, named.lights, measured)
+    return SceneCheck(spec, shapes, pictures, room, measured, drawn, findings, time.monotonic() - begun)
 
 
 def _around(boxes: F32) -> F32:

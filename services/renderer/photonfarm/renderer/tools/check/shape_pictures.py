@@ -124,10 +124,10 @@ def _shade(number: NDArray[np.int64], facing: NDArray[Any], colours: F32) -> Pic
 
 def _edges(number: NDArray[np.int64]) -> NDArray[np.bool_]:
     """Where the pixel to the right or below shows another shape, (H, W)."""
-    found = np.zeros(number.shape, np.bool_)
-    found[:, :-1] |= number[:, :-1] != number[:, 1:]
-    found[:-1] |= number[:-1] != number[1:]
-    return found
+    edges = np.zeros(number.shape, np.bool_)
+    edges[:, :-1] |= number[:, :-1] != number[:, 1:]
+    edges[:-1] |= number[:-1] != number[1:]
+    return edges
 
 
 def shape_colours(scene: Any, geometry: Geometry) -> F32:

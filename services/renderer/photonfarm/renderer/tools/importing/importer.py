@@ -190,7 +190,7 @@ def _measure(text: SpecText, draft: Path, least: float, work: WorkLog) -> SpecTe
     work.begin("choosing the exposure by a quick render")
     draft.write_text(text.text(), encoding="utf-8")
     gc.collect()  # scenes that are collected while Dr.Jit records would end the program
-    found = exposure.propose(load_spec(draft), draft.parent, work, least=least).exposure
-    if found > DARKEST:
-        raise DarkError(f"exposure {found:.3g}")
-    return replace(text, exposure=float(f"{found:.3g}"))
+    proposed = exposure.propose(load_spec(draft), draft.parent, work, least=least).exposure
+    if proposed > DARKEST:
+        raise DarkError(f"exposure {proposed:.3g}")
+    return replace(text, exposure=float(f"{proposed:.3g}"))

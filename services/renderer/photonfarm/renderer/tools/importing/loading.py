@@ -76,12 +76,12 @@ def _explain(message: str, state: Any, objects: list[Element]) -> str:
     import mitsuba as mi
 
     said = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", message).split())
-    found = re.search(r"string \(line \d+, col \d+\)", said)
+    match = re.search(r"string \(line \d+, col \d+\)", said)
     places = [mi.parser.file_location(state, node) for node in state.nodes]
-    if found is None or found[0] not in places:
+    if match is None or match[0] not in places:
         return f"Mitsuba cannot load the scene: {said}"
-    place = elements.place(objects[places.index(found[0])])
-    return f"{place}: Mitsuba cannot load it: {said[found.end() :].lstrip(': ')}"
+    place = elements.place(objects[places.index(match[0])])
+    return f"{place}: Mitsuba cannot load it: {said[match.end() :].lstrip(': ')}"
 
 
 def _drop_unknown(scene: ImportedScene, objects: list[Element], unknown: list[list[str]]) -> None:
@@ -208,7 +208,7 @@ def shapes_of_things(
     `shape_of` and `thing_of` (F,) are the numbers of each face's shape and thing, which is −1 for the room.
     """
     ids = Ids(scene.root)
-    found: list[list[str]] = [[] for _ in range(int(thing_of.max(initial=-1)) + 1)]
+    owned: list[list[str]] = [[] for _ in range(int(thing_of.max(initial=-1)) + 1)]
     split = []
     for number, shape in enumerate(loaded.shapes()):
         faces = thing_of[shape_of == number]
@@ -220,10 +220,10 @@ def shapes_of_things(
             _replace(scene, shape.id(), {made: mesh.part(faces == thing) for thing, made in parts.items()})
         for thing, made in parts.items():
             if thing >= 0:
-                found[thing].append(made)
+                owned[thing].append(made)
     if split:
         scene.changes.note(f"{name_some(split)}: held separate things in one mesh, and became a shape for each")
-    return found
+    return owned
 
 
 def _replace(scene: ImportedScene, shape_id: str, meshes: dict[str, Mesh]) -> None:

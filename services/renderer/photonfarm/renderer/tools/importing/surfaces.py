@@ -131,20 +131,20 @@ class Writer:
             top = SubElement(top, "bsdf")
         return top
 
-    def normals(self, found: Map, strength: float, name: str, *, mirrored: bool, of_all: bool = False) -> Map:
+    def normals(self, part: Map, strength: float, name: str, *, mirrored: bool, of_all: bool = False) -> Map:
         """A normal map of a strength, of x and y or `of_all` of what turns a normal.
 
         Mitsuba's frame is right-handed where images lie mirrored, too.
         """
-        (a, b, _), (c, d, _) = (found.lie or Lie()).rows
+        (a, b, _), (c, d, _) = (part.lie or Lie()).rows
         if b or c or min(a, d) < 0:
             self.note("turns or mirrors the image, and not the directions in it", name)
         if strength == 1 and not mirrored:
-            return found
-        vectors = (2 * found.values - 1) * np.array([strength, -strength if mirrored else strength, 1], np.float32)
+            return part
+        vectors = (2 * part.values - 1) * np.array([strength, -strength if mirrored else strength, 1], np.float32)
         if of_all:
             vectors[..., 2] = 1 + strength * (vectors[..., 2] - 1)
-        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), found.lie)
+        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.lie)
 
     def put_surface(self, place: Element, plugin: str, parts: Mapping[str, Map], *, painted: bool = False) -> None:
         """Put a material by its properties; that of a `painted` mesh has the colours of its vertices."""

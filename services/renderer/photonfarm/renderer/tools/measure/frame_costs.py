@@ -51,8 +51,8 @@ def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:
     camera = Camera.of(view, spec)
     si = first_surfaces(scene, camera, camera.rays(), spec)
     kind = dr.select(si.shape.is_emitter(), mi.UInt32(Surface.EMITTER), _kind_of_lobes(si.bsdf().flags()))
-    found = np.array(dr.select(si.is_valid(), kind, int(Surface.NOTHING)))
-    return found.astype(np.uint8).reshape(camera.height, camera.width)
+    kinds = np.array(dr.select(si.is_valid(), kind, int(Surface.NOTHING)))
+    return kinds.astype(np.uint8).reshape(camera.height, camera.width)
 
 
 def _kind_of_lobes(flags: Any) -> Any:

@@ -80,13 +80,13 @@ def measure(spec: SceneSpec, beside: Path | None, log: Log) -> Measured:
         )
     x, y, z, _ = middles.shape
     space = FreeSpace(of=spec.free_space_digest, cells=(x, y, z), free=pack(free), groups=groups)
-    found = Measured(space, float(sides.max()), float(free.mean()), _share(spec, space))
-    if found.free < LEAST:
+    result = Measured(space, float(sides.max()), float(free.mean()), _share(spec, space))
+    if result.free < LEAST:
         raise NothingFreeError(
-            f"{spec.name}: view.origin: only {found.free:.1%} of it is free beside the groups of a configuration; make "
-            "the box larger, or let groups leave room in it"
+            f"{spec.name}: view.origin: only {result.free:.1%} of it is free beside the groups of a configuration; "
+            "make the box larger, or let groups leave room in it"
         )
-    return found
+    return result
 
 
 def _free(scene: LoadedScene, middles: F32, reach: np.floating) -> NDArray[np.bool_]:
@@ -124,12 +124,12 @@ def _group_boxes(scene: LoadedScene) -> dict[str, tuple[tuple[float, float, floa
     margin = 2 * spec.view.near
     number = {shape.id(): i for i, shape in enumerate(scene.scene.shapes())}
     boxes = scene.boxes.astype(np.float64)
-    found = {}
+    around = {}
     for group in spec.groups:
         own = boxes[[number[shape] for shape in shape_ids(group)]]
         low, high = (own[:, 0].min(axis=0) - margin, own[:, 1].max(axis=0) + margin)
-        found[group.name] = (_round(low - np.array(group.at)), _round(high - np.array(group.at)))
-    return found
+        around[group.name] = (_round(low - np.array(group.at)), _round(high - np.array(group.at)))
+    return around
 
 
 def _round(corner: NDArray[np.float64]) -> tuple[float, float, float]:

@@ -175,14 +175,14 @@ def _find(
     """
     tried: list[Found] = []
     for _ in range(MOST_ROOMS):
-        room = find_room(scene, surfaces, frame, camera, [found.room for found in tried])
+        room = find_room(scene, surfaces, frame, camera, [each.room for each in tried])
         if not room.is_doubtful:
             break
         tried.append(find_things(surfaces, room, objects))
-    if not any(found.things for found in tried):
+    if not any(each.things for each in tried):
         return find_things(surfaces, outdoors(scene, surfaces, frame) if tried else room, objects), False
-    best = max(tried, key=lambda found: found.pieces.area[[*found.moving]].sum())
-    return best, any(found.moving - best.moving for found in tried)
+    best = max(tried, key=lambda each: each.pieces.area[[*each.moving]].sum())
+    return best, any(each.moving - best.moving for each in tried)
 
 
 def _around(extent: Box, frame: Frame, camera: Points | None) -> list[View]:
@@ -253,21 +253,21 @@ def _origin(plan: FloorPlan, scene: Any, frame: Frame) -> Box:
     clear = plan.free(low, high, np.full(2, MARGIN * float(room.size[:2].min())), room.floor)
     wishes = [clear & _find_open(plan, scene, frame, (low, high)), clear, np.ones_like(clear)]
     free = next(wish for wish in wishes if wish.any())
-    found = plan.box_around(free, plan.widest_place(free), room.size[:2])
-    first, last = found or (room.low[:2], room.high[:2])
+    box = plan.box_around(free, plan.widest_place(free), room.size[:2])
+    first, last = box or (room.low[:2], room.high[:2])
     return Box(np.array([*first, low]), np.array([*last, high]))
 
 
 def _find_open(plan: FloorPlan, scene: Any, frame: Frame, heights: tuple[float, ...]) -> Mask:
     """Where cameras stand in the open at all heights: inside no solid, not outside, and not behind something."""
-    found, room = np.ones(plan.shape, np.bool_), plan.room
+    free, room = np.ones(plan.shape, np.bool_), plan.room
     for height in heights:
         places = np.concatenate([plan.middles, np.full((*plan.shape, 1), height)], axis=-1)
         around = surroundings(scene, frame.world(places.reshape(-1, 3)).astype(np.float32))
         inside = (around.leaving <= LEAVING) | (not room.has_ceiling)
         clear = around.clearance > CLEAR * room.height
-        found &= ((around.solid == NONE) & inside & clear).reshape(plan.shape)
-    return found
+        free &= ((around.solid == NONE) & inside & clear).reshape(plan.shape)
+    return free
 
 
 def _look_at(movables: list[Movable], room: Room, origin: Box) -> Box:
@@ -289,7 +289,7 @@ def _look_at(movables: list[Movable], room: Room, origin: Box) -> Box:
 
 def largest_rectangle(free: Mask, row: int, column: int) -> tuple[tuple[int, int], tuple[int, int]]:
     """The first and last cells of the largest rectangle of free cells that contains a free one."""
-    best, found = 0, ((row, column), (row, column))
+    best, corners = 0, ((row, column), (row, column))
     for first in range(row, -1, -1):
         for last in range(row, free.shape[0]):
             blocked = np.flatnonzero(~free[first : last + 1].all(axis=0))
@@ -299,5 +299,5 @@ def largest_rectangle(free: Mask, row: int, column: int) -> tuple[tuple[int, int
                 break
             area = (last - first + 1) * (right - left + 1)
             if area > best:
-                best, found = area, ((first, left), (last, right))
-    return found
+                best, corners = area, ((first, left), (last, right))
+    return corners

@@ -82,10 +82,10 @@ def find_room(scene: Any, surfaces: Surfaces, frame: Frame, camera: Points | Non
         if not np.isfinite(seen[-1].distance).any():
             break
         viewpoints = _along(seen[-1], rng)
-    found, height = np.isfinite(seen[0].distance), seen[0].direction[:, 2]
+    hit, height = np.isfinite(seen[0].distance), seen[0].direction[:, 2]
     level = (height > 0) & (height < LEVEL)
-    backs = seen[0].is_back[found].mean() if found.any() else 1.0
-    if camera is None and (found[level].mean() < OPEN_SHARE or backs > BACKS):
+    backs = seen[0].is_back[hit].mean() if hit.any() else 1.0
+    if camera is None and (hit[level].mean() < OPEN_SHARE or backs > BACKS):
         return around
     low, high, has_ceiling = _sides(_Hits(*map(np.concatenate, zip(*seen, strict=True))), main)
     doubtful = camera is None and bool((high - low).prod() < PART * (main.high - main.low).prod() or backs > PART)
@@ -139,8 +139,8 @@ def _best_viewpoint(scene: Any, frame: Frame, within: Box, rng: np.random.Genera
 
 def _along(hits: _Hits, rng: np.random.Generator) -> Points:
     """Points on the way to what was hit."""
-    found = np.flatnonzero(np.isfinite(hits.distance))
-    chosen = rng.choice(found, min(VIEWPOINTS, len(found)), replace=False)
+    hit = np.flatnonzero(np.isfinite(hits.distance))
+    chosen = rng.choice(hit, min(VIEWPOINTS, len(hit)), replace=False)
     share = rng.uniform(0.2, 0.8, (len(chosen), 1))
     made: Points = hits.origin[chosen] + share * hits.distance[chosen, None] * hits.direction[chosen]
     return made
@@ -175,12 +175,12 @@ def trace(scene: Any, frame: Frame, origin: Points, direction: Points) -> tuple[
 
 def _sides(hits: _Hits, within: Box) -> tuple[Points, Points, bool]:
     """The corners (3,) of the room that was seen, and whether it has a ceiling."""
-    (low, high), found = within, np.isfinite(hits.distance)
-    if not found.any():
+    (low, high), hit = within, np.isfinite(hits.distance)
+    if not hit.any():
         return low, high, False
-    position, normal = (hits.origin + hits.distance[:, None] * hits.direction)[found], hits.normal[found]
+    position, normal = (hits.origin + hits.distance[:, None] * hits.direction)[hit], hits.normal[hit]
     steep = hits.direction[:, 2] > 0.7  # within 45 degrees of up
-    has_ceiling = bool(steep.any() and found[steep].mean() > OPEN_SHARE)
+    has_ceiling = bool(steep.any() and hit[steep].mean() > OPEN_SHARE)
     room_low, room_high = low.copy(), high.copy()
     for axis in range(3):
         for sign, bound in ((1, room_low), (-1, room_high)):

@@ -47,9 +47,9 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
         scene = gltf.read(out, scratch, log)
     except SpecError as error:
         raise SpecError(str(error).replace(str(out), str(path))) from error
-    found, scene.changes = scene.changes, Changes()
+    changes, scene.changes = scene.changes, Changes()
     scene.changes.note("Blender's (x, y, z) is (x, z, −y) here")
-    for change in found:
+    for change in changes:
         for place in change.places or [""]:
             scene.changes.say(change.effect, _NAMES.get(change.name, change.name), change.meaning, place)
     beside: dict[str, Any] = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))

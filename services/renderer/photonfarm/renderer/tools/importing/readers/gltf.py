@@ -62,8 +62,8 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
         log(f"reading {len(file.all('nodes'))} nodes and {len(file.all('meshes'))} meshes of {path.name}")
         _Reader(file, scene, materials).read()
     if scene.root.find("shape") is None:
-        found = "".join(f"\n  {change}" for change in sorted(scene.changes, key=lambda change: not change.effect))
-        raise SpecError(f"{path}: its scene has no triangles; nothing can be rendered{found}")
+        changes = "".join(f"\n  {change}" for change in sorted(scene.changes, key=lambda change: not change.effect))
+        raise SpecError(f"{path}: its scene has no triangles; nothing can be rendered{changes}")
     return scene
 
 

@@ -240,8 +240,8 @@ class GltfFile:
 
 def extension(entry: Node, name: str) -> Node:
     """What an extension says of an entry."""
-    found: Node = entry.get("extensions", {}).get(name, {})
-    return found
+    entries: Node = entry.get("extensions", {}).get(name, {})
+    return entries
 
 
 def numbers(entry: Node, key: str, default: Sequence[float]) -> Floats:

@@ -53,18 +53,18 @@ class Textures:
     scratch: Path
     _last: dict[tuple[int, bool], images.Image] = field(default_factory=dict)  # used twice in a row, mostly
 
-    def map(self, found: Node | None, factor: Sequence[float], channels: slice, *, colour: bool = False) -> Map:
+    def map(self, node: Node | None, factor: Sequence[float], channels: slice, *, colour: bool = False) -> Map:
         """Some channels of an image, times their factors; the factors alone without an image that is read."""
-        image = self._image(found, colour) if found is not None and any(factor) else None
-        if image is None or found is None:
+        image = self._image(node, colour) if node is not None and any(factor) else None
+        if image is None or node is None:
             return constant(*factor)
         if colour:
             image = np.dstack([images.linear(image[..., :3]), image[..., 3:]])
-        return Map(image[..., channels] * np.array(factor, np.float32), self._lie(found))
+        return Map(image[..., channels] * np.array(factor, np.float32), self._lie(node))
 
-    def _image(self, found: Node, colour: bool) -> images.Image | None:
+    def _image(self, node: Node, colour: bool) -> images.Image | None:
         """The pixels of a texture: of the image that all programs read, or else of a format that is read here."""
-        texture, place = self.file.entry("textures", found["index"]), f"texture {found['index']}"
+        texture, place = self.file.entry("textures", node["index"]), f"texture {node['index']}"
         entries = [(name, extension(texture, name)) for name in _FORMATS] + [("", texture)]
         sources = [(name, int(entry["source"])) for name, entry in entries if "source" in entry]
         if not sources:
@@ -84,10 +84,10 @@ class Textures:
             self._last = {(source, colour): images.decode(data, what, raw=not colour)}
         return self._last[source, colour]
 
-    def _lie(self, found: Node) -> Lie:
-        number, moved = self.file.entry("textures", found["index"]).get("sampler"), extension(found, TRANSFORM)
+    def _lie(self, node: Node) -> Lie:
+        number, moved = self.file.entry("textures", node["index"]).get("sampler"), extension(node, TRANSFORM)
         sampler = {} if number is None else self.file.entry("samplers", number)
-        self.file.report(sampler, "colour", f"texture {found['index']}")
+        self.file.report(sampler, "colour", f"texture {node['index']}")
         (u, v), (su, sv) = moved.get("offset", (0, 0)), moved.get("scale", (1, 1))
         c, s = math.cos(moved.get("rotation", 0.0)), math.sin(moved.get("rotation", 0.0))
         wraps = [_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT")]
@@ -123,8 +123,8 @@ class Materials:
 
     def entry(self, number: int | None) -> Node:
         """A material of the file, with its extensions among its properties; None is that of what has none."""
-        found = _UNNAMED if number is None else self.file.entry("materials", number)
-        entry = {**found, **found.get("extensions", {})}
+        material = _UNNAMED if number is None else self.file.entry("materials", number)
+        entry = {**material, **material.get("extensions", {})}
         if (old := entry.get(_OLD)) is not None:
             image, factor = old.get("diffuseTexture"), old.get("diffuseFactor", _WHITE)
             entry["pbrMetallicRoughness"] = {"baseColorTexture": image, "baseColorFactor": factor}
@@ -177,9 +177,9 @@ class Materials:
         return made, writer.light(light, opacity, "emissiveTexture")
 
     def _normals(self, entry: Node, look: Look, writer: Writer) -> Map | None:
-        found = entry.get("normalTexture")
-        strength = found.get("scale", 1.0) if found else 1.0
-        normals = self.textures.map(found, [strength and 1.0] * 3, _RGB)
+        node = entry.get("normalTexture")
+        strength = node.get("scale", 1.0) if node else 1.0
+        normals = self.textures.map(node, [strength and 1.0] * 3, _RGB)
         return writer.normals(normals, strength, TRANSFORM, mirrored=look.mirrored) if normals.lie else None
 
     def _surface(self, entry: Node, colour: Map, painted: bool, writer: Writer) -> tuple[str, dict[str, Map]]:
@@ -220,9 +220,9 @@ class Materials:
         """The properties of `principled`."""
         parts = {"base_color": replace(colour, values=colour.values[..., _RGB])}
         for name, (where, factor, default, image, channel) in _PARTS.items():
-            found = entry.get(where, {})
+            node = entry.get(where, {})
             channels = slice(channel, channel + 1)
-            parts[name] = self.textures.map(found.get(image), [found.get(factor, default)], channels)
+            parts[name] = self.textures.map(node.get(image), [node.get(factor, default)], channels)
         if parts["clearcoat"].values.any() and "clearcoatNormalTexture" in entry[_COAT]:
             writer.lose("clearcoatNormalTexture", "the coat has the normals of what is under it")
         gloss = parts["clearcoat_gloss"]  # whose α is 0.1 without gloss, and 0.001 with all

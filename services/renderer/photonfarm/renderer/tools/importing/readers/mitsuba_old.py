@@ -106,17 +106,17 @@ def _any_up(origin: list[float], target: list[float]) -> str:
 
 def _take(node: Element, name: str, otherwise: str) -> str:
     """The value of a property, which is taken out."""
-    found = elements.child(node, name)
-    if found is None:
+    property_ = elements.child(node, name)
+    if property_ is None:
         return otherwise
-    node.remove(found)
-    return found.get("value", otherwise).lower()
+    node.remove(property_)
+    return property_.get("value", otherwise).lower()
 
 
 def value_of(node: Element, name: str) -> str:
     """The value of a property; empty for one that is not there."""
-    found = elements.child(node, name)
-    return "" if found is None else found.get("value", "")
+    property_ = elements.child(node, name)
+    return "" if property_ is None else property_.get("value", "")
 
 
 def _texture(_: Upgrade, texture: Element) -> None:
@@ -210,7 +210,7 @@ def _glossy(upgrade: Upgrade, bsdf: Element) -> None:
     A Phong lobe of exponent n, around the mirrored direction, is as high as a Beckmann lobe of α = 1 / √(2 (n + 2)).
     """
     for name in ("exponent", "specular_reflectance"):
-        if (found := elements.child(bsdf, name)) is not None and found.tag in ("texture", "ref"):
+        if (child := elements.child(bsdf, name)) is not None and child.tag in ("texture", "ref"):
             upgrade.lose("colour", name, "its texture became the default: a blend has numbers here", bsdf)
     shine = np.array(numbers_of(_take(bsdf, "specular_reflectance", "0.2")))
     diffuse, metal = Element("bsdf", type="diffuse"), Element("bsdf", type="roughconductor")

@@ -120,7 +120,7 @@ def _is_known(node: Element) -> bool:
 def _replace(bsdf: Element) -> str:
     """Make a material what it is on, or else diffuse, with a reflectance that it states; which of them."""
     names = ("reflectance", "diffuse_reflectance", "base_color", "specular_reflectance", "transmittance")
-    stated = next((found for name in names if (found := elements.child(bsdf, name)) is not None), None)
+    stated = next((child for name in names if (child := elements.child(bsdf, name)) is not None), None)
     under = [part for part in bsdf if part.tag == "bsdf" or (part.tag == "ref" and not part.get("name"))]
     bsdf[:] = []
     if under:  # a blend of it with itself, as there may be an id for the material as a whole

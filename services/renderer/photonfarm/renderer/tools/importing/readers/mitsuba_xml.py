@@ -138,14 +138,14 @@ class _Files:
             elif node.tag == "path":
                 node.set("value", str(resolver.resolve(node.get("value", ""))))
                 resolver.prepend(node.get("value", ""))
-            elif (found := Path(str(resolver.resolve(node.get("filename", "/"))))).is_file():
+            elif (included := Path(str(resolver.resolve(node.get("filename", "/"))))).is_file():
                 if node.tag == "include":
-                    if found in (*around, file):
-                        raise SpecError(f"{file}: line {line_of(node)}: {found} includes itself; take this line out")
+                    if included in (*around, file):
+                        raise SpecError(f"{file}: line {line_of(node)}: {included} includes itself; take this line out")
                     inner = mi.FileResolver(resolver)
-                    inner.prepend(str(found.parent))
-                    found = self._copy(found, inner, (*around, file))
-                node.set("filename", str(found.resolve()))
+                    inner.prepend(str(included.parent))
+                    included = self._copy(included, inner, (*around, file))
+                node.set("filename", str(included.resolve()))
         version = tuple(int(part) for part in re.findall(r"\d+", root.get("version", "3")))[:2]
         if version < OLDEST:
             raise SpecError(f"{file}: is of Mitsuba {root.get('version')}; open it in Mitsuba 0.6, and save it there")
@@ -247,10 +247,10 @@ def _drop_settings(root: Element, changes: Changes) -> None:
 
 def _want_one_environment(root: Element) -> None:
     """Raise SpecError for two lights all around, which Mitsuba 3 does not add."""
-    found = [elements.place(node) for node in root.findall("emitter") if node.get("type") in _AROUND]
-    if len(found) > 1:
+    lights = [elements.place(node) for node in root.findall("emitter") if node.get("type") in _AROUND]
+    if len(lights) > 1:
         raise SpecError(
-            f"{' and '.join(found)} light the scene from all around, which in Mitsuba 3 one light can; keep one "
+            f"{' and '.join(lights)} light the scene from all around, which in Mitsuba 3 one light can; keep one "
             '(a sun and a sky are one as <emitter type="sunsky"/>)'
         )
 

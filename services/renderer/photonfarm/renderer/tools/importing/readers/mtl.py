@@ -56,13 +56,13 @@ def statements(file: Path) -> Iterator[tuple[int, str, str]]:
 
 def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[str, Material]:
     """The materials of the `mtllib` statements of a file, by name; of two of one name the first is taken."""
-    found: dict[str, Material] = {}
+    materials: dict[str, Material] = {}
     for file in dict.fromkeys(file for names in stated for file in _libraries(path.parent, names, changes)):
         material: Material | None = None
         for line, word, rest in statements(file):
             if word.lower() == "newmtl":
                 material = Material(rest, file, changes)
-                if found.setdefault(rest, material) is not material:
+                if materials.setdefault(rest, material) is not material:
                     changes.note("is defined twice, and the first is taken", f"{file.name}: line {line}", name=rest)
             elif material is None or not rest:
                 changes.note("has no material or no value, and means nothing", f"{file.name}: line {line}", name=word)
@@ -70,7 +70,7 @@ def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[
                 if material.lines.get(word.lower(), (0, "", rest))[2] != rest:
                     material.say((None, "is stated twice, and the last is taken"), word)
                 material.lines[word.lower()] = (line, word, rest)
-    return found
+    return materials
 
 
 def _libraries(folder: Path, stated: str, changes: Changes) -> Iterator[Path]:
@@ -153,9 +153,9 @@ class Material:
         if not rest:
             return None
         options: dict[str, str] = {}
-        while (found := _OPTION.match(rest)) and not _find(self.file.parent, rest):
-            options[(found[1] or found[3]).lower()] = (found[2] or found[4]).strip().lower()
-            rest = rest[found.end() :]
+        while (option := _OPTION.match(rest)) and not _find(self.file.parent, rest):
+            options[(option[1] or option[3]).lower()] = (option[2] or option[4]).strip().lower()
+            rest = rest[option.end() :]
         file = _locate(self.file.parent, rest, self.changes)
         if file is None:
             self.changes.lose("colour", word, "images are not there", f"{self.file.name}: line {line}: {rest}")

@@ -14,7 +14,7 @@ from photonfarm.core.statistics import block_z_test  # noqa: E402
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, Render  # noqa: E402
 from photonfarm.renderer.strategy.noise import BlockSums, charge_for_missed, pair_errors, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import choose  # noqa: E402
-from photonfarm.renderer.strategy.printed import reasons_for  # noqa: E402
+from photonfarm.renderer.strategy.plan_text import reasons_for  # noqa: E402
 from tests.stability.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)

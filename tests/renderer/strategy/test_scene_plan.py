@@ -16,7 +16,7 @@ from photonfarm.renderer.strategy.budget import ImageCost  # noqa: E402
 from photonfarm.renderer.strategy.candidates import GRID, PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
 from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
-from photonfarm.renderer.strategy.printed import lines, plus_minus  # noqa: E402
+from photonfarm.renderer.strategy.plan_text import lines, plus_minus  # noqa: E402
 from photonfarm.scene.spec import SceneSpec  # noqa: E402
 from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
 

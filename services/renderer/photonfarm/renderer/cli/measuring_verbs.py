@@ -148,7 +148,7 @@ def scene_plan(spec: str, seconds: int, purpose: str, write: bool, again: bool, 
     backend.load(threads=1)
     from photonfarm.renderer.strategy.noise import Purpose
     from photonfarm.renderer.strategy.plan import make_plan
-    from photonfarm.renderer.strategy.printed import lines
+    from photonfarm.renderer.strategy.plan_text import lines
     from photonfarm.renderer.tools import spec_file
 
     file = spec_file.writable(spec) if write else find_spec(spec)

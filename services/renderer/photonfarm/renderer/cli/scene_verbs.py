@@ -81,10 +81,10 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 
     named = NamedSpec.load(spec)
     backend.load()
-    from photonfarm.renderer.tools.check import page, scene_check
+    from photonfarm.renderer.tools.check import scene_check as checking
 
-    check, lines = scene_check.check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
-    page.write(check, lines, out)
+    check, lines = checking.check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
+    checking.write(check, lines, out)
     if as_json:
         show.print_json([finding.document(lines) for finding in check.findings])
         return

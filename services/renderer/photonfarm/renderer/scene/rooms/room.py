@@ -1,4 +1,8 @@
-"""The room `room`: a furnished room, 5.2 × 2.6 × 4.2 m, closed, with nine movable pieces and two ceiling lights.
+"""The two built-in rooms.
+
+`cornell` is a static box, 2 × 2 × 2 m, with a tall and a short block (after Goral et al., SIGGRAPH 1984). The open side
+is at z = 1; the light hangs 5 mm below the ceiling. `room` is a furnished room, 5.2 × 2.6 × 4.2 m, closed, with nine
+movable pieces and two ceiling lights.
 
 x runs right, y up, z towards the front; the origin is in the middle of the floor. Floor and ceiling reach 5 cm beyond
 the walls, so that groups parked at the corner of the bounding box are outside.
@@ -11,14 +15,17 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.rooms import furniture, materials
 from photonfarm.renderer.scene.rooms.materials import diffuse, glossy, metal, textured
-from photonfarm.renderer.scene.rooms.solids import Point, box, join, mesh, quad, rectangle_light
+from photonfarm.renderer.scene.rooms.solids import Point, box, join, mesh, quad, rectangle_light, standing_box
 
 X, Y, Z = 2.6, 2.6, 2.1  # half width, height, half depth
+WHITE, RED, GREEN = (0.73, 0.71, 0.68), (0.60, 0.06, 0.05), (0.12, 0.43, 0.10)
+
 OVERHANG = 0.05
+
+UNIT_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 
 PLACES: dict[str, tuple[Point, float]] = {
     "table": ((-0.9, 0, 0.45), 0.0),
@@ -40,7 +47,7 @@ LIGHT_RADIANCE, LIGHT_SIZE = (10.8, 9.8, 8.2), (1.6, 0.8)  # large and dim: smal
 LIGHT_PLACES = ((-1.2, Y - 0.01, 0.0), (1.2, Y - 0.02, 0.0))  # a centimetre apart, so that they never coincide
 
 
-def describe() -> dict[str, Any]:
+def describe_room() -> dict[str, Any]:
     """The shapes by id, for `mi.load_dict`."""
     shapes = {**_walls(), **_decoration(), **_furniture()}
     for i, place in enumerate(LIGHT_PLACES, start=1):
@@ -60,7 +67,7 @@ def _walls() -> dict[str, Any]:
     walls = {name: mesh(name, solid, diffuse(colour)) for name, (solid, colour) in surfaces.items()}
     floor = quad((-x, 0, z), (2 * x, 0, 0), (0, 0, -2 * z))
     boards = textured(materials.planks((0.50, 0.33, 0.19)), (2, 1))
-    return {"floor": mesh("floor", floor, boards, uv=_unit_uv()), **walls}
+    return {"floor": mesh("floor", floor, boards, uv=UNIT_UV), **walls}
 
 
 def _decoration() -> dict[str, Any]:
@@ -80,8 +87,8 @@ def _decoration() -> dict[str, Any]:
         "skirting": mesh("skirting", skirting, diffuse((0.75, 0.74, 0.71))),
         "door": mesh("door", door, glossy((0.62, 0.58, 0.50), 0.25)),
         "painting-frame": mesh("painting-frame", frame, diffuse(WALNUT)),
-        "painting": mesh("painting", canvas, textured(materials.painting()), uv=_unit_uv()),
-        "rug": mesh("rug", rug, textured(materials.rug((0.50, 0.12, 0.10), (0.72, 0.60, 0.40)), (1, 1)), uv=_unit_uv()),
+        "painting": mesh("painting", canvas, textured(materials.painting()), uv=UNIT_UV),
+        "rug": mesh("rug", rug, textured(materials.rug((0.50, 0.12, 0.10), (0.72, 0.60, 0.40)), (1, 1)), uv=UNIT_UV),
     }
 
 
@@ -136,5 +143,24 @@ def _place(solid: Any, piece: str) -> Any:
     return solid
 
 
-def _unit_uv() -> NDArray[np.float32]:
-    return np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+def describe_cornell() -> dict[str, Any]:
+    """The shapes by id, for `mi.load_dict`."""
+    walls = {
+        "floor": (quad((-1, 0, 1), (2, 0, 0), (0, 0, -2)), WHITE),
+        "ceiling": (quad((-1, 2, -1), (2, 0, 0), (0, 0, 2)), WHITE),
+        "back-wall": (quad((-1, 0, -1), (2, 0, 0), (0, 2, 0)), WHITE),
+        "left-wall": (quad((-1, 0, 1), (0, 0, -2), (0, 2, 0)), RED),
+        "right-wall": (quad((1, 0, -1), (0, 0, 2), (0, 2, 0)), GREEN),
+        "tall-block": (_block((0.6, 1.2, 0.6), (-0.34, 0, -0.30), 0.30), WHITE),
+        "short-block": (_block((0.6, 0.6, 0.6), (0.34, 0, 0.36), -0.29), WHITE),
+    }
+    shapes = {name: mesh(name, solid, diffuse(colour)) for name, (solid, colour) in walls.items()}
+    light = rectangle_light((0, 1.995, 0), (0.5, 0.5), (0, 1, 0), (17.0, 12.0, 5.5))
+    return {**shapes, "ceiling-light": light}
+
+
+def _block(size: tuple[float, float, float], foot: tuple[float, float, float], angle: float) -> Any:
+    block = standing_box(size, (0, 0, 0))
+    block.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 1, 0)))
+    block.apply_translation(foot)
+    return block

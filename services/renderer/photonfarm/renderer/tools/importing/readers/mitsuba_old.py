@@ -17,7 +17,7 @@ import numpy as np
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import elements, images
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
-from photonfarm.renderer.tools.importing.readers.mitsuba_spectra import numbers_of, put, read_old
+from photonfarm.renderer.tools.importing.readers.mitsuba_parts import numbers_of, put_colour, read_old
 
 _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
@@ -89,7 +89,7 @@ class Upgrade:
         elif (colour := read_old(part)) is not None:
             if node.tag == "bsdf" and re.search("reflectance|transmittance", name):
                 colour = colour / max(1.0, float(colour.max()))  # as 0.6 does, to conserve energy
-            put(part, colour)
+            put_colour(part, colour)
 
     def lose(self, effect: Effect, name: str, meaning: str, node: Element) -> None:
         """Say what is lost of an element."""
@@ -229,8 +229,8 @@ def _glossy(upgrade: Upgrade, bsdf: Element) -> None:
     diffuse[:] = [matt]
     base = np.array(numbers_of(matt.get("value", "")))
     total = min(1.0, float(base.max() + shine.max()))  # as 0.6 does, to conserve energy
-    put(matt, base * total / max(float(base.max()), 1e-9))
-    put(elements.put_value(metal, "specular_reflectance", 0.0), np.resize(shine * total / max(*shine, 1e-9), 3))
+    put_colour(matt, base * total / max(float(base.max()), 1e-9))
+    put_colour(elements.put_value(metal, "specular_reflectance", 0.0), np.resize(shine * total / max(*shine, 1e-9), 3))
     bsdf[:] = [diffuse, metal]
     elements.put_value(bsdf, "weight", float(shine.max() / max(1e-9, base.max() + shine.max())))
 

@@ -87,7 +87,8 @@ class LightSwitch:
     def __init__(self, emitter: Any) -> None:
         self._parameters = mi.traverse(emitter)
         keys = [key for key in self._parameters.keys() if key.startswith("radiance.")]  # noqa: SIM118 - no mapping
-        self._lit = {key: _copy(self._parameters[key]) for key in keys if not key.endswith("to_uv")}
+        values = {key: self._parameters[key] for key in keys if not key.endswith("to_uv")}
+        self._lit = {key: type(value)(value) for key, value in values.items()}  # references change with the scene
         self._dark = {key: zeros_like(value) for key, value in self._lit.items()}
 
     def switch(self, on: bool) -> None:
@@ -96,10 +97,6 @@ class LightSwitch:
             self._parameters[key] = value
             dr.make_opaque(self._parameters[key])
         self._parameters.update()
-
-
-def _copy(value: Any) -> Any:
-    return type(value)(value)  # a parameter is a reference, which changes with the scene
 
 
 def _shift(offset: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -119,7 +116,11 @@ class MovableGroup:
     def of(cls, shapes: list[Any]) -> MovableGroup:
         """The group of these shapes, which are placed as modelled."""
         shines = tuple(LightSwitch(shape.emitter()) for shape in shapes if shape.is_emitter())
-        return cls(tuple(_placement(shape) for shape in shapes), shines)
+        placements = (
+            MeshPlacement(shape) if "vertex_positions" in mi.traverse(shape) else TransformPlacement(shape)
+            for shape in shapes
+        )
+        return cls(tuple(placements), shines)
 
     def move(self, translation: F32, *, was_present: bool) -> None:
         """Place the group at `translation` (3,) from rest."""
@@ -137,11 +138,6 @@ class MovableGroup:
     def _switch(self, on: bool) -> None:
         for shine in self.shines:
             shine.switch(on)
-
-
-def _placement(shape: Any) -> MeshPlacement | TransformPlacement:
-    meshed = "vertex_positions" in mi.traverse(shape)
-    return MeshPlacement(shape) if meshed else TransformPlacement(shape)
 
 
 def dim(scene: Any, spec: SceneSpec) -> None:

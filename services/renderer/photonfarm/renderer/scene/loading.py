@@ -121,7 +121,7 @@ def _load_file(spec: SceneSpec, beside: Path | None) -> Any:
         with threads_to_read_with():
             scene = mi.load_file(str(file.path), optimize=False, **spec.scene.parameters)
     except (RuntimeError, ValueError) as error:
-        raise SpecError(f"{file.path}: Mitsuba cannot load it: {_sentence(error)}") from error
+        raise SpecError(f"{file.path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from error
     dim(scene, spec)
     free = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     shining = [emitter for emitter in free if factor_of(emitter, spec) > 0]
@@ -158,7 +158,3 @@ def _describe_added_lights(spec: SceneSpec) -> dict[str, Any]:
         for light in spec.lights
         if light.rectangle is not None
     }
-
-
-def _sentence(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -68,7 +68,7 @@ class Budget:
     def require(self, what: str, more_s: float, best_s: float) -> None:
         """Raise IncompleteError unless `more_s` are left, needed for `what`; `best_s` would do all that is of use."""
         if more_s > self.left_s:
-            least, best = (_tens(self.spent_s + seconds) for seconds in (more_s, max(best_s, more_s)))
+            least, best = (10 * ceil((self.spent_s + seconds) / 10) for seconds in (more_s, max(best_s, more_s)))
             raise IncompleteError(
                 f"{what} does not fit in --seconds {self.seconds:g}: {self.spent_s:.0f} s of processor time are used, "
                 f"and about {max(ceil(more_s), 1)} s more are needed; give it {least}"
@@ -83,10 +83,6 @@ class Budget:
                 return
 
 
-def _tens(seconds: float) -> int:
-    return 10 * ceil(seconds / 10)
-
-
 def affordable(
     render: Render, candidates: Iterable[Candidate], first: Set[Candidate], budget: Budget, edit_s: float, what: str
 ) -> list[Candidate]:
@@ -99,22 +95,22 @@ def affordable(
     compiling: list[float] = []
     images: list[float] = []
 
-    def needed(count: int) -> float:
+    def needed_s(count: int) -> float:
         timed = (LEAST_TURNS + 1) * (1 + RANGE) * count
         of_a_view = max(SCOUTS, count) + 2 * -(-LEAST_PAIRS // LEAST_VIEWS) * count
         rendered_s = (timed + LEAST_VIEWS * of_a_view) * np.mean(images)
         return float(rendered_s + TRACES * count * min(compiling) + EDITS * LEAST_VIEWS * edit_s)
 
     for count, candidate in enumerate(ordered, 1):
-        if count > len(first) and MARGIN * needed(count) + min(compiling) > budget.left_s:
+        if count > len(first) and MARGIN * needed_s(count) + min(compiling) > budget.left_s:
             return ordered[: count - 1]
         for seconds in (compiling, images):
             begun = budget.clock()
             render(candidate, 0, 1)
             seconds.append(budget.clock() - begun)
         if count <= len(first):
-            every = MARGIN * needed(len(ordered)) + (len(ordered) - count) * min(compiling)
-            budget.require(what, needed(len(first)) + (len(first) - count) * min(compiling), every)
+            every = MARGIN * needed_s(len(ordered)) + (len(ordered) - count) * min(compiling)
+            budget.require(what, needed_s(len(first)) + (len(first) - count) * min(compiling), every)
     return ordered
 
 

@@ -10,7 +10,6 @@ import errno
 import shutil
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from redis import Redis
 
@@ -50,17 +49,13 @@ class DiskReserve:
         if self._clock() < self._refused_until:
             return "the disk is full; trying again now and then"
         with store_errors("ask how much of the disk is free", str(self._root)):
-            free = _free_bytes(self._root)
+            free = None if self._root is None else shutil.disk_usage(self._root).free
         if free is None or free >= self._reserve_bytes:
             return None
         return (
             f"{free / 1e9:.1f} GB are free on the disk of {self._root}, and {self._reserve_bytes / 1e9:g} GB are to "
             "stay free (--reserve)"
         )
-
-
-def _free_bytes(root: Path | None) -> int | None:
-    return None if root is None else shutil.disk_usage(root).free
 
 
 def is_full(error: BaseException) -> bool:

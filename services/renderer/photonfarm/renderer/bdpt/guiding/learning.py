@@ -123,17 +123,17 @@ def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Tot
     weight = _weights(images.radiance, lanes, tiles)
     columns = lanes.images * tiles**2
 
-    def weighted(squares: mi.Float) -> mi.Float:
+    def weigh(squares: mi.Float) -> mi.Float:
         column = dr.arange(mi.UInt32, dr.width(squares)) % columns
         return dr.block_sum(squares * dr.gather(mi.Float, weight, column), columns)
 
-    def on_host(*arrays: mi.Float) -> list[F64]:
+    def read(*arrays: mi.Float) -> list[F64]:
         return [np.array(values, np.float64) for values in arrays]
 
     splat_squares, started, edges, connection_squares, connections = totals
-    splats, joined = on_host(weighted(splat_squares), weighted(connection_squares))
-    gain = estimate_gains(layout, splats, float(joined.sum()), *on_host(started, edges, probability))
-    table = None if lanes.shifts is None else estimate_usefulness(joined, *on_host(connections))
+    splats, joined = read(weigh(splat_squares), weigh(connection_squares))
+    gain = estimate_gains(layout, splats, float(joined.sum()), *read(started, edges, probability))
+    table = None if lanes.shifts is None else estimate_usefulness(joined, *read(connections))
     return LightGuide.of(StartGuide.of(layout, gain), table)
 
 

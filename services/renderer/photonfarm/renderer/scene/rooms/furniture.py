@@ -19,8 +19,10 @@ def table() -> Parts:
     """A dining table, 1.5 × 0.8 × 0.75, with a bowl on it."""
     top = box((1.5, 0.045, 0.8), (0, 0.7275, 0))
     apron = box((1.34, 0.07, 0.64), (0, 0.67, 0))
-    bowl = [(0, 0), (0.07, 0), (0.13, 0.05), (0.165, 0.12), (0.155, 0.12), (0.12, 0.055), (0.06, 0.015), (0, 0.015)]
-    return {"wood": join(top, apron, *legs(1.4, 0.7, 0.705, 0.06)), "bowl": _raise(lathe(bowl), 0.75)}
+    profile = [(0, 0), (0.07, 0), (0.13, 0.05), (0.165, 0.12), (0.155, 0.12), (0.12, 0.055), (0.06, 0.015), (0, 0.015)]
+    bowl = lathe(profile)
+    bowl.apply_translation((0, 0.75, 0))
+    return {"wood": join(top, apron, *legs(1.4, 0.7, 0.705, 0.06)), "bowl": bowl}
 
 
 def chair() -> Parts:
@@ -92,11 +94,6 @@ def vase() -> Parts:
     outer = [(0, 0), (0.11, 0), (0.13, 0.05), (0.20, 0.28), (0.19, 0.42), (0.09, 0.60), (0.075, 0.66), (0.12, 0.75)]
     inner = [(0.105, 0.75), (0.06, 0.66), (0.075, 0.59), (0.17, 0.41), (0.18, 0.28), (0.11, 0.06), (0, 0.03)]
     return {"copper": lathe(outer + inner, 48)}
-
-
-def _raise(mesh: Any, height: float) -> Any:
-    mesh.apply_translation((0, height, 0))
-    return mesh
 
 
 def _leaning(mesh: Any, place: tuple[float, float, float]) -> Any:

@@ -95,15 +95,13 @@ class Pictures:
         whole image has half the variance of its halves: what they lose against it, it loses against the noise-free
         image.
         """
-        return self.noisy_means(exposure) + self._lower(exposure)
+        whole = self.noisy_means(exposure)
+        halves = [_means(self.halves[:, half], exposure) for half in (0, 1)]
+        return whole + (whole - np.mean(halves, axis=0))
 
     def noisy_means(self, exposure: float) -> NDArray[np.float64]:
         """The display mean of each view's whole image with its noise, (N,)."""
         return _means(self.halves.mean(axis=1), exposure)
-
-    def _lower(self, exposure: float) -> NDArray[np.float64]:
-        halves = [_means(self.halves[:, half], exposure) for half in (0, 1)]
-        return self.noisy_means(exposure) - np.mean(halves, axis=0)
 
     def exposure(self, target: float) -> float | None:
         """The exposure at which the mean over all views is `target`; None if none is high enough."""

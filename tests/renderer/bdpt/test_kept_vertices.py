@@ -40,10 +40,16 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> tuple[KeptVertex, list[dict[str, np
     sequence = randomness.stream(randomness.image_keys([3]), randomness.PHOTONS)
     rng = randomness.sampler(sequence + dr.zeros(mi.UInt32, PATHS), path)
     vertices = light_paths.trace_light_paths(
-        scene, scene.sensors()[0], read_lights(scene),
+        scene,
+        scene.sensors()[0],
+        read_lights(scene),
         PathOptions(EDGES, 99, 1, mi.Float(1), mi.Float(1), connects=True, traces_light=False),
-        rng=rng, path=path, paths=dr.opaque(mi.UInt32, PATHS), offset=mi.Float([0.5]), splat=cast(Any, None),
-    )  # fmt: skip
+        rng=rng,
+        path=path,
+        paths=dr.opaque(mi.UInt32, PATHS),
+        offset=mi.Float([0.5]),
+        splat=cast(Any, None),
+    )
     assert vertices is not None
     return vertices.read(path, mi.Bool(True)), steps
 

@@ -26,8 +26,10 @@ SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """The vertices (8, 3) and faces (12, 3) of a box whose faces look outwards."""
-    corners = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]]
-                        for i in (0, 1) for j in (0, 1) for k in (0, 1)], "<f4")  # fmt: skip
+    corners = np.array(
+        [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)],
+        "<f4",
+    )
     return corners, np.array([f for a, b, c, d in SIDES for f in ((a, b, c), (a, c, d))], "<u4")
 
 

@@ -47,9 +47,26 @@ def encoded_as(kind: str) -> bytes:
 
 @pytest.mark.parametrize(
     "kind",
-    ["PNG L", "PNG LA", "PNG P", "PNG RGB", "PNG RGBA", "PNG 16", "PNG 16 RGB", "JPEG L", "JPEG CMYK", "WEBP RGB",
-     "GIF P", "BMP L", "TGA RGB", "TIFF 16", "TIFF F", "OpenEXR", "RGBE"],
-)  # fmt: skip
+    [
+        "PNG L",
+        "PNG LA",
+        "PNG P",
+        "PNG RGB",
+        "PNG RGBA",
+        "PNG 16",
+        "PNG 16 RGB",
+        "JPEG L",
+        "JPEG CMYK",
+        "WEBP RGB",
+        "GIF P",
+        "BMP L",
+        "TGA RGB",
+        "TIFF 16",
+        "TIFF F",
+        "OpenEXR",
+        "RGBE",
+    ],
+)
 def test_images_of_every_depth_have_their_values(kind: str) -> None:
     image = images.decode(encoded_as(kind), "it")
     assert image.shape == (1, 2, 4)
@@ -59,9 +76,15 @@ def test_images_of_every_depth_have_their_values(kind: str) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"no image", b"#?RADIANCE", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 8\nabc", b"PF\n3 3\n-1\nabc",
-     b"\x76\x2f\x31\x01\x02\0\0\0"],
-)  # fmt: skip
+    [
+        b"",
+        b"no image",
+        b"#?RADIANCE",
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 8\nabc",
+        b"PF\n3 3\n-1\nabc",
+        b"\x76\x2f\x31\x01\x02\0\0\0",
+    ],
+)
 def test_what_is_no_image_or_cut_off_is_told_without_addresses_and_temporary_files(data: bytes) -> None:
     with pytest.raises(SpecError, match=r"^it: is not a readable image: ") as raised:
         images.decode(data, "it")

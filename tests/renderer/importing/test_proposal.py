@@ -235,9 +235,12 @@ def test_the_largest_rectangle_is_that_of_all_rectangles() -> None:
             assert free[top : bottom + 1, left : right + 1].all()
             best = max(
                 (b - t + 1) * (r - c + 1)
-                for t in range(row + 1) for b in range(row, 7) for c in range(column + 1) for r in range(column, 9)
+                for t in range(row + 1)
+                for b in range(row, 7)
+                for c in range(column + 1)
+                for r in range(column, 9)
                 if free[t : b + 1, c : r + 1].all()
-            )  # fmt: skip
+            )
             assert (bottom - top + 1) * (right - left + 1) == best
 
 

@@ -172,8 +172,11 @@ def test_no_camera_stands_in_a_cube_on_a_floor_which_gets_a_sky(
 def test_a_room_is_the_same_in_other_units_and_elsewhere(
     quick: None, gltf: Any, run: Callable[..., Result], scale: float, shift: float, unit: str | None
 ) -> None:
-    for name, low, high, light in (("Shell", (0, 0, 0), (5, 2.6, 4), 0), ("Table", (2, 0, 1.5), (3.2, 0.75, 2.2), 0),
-                                   ("Lamp", (2, 2.5, 1.6), (2.6, 2.58, 2.2), 1)):  # fmt: skip
+    for name, low, high, light in (
+        ("Shell", (0, 0, 0), (5, 2.6, 4), 0),
+        ("Table", (2, 0, 1.5), (3.2, 0.75, 2.2), 0),
+        ("Lamp", (2, 2.5, 1.6), (2.6, 2.58, 2.2), 1),
+    ):
         mesh = trimesh.creation.box(bounds=[low, high])
         if name == "Shell":
             mesh.invert()

@@ -82,8 +82,9 @@ def test_other_images_of_a_scene_have_the_display_mean_that_was_wanted(quick: No
 
 def test_where_too_much_is_black_it_is_said_how_bright_it_can_get(quick: None) -> None:
     described = cornell()
-    away = described.view.model_copy(update={"look_at": described.view.look_at.model_copy(
-        update={"min": (0.0, 1.0, 9.0), "max": (0.0, 1.0, 9.0)})})  # fmt: skip
+    away = described.view.model_copy(
+        update={"look_at": described.view.look_at.model_copy(update={"min": (0.0, 1.0, 9.0), "max": (0.0, 1.0, 9.0)})}
+    )
     with pytest.raises(DarkError, match="stays below 0"):
         propose(described.model_copy(update={"view": away}), None, WorkLog(lambda _: None), frames=2)
 

@@ -211,8 +211,13 @@ def test_each_part_is_charged_with_its_own_seconds(
     monkeypatch.setattr(PartialFilm, "render", takes(lambda film, *_: film.spec.film.width, lambda *_: None))
     costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[4, 1], timed=2)
     assert costs.medians() == {
-        "edit_s": 1, "buffers_s": 10, "guides_s": 1000, "points_s": 4096, "photons_s": 100, "photons_seen_s": 8192
-    }  # fmt: skip
+        "edit_s": 1,
+        "buffers_s": 10,
+        "guides_s": 1000,
+        "points_s": 4096,
+        "photons_s": 100,
+        "photons_seen_s": 8192,
+    }
     assert costs.render_medians() == {4: 12, 1: 24}
 
 

@@ -64,8 +64,13 @@ SHAPES = """
 
 def of_file(file_scene: Any, folder: Path, **view: Any) -> LoadedScene:
     low, high = [-4, 0.2, -3], [4, 2.8, 3]  # larger than the room, whose floor is 6 × 4
-    crate = {"name": "crate", "shapes": ["Crate"], "at": [1.5, 0, 0], "removal_probability": 0,
-             "box": {"min": [-2.5, 0, -1.5], "max": [2.5, 0, 1.5]}}  # fmt: skip
+    crate = {
+        "name": "crate",
+        "shapes": ["Crate"],
+        "at": [1.5, 0, 0],
+        "removal_probability": 0,
+        "box": {"min": [-2.5, 0, -1.5], "max": [2.5, 0, 1.5]},
+    }
     box = {"min": low, "max": high}
     look_at = {"min": [-2.5, 0.5, -1.5], "max": [2.5, 2.5, 1.5]}
     return file_scene(folder, SHAPES, objects=[crate], view={"origin": box, "look_at": look_at, **view})

@@ -180,8 +180,9 @@ def test_savings_are_ratios_of_time_to_equal_error() -> None:
     """Plain path tracing has 9 samples in 0.1 s, (0, 1) has 4 and (1, 1) has 2: 0.2/9, 0.05/4, 0.05/2."""
     found = plan_of(spec_with(), measurement(), cached=False)
     assert [(s.over, s.factor) for s in found.savings] == [
-        (PLAIN, pytest.approx(0.2 / 9 / (0.05 / 4))), (JOINED, pytest.approx(2)),
-    ]  # fmt: skip
+        (PLAIN, pytest.approx(0.2 / 9 / (0.05 / 4))),
+        (JOINED, pytest.approx(2)),
+    ]
     assert found.savings[0].spread == pytest.approx(0.2 / 9 / (0.05 / 4) * 0.1 / 3**0.5)
     text = text_of(found)
     for sentence in (

@@ -266,9 +266,12 @@ def test_a_redis_that_refuses_for_good_ends_a_worker_with_a_sentence(
     def work() -> None:
         try:
             run_worker(
-                tmp_path / "store", redis_server.url.replace("://", "://ada:secret@"), child=analytic.command(),
-                idle_s=1, reserve_bytes=0,
-            )  # fmt: skip
+                tmp_path / "store",
+                redis_server.url.replace("://", "://ada:secret@"),
+                child=analytic.command(),
+                idle_s=1,
+                reserve_bytes=0,
+            )
         except QueueError as error:
             ended.append(error)
 

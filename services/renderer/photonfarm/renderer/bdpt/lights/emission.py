@@ -34,7 +34,7 @@ from photonfarm.renderer.bdpt.lights.selection import (
     read_selection,
     sampling_weight,
 )
-from photonfarm.renderer.bdpt.lights.shapes import Spheres, column, cones, is_unmirrored
+from photonfarm.renderer.bdpt.lights.shapes import Spheres, column, cones, is_textured, is_unmirrored, registry_id
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
 from photonfarm.renderer.bdpt.scenes import bounding_box, bounding_sphere
 
@@ -115,7 +115,7 @@ class Lights:
         Raises ValueError for a guide of another number of lights.
         """
         emitters = list(scene.emitters())
-        ids = [_registry_id(emitter) for emitter in emitters]
+        ids = [registry_id(emitter) for emitter in emitters]
         return replace(self, guided=GuidedStarts.bind(guide, self.emit_probability, ids, rectangles(emitters)))
 
     def gain(
@@ -147,8 +147,8 @@ def read_lights(scene: mi.Scene) -> Lights:
     """The scene's lights as they are now, by some small arrays and one small kernel, without host synchronisation."""
     emitters = list(scene.emitters())
     n = len(emitters)
-    ids = [_registry_id(emitter) for emitter in emitters]
-    shapes = {_registry_id(shape.emitter()): shape for shape in scene.shapes() if shape.is_emitter()}
+    ids = [registry_id(emitter) for emitter in emitters]
+    shapes = {registry_id(shape.emitter()): shape for shape in scene.shapes() if shape.is_emitter()}
     kinds = tuple(_kind(emitter, shapes.get(key)) for emitter, key in zip(emitters, ids, strict=True))
     parameters = [mi.traverse(emitter) for emitter in emitters]
     pointers = scene.emitters_dr()
@@ -158,7 +158,7 @@ def read_lights(scene: mi.Scene) -> Lights:
     weights = [sampling_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
-            has_densities = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if _is_textured(emitters[i]) else True)
+            has_densities = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if is_textured(emitters[i]) else True)
             weights[i] = dr.select(has_densities, weights[i], 0)
         elif kinds[i] == AREA and shapes[key].class_name() == "Cylinder":
             weights[i] = dr.select(is_unmirrored(shapes[key]), weights[i], 0)
@@ -197,11 +197,6 @@ def read_lights(scene: mi.Scene) -> Lights:
     )
 
 
-def _registry_id(emitter: mi.Emitter) -> int:
-    """Dr.Jit's registry id of an emitter; it is a literal, so reading it waits for nothing."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
-
-
 def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
     """The kind of a light; ``shape`` is the shape that carries it, if any."""
     kind = _KIND_BY_CLASS.get(emitter.class_name(), EYE_ONLY)
@@ -209,7 +204,7 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
         return kind
     if shape is None:
         return HIT_ONLY  # on an instanced shape: it can be hit, but has no place of its own to be sampled from
-    if _is_textured(emitter) and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
+    if is_textured(emitter) and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
         return HIT_ONLY  # Mitsuba's sampling of such a light does not know the surface's texture coordinates
     return AREA
 
@@ -219,10 +214,6 @@ def _normalise(weight: mi.Float, n: int) -> tuple[mi.Float, mi.Float]:
     cdf = dr.cumsum(weight) if n > 1 else weight
     total = dr.gather(mi.Float, cdf, mi.UInt32(n - 1))
     return cdf, dr.select(total > 0, weight / total, 0)
-
-
-def _is_textured(emitter: mi.Emitter) -> bool:
-    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
 
 
 # ------------------------------------- Next event estimation (y₀ from x) -------------------------------------

@@ -1,6 +1,6 @@
 """What the starts of light paths need to know of the lights' shapes.
 
-These are the cones of spot lights, the normals of spheres, and which cylinders are mirrored.
+These are the cones of spot lights, the normals of spheres, which cylinders are mirrored, and which lights are textured.
 
 All of it is data in device memory, so that edits in place change no kernel. Index letter: N lights.
 """
@@ -35,6 +35,16 @@ def cones(parameters: Sequence[mi.SceneParameters], emitters: Sequence[mi.Emitte
         axes.append(dr.normalize(params["to_world"] @ mi.Vector3f(0, 0, 1)) if spot else mi.Vector3f(0, 0, 1))
         cosines.append(dr.cos(dr.deg2rad(params["cutoff_angle"])) if spot else mi.Float(-1))
     return mi.Vector3f(*(column(n, [axis[k] for axis in axes]) for k in range(3))), column(n, cosines)
+
+
+def registry_id(emitter: mi.Emitter) -> int:
+    """Dr.Jit's registry id of an emitter; it is a literal, so reading it waits for nothing."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
+
+
+def is_textured(emitter: mi.Emitter) -> bool:
+    """Whether a light's radiance is a texture."""
+    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
 
 
 def is_unmirrored(cylinder: mi.Shape) -> mi.Bool:

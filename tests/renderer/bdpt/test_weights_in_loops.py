@@ -73,7 +73,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     monkeypatch.setattr(light_paths, "loop_once", keeping(found.light))
     for name in ("hit_emitter", "next_event", "light_tracing"):
         keep_results(weights, name, found.weights.setdefault(name, []))
-    over_r2, connect, draw = weights.connection_over_r2, eye_paths._connect, KeptVertices.drawn
+    over_r2, connect, draw = weights.connection_over_r2, eye_paths._connect, KeptVertices.draw
 
     def keep_connection(count: Any, r2: Any, *sums: Any) -> Any:
         found.r2.append(r2)
@@ -91,7 +91,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
         return value
 
     monkeypatch.setattr(weights, "connection_over_r2", keep_connection)
-    monkeypatch.setattr(KeptVertices, "drawn", keep_path)
+    monkeypatch.setattr(KeptVertices, "draw", keep_path)
     monkeypatch.setattr(eye_paths, "_connect", evaluated)
     keep_results(eye_paths, "sample_direct", found.direct)
     starts: list[Any] = []

@@ -128,16 +128,16 @@ def write(check: SceneCheck, lines: SpecLines, out: Path) -> None:
 
 def page(check: SceneCheck, lines: SpecLines) -> str:
     """The page."""
-    spec, samples = check.spec, check.measured.samples
+    spec, seen = check.spec, check.measured.samples
     groups = [
         (group, COLOURS[number % len(COLOURS)], placed)
         for number, (group, placed) in enumerate(zip(spec.groups, check.measured.placed, strict=True))
     ]
     shown = [
         (each, [g.name for g, there in zip(spec.groups, each.modification.present, strict=True) if not there])
-        for each in samples.shown
+        for each in seen.shown
     ]
-    exposed = spec.exposure * np.nan_to_num(samples.images.halves.mean(axis=1))
+    exposed = spec.exposure * np.nan_to_num(seen.images.halves.mean(axis=1))
     return render_page(
         TEMPLATE,
         title=f"photonfarm: {spec.name}",
@@ -149,9 +149,9 @@ def page(check: SceneCheck, lines: SpecLines) -> str:
         shown=shown,
         cameras=_camera_facts(check),
         light=_light_facts(check),
-        seen=_bars(samples.cameras.seen, (0.0, float(max(samples.cameras.seen.max(), 1e-6)))),
+        seen=_bars(seen.cameras.seen, (0.0, float(max(seen.cameras.seen.max(), 1e-6)))),
         brightness=_bars(display_values(exposed.astype(np.float32)).mean(axis=-1), (0.0, 1.0)),
-        most_seen=f"{100 * float(samples.cameras.seen.max()):.0f} %",
+        most_seen=f"{100 * float(seen.cameras.seen.max()):.0f} %",
         sections=_sections(check),
         limits={"outside": OUTSIDE, "cut": CUT_AT_ALL},
     )

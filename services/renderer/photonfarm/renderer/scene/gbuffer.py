@@ -54,11 +54,12 @@ RAYS = 1 << 20
 def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | None = None) -> ViewBuffers:
     """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is hit.
 
-    With a `recorder` of `look`, Python runs only the first time; it takes half of the time in scenes of many materials.
+    With a `recorder` of `trace_first_surfaces`, Python runs only the first time; it takes half of the time in scenes of
+    many materials.
     """
     camera = Camera.of(view, spec)
     directions = camera.rays()
-    hit, normal, distance = _record_look("centre", scene, _rays(camera, directions, spec), recorder)
+    hit, normal, distance = _trace_recorded("centre", scene, _rays(camera, directions, spec), recorder)
     along = directions.reshape(-1, 3).astype(np.float64) @ camera.forward
     depth = np.where(np.array(hit), spec.view.near + np.array(distance) * along, 0)
     shape = (camera.height, camera.width)
@@ -74,7 +75,7 @@ def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec, recorder: Recorder
     total = np.zeros((camera.height, camera.width, 3))
     for start in range(0, len(within), at_once):
         directions = np.stack([camera.rays(u, v) for u, v in within[start : start + at_once]])
-        (albedo,) = _record_look("albedo", scene, _rays(camera, directions, spec), recorder)
+        (albedo,) = _trace_recorded("albedo", scene, _rays(camera, directions, spec), recorder)
         total += rows(albedo, *directions.shape[:-1]).sum(axis=0, dtype=np.float64)
     return (total / len(within)).astype(np.float32)
 
@@ -84,15 +85,15 @@ Rays = tuple[Any, Any, Any]
 """The origins (Point3f), directions (Vector3f) and lengths (Float) of rays."""
 
 
-def _record_look(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tuple[Any, ...]:
-    """The result of `look`, recorded by `what` and the number of rays."""
+def _trace_recorded(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tuple[Any, ...]:
+    """The result of `trace_first_surfaces`, recorded by `what` and the number of rays."""
     if recorder is None:
-        return look(scene, None, *rays, what)
+        return trace_first_surfaces(scene, None, *rays, what)
     columns: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
     return columns
 
 
-def look(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
+def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
     """The hits, normals and distances of the first surfaces that rays meet, or their albedo; zeros without a hit."""
     si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
     hit = si.is_valid()

@@ -49,7 +49,7 @@ class LoadedScene:
         paths_at_once = paths_at_once or backend.paths_at_once()
         self._integrator = integrator_of(spec.transport, paths_at_once)
         self.samples_at_once = 1 if paths_at_once is None else _samples_at_once(spec, paths_at_once)
-        self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
+        self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.trace_first_surfaces)
         self._guide_recorder, self._point_recorder = Recorder(guides.trace), Recorder(guides.irradiance)
         self._materials = Materials.of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}

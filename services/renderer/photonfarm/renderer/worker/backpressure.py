@@ -92,7 +92,7 @@ class TrainerPace:
         """The scenes of which no job should be taken now: the reason, by scene id. Raises redis.RedisError."""
         if self._clock() >= self._due:
             began = self._clock()
-            self._ahead = self._look()
+            self._ahead = self._find_ahead()
             self._due = self._clock() + pause_after_look(self._clock() - began, AHEAD_LOOK_S)
         return self._ahead
 
@@ -102,7 +102,7 @@ class TrainerPace:
             return self._store.each(_progress)[0]
         return {self._scene_id: _progress(self._store.scene(self._scene_id))}
 
-    def _look(self) -> dict[str, str]:
+    def _find_ahead(self) -> dict[str, str]:
         committed = {
             scene_id: progress.committed_samples
             for scene_id, progress in self._progress().items()

@@ -198,7 +198,7 @@ class ShareSource(JobSource):
         looked = bool(paused)
         while not looked:  # what was left at the last look may have been rendered by others
             if looked := not self._waiting or time.monotonic() >= self._look_due:
-                self._look()
+                self._list_missing()
             while self._waiting:
                 job = self._waiting.popleft()
                 if job.scene_id not in left and self._store.scene(job.scene_id).is_to_do(job.job):
@@ -206,7 +206,7 @@ class ShareSource(JobSource):
                     return job
         return None
 
-    def _look(self) -> None:
+    def _list_missing(self) -> None:
         """List what is missing, without what has failed too often; what has failed comes last."""
         self._store.check()
         began = time.monotonic()

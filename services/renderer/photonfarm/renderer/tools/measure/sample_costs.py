@@ -166,7 +166,7 @@ def _measure_frame(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _F
     modification = sample_modification(spec, SEED, number)
     view = sample_view(spec, modification.key(spec.radiance_id), SEED, number, modification)
     configuration_s, (points, photons) = time_work(partial(_configure, scene, cloud, modification))
-    view_s, _ = time_work(partial(_look, scene, view, points, photons))
+    view_s, _ = time_work(partial(_render_buffers, scene, view, points, photons))
     guides_s, _ = time_work(partial(_guide, scene, view, cloud, modification))
     few = fewer_samples(spec)
     few_s, halves = time_work(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
@@ -185,7 +185,9 @@ def _configure(
     return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.radiance_id))[0]
 
 
-def _look(scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None) -> None:
+def _render_buffers(
+    scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
+) -> None:
     """Render the buffers of a view, and which points and photons it sees."""
     scene.buffers(view)
     visibility_of(scene, view, points, photons)

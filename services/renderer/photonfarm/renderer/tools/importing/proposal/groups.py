@@ -122,7 +122,7 @@ class _Search:
         why = np.where(glows, self._why_fixed(), MOVES)
         loose = np.where(glows, why == MOVES, ~self._is_shell()) & (not self.room.is_stage)
         group = self._group(loose, glows)
-        things, lit = [], self._beside_lights(group)
+        things, lit = [], self._near_lights(group)
         for number, built_in in enumerate(self._find_built_in(group)):
             thing = self._thing(np.flatnonzero(group == number), bool(built_in))
             if isinstance(thing, Thing) and not lit[number]:
@@ -231,7 +231,7 @@ class _Search:
                 joined.append((number, others[int(np.argmin(distance))]))
         return np.array(joined, np.int64).reshape(-1, 2)
 
-    def _beside_lights(self, group: Labels) -> NDArray[np.bool_]:
+    def _near_lights(self, group: Labels) -> NDArray[np.bool_]:
         """Which groups are around a light without a shape or, where none is, nearest to it and near, (T,)."""
         light = self.surfaces.lights[:, None]
         distance = _distance(*self._bounds(group), light, light)

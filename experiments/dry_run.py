@@ -58,9 +58,9 @@ class Need:
 
 def measure_need(experiment: Experiment) -> Need:
     """What an experiment needs, its scene's costs measured here. Raises SpecError."""
-    from photonfarm.renderer.measure.sample_costs import measured_costs
+    from photonfarm.renderer.tools.measure.sample_costs import measure_costs
 
-    return Need.of(experiment, measured_costs(experiment.spec(), frames=FRAMES))
+    return Need.of(experiment, measure_costs(experiment.spec(), frames=FRAMES))
 
 
 def count_operations(spec: SceneSpec, run: Run) -> float:

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.readers import blender
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.readers import blender
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 

@@ -15,11 +15,9 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec
 from photonfarm.scene.view import View
 
-
-@pytest.fixture(autouse=True, scope="session")
-def one_thread() -> None:
-    """Equal seeds give equal bytes with one thread only: light splats are then added in a fixed order."""
-    backend.load(threads=1)
+# Modules bind Mitsuba's types on import. Equal seeds give equal bytes with one thread only: light splats are then added
+# in a fixed order.
+backend.load(threads=1)
 
 
 @pytest.fixture(scope="session")

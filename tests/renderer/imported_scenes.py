@@ -10,11 +10,11 @@ from xml.etree.ElementTree import Element
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.loading import load
-from photonfarm.renderer.importing.proposal.proposed import Proposal, propose
-from photonfarm.renderer.importing.proposal.surfaces import Frame
-from photonfarm.renderer.importing.readers import reader_of
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.loading import load
+from photonfarm.renderer.tools.importing.proposal.proposed import Proposal, propose
+from photonfarm.renderer.tools.importing.proposal.surfaces import Frame
+from photonfarm.renderer.tools.importing.readers import reader_of
 
 Read = Callable[[Path], ImportedScene]
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]

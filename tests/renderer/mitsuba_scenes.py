@@ -10,7 +10,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 

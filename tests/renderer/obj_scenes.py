@@ -9,7 +9,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 

@@ -45,16 +45,28 @@ def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, sca
     """`scatter`: how far the errors of three views differ from their mean; √3 times the standard error of a ratio."""
     own = tuple(error * (1 + scatter * d) for d in (-1, 0, 1)) if candidate != PLAIN else (error,) * 3
     return CandidateRow(
-        candidate=candidate, missed=0.0, cost=ImageCost(fixed_s, sample_s),
+        candidate=candidate,
+        missed=0.0,
+        cost=ImageCost(fixed_s, sample_s),
         errors=RelativeErrors(images=12, own=own, plain=(0.2,) * 3),
-    )  # fmt: skip
+    )
 
 
 def measurement(*rows: CandidateRow) -> Measurement:
     """The measurement of a spec with (1, 1) and 2 samples per pixel."""
     default = (row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.05, 0.02, 0.02), row(JOINED, 0.05, 0.02, 0.04))
     return Measurement(
-        purpose=Purpose.IMAGES, film=Film(width=16, height=16), spp=2, half_s=0.1, views=3,
-        modelled=("lights: 1 area",), left_out=(), rows=rows or default, shared=0.0,
-        near=((1.0, 0.9, 0.8),), power=((0.7, 0.295, 0.005),), asked_s=60.0, spent_s=5.0,
-    )  # fmt: skip
+        purpose=Purpose.IMAGES,
+        film=Film(width=16, height=16),
+        spp=2,
+        half_s=0.1,
+        views=3,
+        modelled=("lights: 1 area",),
+        left_out=(),
+        rows=rows or default,
+        shared=0.0,
+        near=((1.0, 0.9, 0.8),),
+        power=((0.7, 0.295, 0.005),),
+        asked_s=60.0,
+        spent_s=5.0,
+    )

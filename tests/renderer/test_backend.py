@@ -8,8 +8,7 @@ import nvidia_driver
 import pytest
 
 from photonfarm.core.errors import BackendError
-from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.native import gathers
+from photonfarm.renderer.scene import backend, native
 
 LOAD = "from photonfarm.renderer.scene import backend; print(backend.load(1).variant())"
 
@@ -36,39 +35,43 @@ def test_mitsuba_is_loaded_with_the_plugin_registered() -> None:
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the feature is one of x86-64")
 def test_a_kernel_with_gather_instructions_has_the_same_bits() -> None:
-    """On any processor, as if it were one on which they are faster."""
     code = """
+import os
 import drjit as dr
 from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.native import gathers
+from photonfarm.renderer.scene import native
 
 mi = backend.load(1)
 
-def gathered():
+def gather():
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         i = dr.arange(mi.UInt32, 1001)
         table = dr.sqrt(mi.Float(i))
         dr.eval(i, table)
-        found = dr.gather(mi.Float, table, (i * 7919) % 1001, i % 3 > 0)
-        dr.eval(found)
-        return list(found), [kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel][-1]
+        values = dr.gather(mi.Float, table, (i * 7919) % 1001, i % 3 > 0)
+        dr.eval(values)
+        return list(values), [kernel["ir"].getvalue() for kernel in dr.kernel_history() if "ir" in kernel][-1]
 
-usual = gathers.FEATURE in gathers.target()[1]
-before, _ = gathered()
-gathers.FASTER_ON = {gathers.target()[0]}
-gathers.use_where_faster()
-after, kernel = gathered()
-print(usual, before == after, gathers.FEATURE in kernel, gathers.target()[1].count(gathers.FEATURE))
+before, _ = gather()
+os.environ[native.GATHERS_VARIABLE] = "1"
+native.use_gathers_if_asked()
+after, kernel = gather()
+print(before == after, native.FEATURE in kernel, native.target()[1].count(native.FEATURE))
 """
     done = run(code)
-    usual = gathers.target()[0] in gathers.FASTER_ON
-    assert done.stdout.split() == [str(usual), "True", "True", "1"], done.stderr
+    assert done.stdout.split() == ["True", "True", "1"], done.stderr
 
 
 def test_a_dr_jit_without_the_functions_renders_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gathers, "_SET", "no_such_function")
+    monkeypatch.setattr(native, "_SET", "no_such_function")
     assert backend.load(1).variant() == backend.DEFAULT_VARIANT
-    assert gathers.target() == ("", "")
+    assert native.target() == ("", "")
+
+
+def test_a_wish_for_gather_instructions_that_is_neither_0_nor_1_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(native.GATHERS_VARIABLE, "yes")
+    with pytest.raises(BackendError, match=r"PHOTONFARM_GATHERS is 'yes'; 0 and 1 are allowed"):
+        backend.load(1)
 
 
 def test_a_libllvm_that_is_not_there_is_one_sentence_that_says_what_to_install() -> None:

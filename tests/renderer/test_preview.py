@@ -37,9 +37,11 @@ def furnished() -> Geometry:
     floor = [[-2, 0, -1], [2, 0, -1], [2, 0, 1]]
     block = [[0, 0, 0], [1, 0, 1], [1, 1, 0]]
     return Geometry(
-        np.array([*floor, *block], np.float32), np.array([[0, 1, 2], [3, 4, 5]], np.uint32),
-        np.array([0, 1], np.int32), np.array([-1, 0], np.int16),
-    )  # fmt: skip
+        np.array([*floor, *block], np.float32),
+        np.array([[0, 1, 2], [3, 4, 5]], np.uint32),
+        np.array([0, 1], np.int32),
+        np.array([-1, 0], np.int16),
+    )
 
 
 def rectangles(svg: str, kind: str) -> list[list[float]]:
@@ -49,8 +51,9 @@ def rectangles(svg: str, kind: str) -> list[list[float]]:
 
 
 def test_a_plan_shows_what_stands_where_it_was_put_and_nothing_that_is_gone() -> None:
-    spec = samples.small_spec(view={"origin": {"min": [-2, 0, -1], "max": [2, 1, 1]},
-                                    "look_at": {"min": [0, 0, 0], "max": [1, 1, 1]}})  # fmt: skip
+    spec = samples.small_spec(
+        view={"origin": {"min": [-2, 0, -1], "max": [2, 1, 1]}, "look_at": {"min": [0, 0, 0], "max": [1, 1, 1]}}
+    )
     plan = PlanView.of(spec, furnished())
     scale = 100 / (1.06 * 4)  # of 4 units and a margin of 3 % of them at each side
     view = View(np.array([-1.0, 1.0, 0.0], np.float32), np.array([1.0, 1.0, 0.0], np.float32))

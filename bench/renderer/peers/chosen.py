@@ -72,7 +72,7 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
 
     from photonfarm.renderer.strategy import content, pilot
     from photonfarm.renderer.strategy.candidates import GRID
-    from photonfarm.renderer.strategy.printed import BLACK, reasons_for
+    from photonfarm.renderer.strategy.plan_text import BLACK, reasons_for
 
     plugins: dict[Any, Any] = {}
 

@@ -61,7 +61,7 @@ def _triangles(shape: Any) -> tuple[NDArray[np.float32], NDArray[np.uint32], NDA
     import mitsuba as mi
 
     from photonfarm.core.errors import SpecError
-    from photonfarm.renderer.scene.tessellation import triangles_of
+    from photonfarm.renderer.scene.base_cloud import triangles_of
 
     try:
         triangles = triangles_of(shape)

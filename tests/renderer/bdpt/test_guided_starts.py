@@ -11,8 +11,7 @@ import pytest
 
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.guiding import grid, learning
-from photonfarm.renderer.bdpt.guiding.densities import DEFAULT_SHARE, gains
-from photonfarm.renderer.bdpt.guiding.learning import LightGuide
+from photonfarm.renderer.bdpt.guiding.learning import DEFAULT_SHARE, LightGuide, estimate_gains
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.lights.emission import INFINITE, Lights, read_lights, sample_emission
 from tests.stability.scenes import hard_scenes
@@ -44,7 +43,7 @@ def started(lights: Lights, paths: int) -> Any:
 def test_the_density_of_a_start_is_found_again_from_its_ray(build: Any) -> None:
     scene = loaded(build)
     plain = read_lights(scene)
-    lights = plain.guided_by(at_random(Layout.of(plain.count)), scene)
+    lights = plain.guide_with(at_random(Layout.of(plain.count)), scene)
     start = started(lights, 1 << 14)
     ds = mi.DirectionSample3f(start.sample)
     ds.d = -start.ray.d
@@ -62,7 +61,7 @@ def test_starts_fall_into_cells_as_the_guide_says(layout: Layout) -> None:
     scene = loaded(hard_scenes.many_lights)
     plain = read_lights(scene)
     layout = Layout(plain.count, layout.directions, layout.positions)
-    lights, paths = plain.guided_by(at_random(layout), scene), 1 << 16
+    lights, paths = plain.guide_with(at_random(layout), scene), 1 << 16
     count = np.bincount(np.array(started(lights, paths).cell), minlength=layout.cells)
     assert lights.guided is not None
     probability = np.diff(np.array(lights.guided.cdf), prepend=0) / np.array(lights.guided.cdf)[-1]
@@ -73,14 +72,14 @@ def test_starts_fall_into_cells_as_the_guide_says(layout: Layout) -> None:
 def test_a_neutral_guide_has_the_density_of_no_guide() -> None:
     scene = loaded(hard_scenes.many_lights)
     plain = read_lights(scene)
-    start = started(plain.guided_by(StartGuide.neutral(Layout.of(plain.count)), scene), 256)
+    start = started(plain.guide_with(StartGuide.neutral(Layout.of(plain.count)), scene), 256)
     np.testing.assert_allclose(np.array(start.factor), np.array(plain.emission_factor(start.emitter)), rtol=1e-5)
 
 
 def test_positions_are_guided_on_rectangles_alone() -> None:
     scene = loaded(ball_light)
     plain = read_lights(scene)
-    lights = plain.guided_by(at_random(Layout(1, 2, 4)), scene)
+    lights = plain.guide_with(at_random(Layout(1, 2, 4)), scene)
     assert lights.guided is not None
     by_direction = np.array(lights.guided.gain).reshape(4, 16)
     assert np.ptp(by_direction, axis=1).max() < 1e-5 * by_direction.max()
@@ -94,7 +93,7 @@ def test_a_light_in_any_direction_has_a_frame(towards: tuple[float, float, float
     del description["light"]
     scene = mi.load_dict(description, optimize=False)
     plain = read_lights(scene)
-    lights = plain.guided_by(at_random(Layout.of(plain.count)), scene)
+    lights = plain.guide_with(at_random(Layout.of(plain.count)), scene)
     start = started(lights, 1024)
     assert np.array(start.valid).all()
     frame = grid.frame_about(dr.normalize(mi.Vector3f(*towards)))
@@ -108,7 +107,7 @@ def test_a_dead_light_starts_no_guided_path() -> None:
     description["ball_light"]["emitter"] = hard_scenes.shining(0.0)
     scene = mi.load_dict(description, optimize=False)
     plain = read_lights(scene)
-    start = started(plain.guided_by(at_random(Layout.of(plain.count)), scene), 4096)
+    start = started(plain.guide_with(at_random(Layout.of(plain.count)), scene), 4096)
     dead = next(shape.emitter() for shape in scene.shapes() if shape.id() == "ball_light")
     assert not np.array(start.valid & (start.emitter == mi.EmitterPtr(dead))).any()
     assert INFINITE in plain.kinds
@@ -201,7 +200,7 @@ def test_a_guide_that_would_lose_light_is_refused(wrong: float) -> None:
 def test_gains_follow_the_root_of_what_cells_add() -> None:
     layout = Layout(1, 2, 1)
     starts = np.full(4, 1e6)
-    found = gains(layout, starts * [1, 4, 9, 0], 0.0, starts, 2 * starts, np.ones(1))
+    found = estimate_gains(layout, starts * [1, 4, 9, 0], 0.0, starts, 2 * starts, np.ones(1))
     assert found.mean() == pytest.approx(1)
     np.testing.assert_allclose(found, (1 - DEFAULT_SHARE) * np.array([1, 2, 3, 0]) / 1.5 + DEFAULT_SHARE, atol=0.01)
 
@@ -210,7 +209,7 @@ def test_light_paths_start_as_without_a_guide_where_connections_make_the_error()
     layout = Layout(1, 2, 1)
     starts = np.full(4, 1e6)
     splats, edges = starts * [1, 4, 9, 0], starts * [1, 4, 2, 8]
-    found = gains(layout, splats, 1e4 * splats.sum(), starts, edges, np.ones(1))
+    found = estimate_gains(layout, splats, 1e4 * splats.sum(), starts, edges, np.ones(1))
     np.testing.assert_allclose(found, 1, atol=1e-3)
 
 
@@ -219,7 +218,7 @@ def test_cells_without_light_paths_have_the_gain_of_their_surroundings() -> None
     starts = np.full(16, 1e6)
     sums = np.repeat([1.0, 4.0, 4.0, 4.0], 4) * starts
     starts[1] = sums[1] = 0
-    found = gains(layout, sums, 0.0, starts, starts, np.ones(1))
+    found = estimate_gains(layout, sums, 0.0, starts, starts, np.ones(1))
     assert found[1] == pytest.approx(found[0], rel=0.01)
     assert found[4] > 1.5 * found[0]
 
@@ -227,7 +226,9 @@ def test_cells_without_light_paths_have_the_gain_of_their_surroundings() -> None
 def test_nothing_seen_teaches_nothing() -> None:
     layout = Layout.of(2)
     nothing = np.zeros(layout.cells)
-    np.testing.assert_array_equal(gains(layout, nothing, 0.0, nothing, nothing, np.full(2, 0.5)), np.ones(layout.cells))
+    np.testing.assert_array_equal(
+        estimate_gains(layout, nothing, 0.0, nothing, nothing, np.full(2, 0.5)), np.ones(layout.cells)
+    )
 
 
 @pytest.mark.parametrize(("lights", "cells"), [(1, 1 << 14), (9, 9 << 10), (100, 100 << 6), (1 << 15, 1 << 15)])
@@ -237,5 +238,5 @@ def test_more_lights_have_fewer_cells_each(lights: int, cells: int) -> None:
 
 def test_the_paths_that_teach_are_a_small_share_of_an_image() -> None:
     for eye_paths, light_ratio, connections in ((1 << 17, 1.0, 0), (1 << 20, 16.0, 1), (1 << 18, 0.125, 4)):
-        effort = learning.Effort.of_image(eye_paths, light_ratio, connections)
+        effort = learning.Effort.for_image(eye_paths, light_ratio, connections)
         assert effort.eye_paths + effort.light_paths < 0.1 * eye_paths * (1 + light_ratio)

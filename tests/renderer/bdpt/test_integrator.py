@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer import bdpt
-from photonfarm.renderer.bdpt import variant
+from photonfarm.renderer.bdpt import scenes
 from photonfarm.renderer.bdpt.lights import emission
 from tests.stability.scenes.hard_scenes import HARD_SCENES
 
@@ -215,15 +215,15 @@ def test_parameters_out_of_range_are_refused(wrong: dict[str, Any]) -> None:
 
 @pytest.mark.parametrize("name", ["scalar_rgb", "llvm_ad_spectral", "llvm_ad_rgb_polarized"])
 def test_variants_without_rgb_arrays_are_refused(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variant.mi, "variant", lambda: name)
+    monkeypatch.setattr(scenes.mi, "variant", lambda: name)
     with pytest.raises(ValueError, match=name):
-        variant.require_variant()
+        scenes.require_variant()
 
 
 def test_a_missing_variant_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(variant.mi, "variant", lambda: None)
+    monkeypatch.setattr(scenes.mi, "variant", lambda: None)
     with pytest.raises(RuntimeError, match="set_variant"):
-        variant.require_variant()
+        scenes.require_variant()
 
 
 # ------------------------------------------------ Photons ------------------------------------------------

@@ -34,16 +34,22 @@ def kept(monkeypatch: pytest.MonkeyPatch) -> tuple[KeptVertex, list[dict[str, np
             state = body(s)
         return state
 
-    monkeypatch.setattr(light_paths, "traced_once", stepwise)
+    monkeypatch.setattr(light_paths, "loop_once", stepwise)
     scene = mi.load_dict(hard_scenes.cornell(16), optimize=False)
     path = dr.arange(mi.UInt32, PATHS)
     sequence = randomness.stream(randomness.image_keys([3]), randomness.PHOTONS)
     rng = randomness.sampler(sequence + dr.zeros(mi.UInt32, PATHS), path)
     vertices = light_paths.trace_light_paths(
-        scene, scene.sensors()[0], read_lights(scene),
+        scene,
+        scene.sensors()[0],
+        read_lights(scene),
         PathOptions(EDGES, 99, 1, mi.Float(1), mi.Float(1), connects=True, traces_light=False),
-        rng=rng, path=path, paths=dr.opaque(mi.UInt32, PATHS), offset=mi.Float([0.5]), splat=cast(Any, None),
-    )  # fmt: skip
+        rng=rng,
+        path=path,
+        paths=dr.opaque(mi.UInt32, PATHS),
+        offset=mi.Float([0.5]),
+        splat=cast(Any, None),
+    )
     assert vertices is not None
     return vertices.read(path, mi.Bool(True)), steps
 

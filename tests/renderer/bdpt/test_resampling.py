@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.bdpt.recording import resampled
+from photonfarm.renderer.bdpt.recording import resample
 
 IMAGES, PATHS = 3, 1000
 
@@ -15,7 +15,7 @@ IMAGES, PATHS = 3, 1000
 def drawn(weight: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(paths of the slots, factors of the paths), [K, N] both."""
     paths = dr.opaque(mi.UInt32, weight.shape[1])
-    found = resampled(mi.Float(weight.ravel().tolist()), mi.Float(offset.tolist()), paths)
+    found = resample(mi.Float(weight.ravel().tolist()), mi.Float(offset.tolist()), paths)
     slots, factor = (np.array(values).reshape(weight.shape) for values in found)
     return slots, factor
 

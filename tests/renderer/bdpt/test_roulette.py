@@ -19,9 +19,13 @@ N, RR_DEPTH = 1 << 16, 5
 def after_roulette(throughput: float, *, whole: float, depth: int, eta: float = 1.0, first: bool = False) -> Any:
     rng = randomness.sampler(dr.full(mi.UInt32, 7, N), dr.arange(mi.UInt32, N))
     state = SimpleNamespace(
-        active=dr.full(mi.Bool, True, N), rng=rng, throughput=mi.Spectrum(throughput, throughput / 2, 0),
-        eta=mi.Float(eta), whole=mi.Float(whole), depth=mi.UInt32(depth),
-    )  # fmt: skip
+        active=dr.full(mi.Bool, True, N),
+        rng=rng,
+        throughput=mi.Spectrum(throughput, throughput / 2, 0),
+        eta=mi.Float(eta),
+        whole=mi.Float(whole),
+        depth=mi.UInt32(depth),
+    )
     options = PathOptions(99, RR_DEPTH, 0, mi.Float(0), mi.Float(0), connects=False, traces_light=False)
     eye_paths._roulette(state, mi.Bool(first), options)  # type: ignore[arg-type]
     return state
@@ -61,9 +65,11 @@ def test_surviving_light_paths_are_brighter_by_their_rarity(
     throughput: float, start: float, depth: int, survive: float
 ) -> None:
     state = SimpleNamespace(
-        active=dr.full(mi.Bool, True, N), throughput=mi.Spectrum(throughput, throughput / 2, 0), depth=mi.UInt32(depth),
+        active=dr.full(mi.Bool, True, N),
+        throughput=mi.Spectrum(throughput, throughput / 2, 0),
+        depth=mi.UInt32(depth),
         rng=randomness.sampler(dr.full(mi.UInt32, 7, N), dr.arange(mi.UInt32, N)),
-    )  # fmt: skip
+    )
     options = PathOptions(99, RR_DEPTH, 0, mi.Float(0), mi.Float(0), connects=False, traces_light=False)
     light_paths.roulette(state, SimpleNamespace(throughput=mi.Spectrum(start)), options)  # type: ignore[arg-type]
     assert abs(np.array(state.active).mean() - survive) <= 4 * np.sqrt(survive * (1 - survive) / N)

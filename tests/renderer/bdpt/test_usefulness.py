@@ -12,7 +12,7 @@ import pytest
 from photonfarm.renderer.bdpt.guiding.grid import Grid
 from photonfarm.renderer.bdpt.guiding.learning import LightGuide
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
-from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, LEAST, NORMALS, SIDE, cell_of, usefulness
+from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, LEAST, NORMALS, SIDE, cell_of, estimate_usefulness
 from tests.stability.scenes import hard_scenes
 
 CONNECTED = {"type": "bdpt", "max_depth": 6, "connections": 4, "light_ratio": 0.125, "guided_light": True}
@@ -44,14 +44,14 @@ def test_each_direction_of_an_axis_has_cells_of_its_own(axis: int, sign: int) ->
 def test_usefulness_is_the_root_of_what_connections_add() -> None:
     connections = np.full(CELLS, 1e6)
     value = np.random.default_rng(0).uniform(0.5, 2, CELLS)
-    found = usefulness(connections * value**2, connections)
+    found = estimate_usefulness(connections * value**2, connections)
     np.testing.assert_allclose(found, value / value.mean(), rtol=1e-3)
 
 
 def test_no_cell_is_less_useful_than_the_least() -> None:
     connections, sums = np.full(CELLS, 1e6), np.zeros(CELLS)
     sums[: CELLS // 2] = 1e6
-    found = usefulness(sums, connections)
+    found = estimate_usefulness(sums, connections)
     np.testing.assert_allclose(found[: CELLS // 2], 2, rtol=0.05)
     np.testing.assert_array_equal(found[-CELLS // 4 :], LEAST)
 
@@ -61,13 +61,13 @@ def test_cells_that_were_not_met_are_as_useful_as_those_around_them() -> None:
     connections, sums = np.full(shape, 1e4), np.full(shape, 1e4)
     sums[: SIDE // 2] *= 9
     connections[1, 1, 1], sums[1, 1, 1] = 0, 0
-    found = usefulness(sums.ravel(), connections.ravel()).reshape(shape)
+    found = estimate_usefulness(sums.ravel(), connections.ravel()).reshape(shape)
     np.testing.assert_allclose(found[1, 1, 1], found[0, 0, 0], rtol=0.02)
 
 
 def test_where_connections_add_nothing_all_are_alike() -> None:
-    np.testing.assert_array_equal(usefulness(np.zeros(CELLS), np.ones(CELLS)), np.ones(CELLS))
-    np.testing.assert_array_equal(usefulness(np.zeros(CELLS), np.zeros(CELLS)), np.ones(CELLS))
+    np.testing.assert_array_equal(estimate_usefulness(np.zeros(CELLS), np.ones(CELLS)), np.ones(CELLS))
+    np.testing.assert_array_equal(estimate_usefulness(np.zeros(CELLS), np.zeros(CELLS)), np.ones(CELLS))
 
 
 @pytest.mark.parametrize("wrong", [np.full(CELLS, np.nan), np.zeros(CELLS), np.ones(2)], ids=["nan", "zero", "short"])

@@ -69,11 +69,11 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
 
         monkeypatch.setattr(module, name, keep)
 
-    monkeypatch.setattr(eye_paths, "traced_once", keeping(found.eye))
-    monkeypatch.setattr(light_paths, "traced_once", keeping(found.light))
+    monkeypatch.setattr(eye_paths, "loop_once", keeping(found.eye))
+    monkeypatch.setattr(light_paths, "loop_once", keeping(found.light))
     for name in ("hit_emitter", "next_event", "light_tracing"):
         keep_results(weights, name, found.weights.setdefault(name, []))
-    over_r2, connect, draw = weights.connection_over_r2, eye_paths._connect, KeptVertices.drawn
+    over_r2, connect, draw = weights.connection_over_r2, eye_paths._connect, KeptVertices.draw
 
     def keep_connection(count: Any, r2: Any, *sums: Any) -> Any:
         found.r2.append(r2)
@@ -91,7 +91,7 @@ def recorder(monkeypatch: pytest.MonkeyPatch) -> Recorder:
         return value
 
     monkeypatch.setattr(weights, "connection_over_r2", keep_connection)
-    monkeypatch.setattr(KeptVertices, "drawn", keep_path)
+    monkeypatch.setattr(KeptVertices, "draw", keep_path)
     monkeypatch.setattr(eye_paths, "_connect", evaluated)
     keep_results(eye_paths, "sample_direct", found.direct)
     starts: list[Any] = []
@@ -239,7 +239,7 @@ def test_weights_of_a_render_are_the_oracles(build: Any, guided: bool, recorder:
     bdpt = {"type": "bdpt", "max_depth": EDGES, "connections": CONNECTIONS, "light_ratio": LIGHT_RATIO, "rr_depth": 99}
     if guided:
         guide = LightGuide(random_guide(lights.count, seed=4), random_usefulness(seed=5))
-        lights, useful = lights.guided_by(guide.starts, scene), Usefulness.over(scene, guide.usefulness_table)
+        lights, useful = lights.guide_with(guide.starts, scene), Usefulness.over(scene, guide.usefulness_table)
     mi.load_dict(bdpt | {"guided_light": guided}).render(scene, seed=1, spp=SPP, guide=guide)
     counts = TechniqueCounts(connection_count(CONNECTIONS, EDGES, guided=guided), LIGHT_RATIO, useful)
     off: dict[str, list[Any]] = {"hit": [], "next event": [], "light tracing": [], "connection": []}

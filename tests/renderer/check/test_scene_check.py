@@ -11,10 +11,10 @@ from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
 from photonfarm.plan.request import PlannedContent, Request, expand
-from photonfarm.renderer.check import samples
-from photonfarm.renderer.check.orthographic import PAPER, Projection, whole
-from photonfarm.renderer.check.scene_check import SceneCheck, check
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.check import samples
+from photonfarm.renderer.tools.check.scene_check import SceneCheck, check
+from photonfarm.renderer.tools.check.shape_pictures import PAPER, Projection, draw_scene
 from photonfarm.scene.spec_loading import NamedSpec, load_spec
 
 ROOM = """<scene version="3.0.0">
@@ -84,8 +84,14 @@ ORIGIN = "origin = { min = [-1.8, 1.2, -1.8], max = [1.8, 2, 1.8] }"
         ((), [], []),
         ([(ORIGIN, "origin = { min = [230, 1, 0], max = [231, 2, 1] }")], ["view.origin"], []),
         ([(ORIGIN, "origin = { min = [-6, 1.2, -1], max = [0, 2, 1] }")], ["view.origin"], []),
-        ([(ORIGIN, "origin = { min = [-0.3, 0.1, -0.3], max = [0.3, 0.7, 0.3] }"), (BOX, "box.min = [0, 0, 0]\n"
-           "box.max = [0.1, 0, 0.1]")], ["view.origin"], []),
+        (
+            [
+                (ORIGIN, "origin = { min = [-0.3, 0.1, -0.3], max = [0.3, 0.7, 0.3] }"),
+                (BOX, "box.min = [0, 0, 0]\nbox.max = [0.1, 0, 0.1]"),
+            ],
+            ["view.origin"],
+            [],
+        ),
         ([(AT, "at = [5, 0, 0]")], ["objects.0.at"], []),
         ([(BOX, "box = { min = [-120, 0, -120], max = [120, 0, 120] }")], ["objects.0.box"], []),
         ([(BOX, "box = { min = [-3, 0, -3], max = [3, 0, 3] }")], ["objects.0.box"], []),
@@ -96,7 +102,7 @@ ORIGIN = "origin = { min = [-1.8, 1.2, -1.8], max = [1.8, 2, 1.8] }"
         ([("[view]", "[emitters]\nall = 0\n[view]")], ["emitters"], []),
         ([("[film]", "fov_deg = 1.2\n[film]")], ["view.fov_deg"], []),
     ],
-)  # fmt: skip
+)
 def test_each_fault_has_its_own_finding_and_no_other(
     write: Write, changes: list[tuple[str, str]], serious: list[str], notes: list[str]
 ) -> None:
@@ -107,8 +113,11 @@ def test_each_fault_has_its_own_finding_and_no_other(
 
 def test_a_scene_far_from_the_origin_is_found_before_all_else(write: Write, tmp_path: Path) -> None:
     group = SPEC[SPEC.index("[[objects]]") : SPEC.index("[view]")]
-    ends = [(f"{end} = [{sign}{x}", f"{end} = [{10000 + float(f'{sign}{x}')}")
-            for x in ("1.8", "1.5") for end, sign in (("min", "-"), ("max", ""))]  # fmt: skip
+    ends = [
+        (f"{end} = [{sign}{x}", f"{end} = [{10000 + float(f'{sign}{x}')}")
+        for x in ("1.8", "1.5")
+        for end, sign in (("min", "-"), ("max", ""))
+    ]
     spec = write((group, ""), *ends)
     moved = ROOM.replace("</transform>", '<translate x="10000"/></transform>').replace('x="1.8"', 'x="10001.8"')
     (tmp_path / "scene.xml").write_text(moved)
@@ -186,7 +195,7 @@ def test_a_drawing_shows_a_shape_where_points_of_it_are_projected_to(write: Writ
     low, high = np.array([-3.0, 0, -3]), np.array([3.0, 3, 3])
     plan = Projection.around(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), low, high, -1.0)  # cut at a height of 1
     red = np.where(np.arange(4)[:, None] == 2, [1, 0, 0], [0, 0, 1]).astype(np.float32)  # the block, all else blue
-    picture = whole(scene, plan, 120, red)
+    picture = draw_scene(scene, plan, 120, red)
     for place, colour in (([0.3, 0.5, -0.3], "block"), ([1.0, 0.5, -0.3], "floor"), ([2.5, 0, 2.5], "paper")):
         x, y = (120 * plan.flat(np.array(place))).astype(int)
         expected = {"block": [True, False], "floor": [False, True]}.get(colour)

@@ -51,8 +51,9 @@ def make(job: dict[str, Any]) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=job["make"], compress=True)
 
 
-def _box(name: str, low: tuple[float, ...], high: tuple[float, ...], grey: float, inward: bool = False,
-         is_open: bool = False) -> None:  # fmt: skip
+def _box(
+    name: str, low: tuple[float, ...], high: tuple[float, ...], grey: float, inward: bool = False, is_open: bool = False
+) -> None:
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     corners = [(x, y, z) for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
     mesh = bpy.data.meshes.new(name)

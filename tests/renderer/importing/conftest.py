@@ -13,10 +13,10 @@ import trimesh
 from obj_scenes import SQUARE
 from PIL import Image
 
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.loading import load
-from photonfarm.renderer.importing.proposal import surfaces
-from photonfarm.renderer.importing.readers import reader_of
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.loading import load
+from photonfarm.renderer.tools.importing.proposal import surfaces
+from photonfarm.renderer.tools.importing.readers import reader_of
 
 STRENGTH = "KHR_materials_emissive_strength"
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
@@ -26,8 +26,10 @@ SIDES = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (
 
 def box(low: tuple[float, ...], high: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """The vertices (8, 3) and faces (12, 3) of a box whose faces look outwards."""
-    corners = np.array([[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]]
-                        for i in (0, 1) for j in (0, 1) for k in (0, 1)], "<f4")  # fmt: skip
+    corners = np.array(
+        [[(low, high)[i][0], (low, high)[j][1], (low, high)[k][2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)],
+        "<f4",
+    )
     return corners, np.array([f for a, b, c, d in SIDES for f in ((a, b, c), (a, c, d))], "<u4")
 
 
@@ -153,7 +155,7 @@ def boxes(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """A quick render that is quicker."""
-    from photonfarm.renderer.measure import exposure
+    from photonfarm.renderer.tools.measure import exposure
 
     monkeypatch.setattr(exposure, "PATHS", 1 << 13)
     monkeypatch.setattr(exposure, "SIDE", 32)

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.loading import load
-from photonfarm.renderer.importing.readers import reader_of
-from photonfarm.renderer.importing.readers.blender import VARIABLE
+from photonfarm.renderer.tools.importing import elements
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.loading import load
+from photonfarm.renderer.tools.importing.readers import reader_of
+from photonfarm.renderer.tools.importing.readers.blender import VARIABLE
 
 SCRIPT = Path(__file__).with_name("blender_render.py")
 
@@ -179,7 +179,7 @@ LAMPS: dict[str, dict[str, Any]] = {
     "world": {"kind": "POINT", "set": {"energy": 0}, "world": {"Color": (0.2, 0.5, 1, 1), "Strength": 2}},
     "world-map": {"kind": "POINT", "set": {"energy": 0}, "world": {"Color": ["ShaderNodeTexCoord"], "Strength": 1}},
     "world-sky": {"kind": "POINT", "set": {"energy": 0}, "world": {"Color": ["ShaderNodeTexSky"], "Strength": 0.1}},
-}  # fmt: skip
+}
 """Lamps that a room of `blender_render.py` gets, one each."""
 
 VIEWS = [[[3.8, 2.1, -0.2], [1.8, 0.5, -1.2]], [[0.3, 1.9, -0.3], [3.5, 0.9, -2.6]]]
@@ -191,8 +191,10 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     """The folder of the rooms, and what Blender says of each."""
     folder = tmp_path_factory.mktemp("rooms")
     makes = [{"make": str(folder / f"{name}.blend"), "lamp": lamp} for name, lamp in LAMPS.items()]
-    looks = [{"look": job["make"], "views": VIEWS, "pictures": str(folder / f"cycles-{name}")}
-             for job, name in zip(makes, LAMPS, strict=True)]  # fmt: skip
+    looks = [
+        {"look": job["make"], "views": VIEWS, "pictures": str(folder / f"cycles-{name}")}
+        for job, name in zip(makes, LAMPS, strict=True)
+    ]
     return folder, dict(zip(LAMPS, run_in_blender(makes + looks, folder)[len(makes) :], strict=True))
 
 
@@ -221,8 +223,16 @@ def show_all(names: list[str], out: Path, size: int = 256) -> None:
     with TemporaryDirectory() as folder:
         makes = [{"make": f"{folder}/{name}.blend", "lamp": LAMPS[name]} for name in names if name in LAMPS]
         files = [Path(f"{folder}/{name}.blend" if name in LAMPS else name) for name in names]
-        looks = [{"look": str(file), "pictures": f"{folder}/cycles-{k}", "size": size, "sky": file.suffix != ".blend",
-                  "views": VIEWS[:1] if names[k] in LAMPS else None} for k, file in enumerate(files)]  # fmt: skip
+        looks = [
+            {
+                "look": str(file),
+                "pictures": f"{folder}/cycles-{k}",
+                "size": size,
+                "sky": file.suffix != ".blend",
+                "views": VIEWS[:1] if names[k] in LAMPS else None,
+            }
+            for k, file in enumerate(files)
+        ]
         found = run_in_blender(makes + looks, Path(folder))[len(makes) :]
         for number, (file, theirs) in enumerate(zip(files, found, strict=True)):
             _, scene = imported(file, Path(folder) / str(number), sky=file.suffix != ".blend")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 
@@ -25,7 +25,7 @@ FILES = {
     "parts/one.xml": '<bsdf version="3.0.0" type="diffuse"><rgb name="reflectance" value="0.9 0.1 0.4"/></bsdf>',
     "meshes/t.obj": "v -1 -1 0\nv 1 -1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\nf 1/1 2/2 3/3\n",
     "s.spd": "400 0.2\n500 0.6\n700 0.9\n",
-}  # fmt: skip
+}
 """What the scenes name."""
 
 
@@ -44,13 +44,17 @@ SCENES = {
     "what comes later": square('<ref id="a"/>') + RED.format("a"),
     "what is in another shape": f'<shape type="sphere">{RED.format("m")}</shape>' + square('<ref id="m"/>'),
     "an image": square(f'<bsdf type="diffuse">{IMAGE.format("reflectance")}</bsdf>'),
-    "nested materials": square('<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="twosided">'
-                               f"{RED.format('red')}</bsdf></bsdf>"),
-    "a blend": square(f'<bsdf type="blendbsdf"><float name="weight" value="0.3"/>{RED.format("x")}'
-                      '<bsdf type="diffuse"/></bsdf>'),
+    "nested materials": square(
+        f'<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="twosided">{RED.format("red")}</bsdf></bsdf>'
+    ),
+    "a blend": square(
+        f'<bsdf type="blendbsdf"><float name="weight" value="0.3"/>{RED.format("x")}<bsdf type="diffuse"/></bsdf>'
+    ),
     "a normal map": square(f'<bsdf type="normalmap">{IMAGE.format("normalmap")}<bsdf type="diffuse"/></bsdf>'),
-    "transforms": square('<transform name="to_world"><translate x="1"/><rotate y="1" angle="30"/><scale value="2"/>'
-                         '<matrix value="1 0 0 0.1 0 1 0 0.2 0 0 1 0.3 0 0 0 1"/></transform>'),
+    "transforms": square(
+        '<transform name="to_world"><translate x="1"/><rotate y="1" angle="30"/><scale value="2"/>'
+        '<matrix value="1 0 0 0.1 0 1 0 0.2 0 0 1 0.3 0 0 0 1"/></transform>'
+    ),
     "a uniform spectrum": square('<bsdf type="diffuse"><spectrum name="reflectance" value="0.4"/></bsdf>'),
     "a sampled spectrum": square('<bsdf type="diffuse"><spectrum name="reflectance" value="400:.1, 700:.3"/></bsdf>'),
     "a spectrum of a file": square('<bsdf type="diffuse"><spectrum name="reflectance" filename="s.spd"/></bsdf>'),
@@ -62,7 +66,7 @@ SCENES = {
     "an image of the sky": square("") + '<emitter type="envmap"><string name="filename" value="images/a.png"/>'
     '<transform name="to_world"><rotate x="1" angle="90"/></transform></emitter>',
     "metal": square('<bsdf type="roughconductor"><string name="material" value="Au"/></bsdf>'),
-}  # fmt: skip
+}
 
 
 def facts(scene: Any) -> list[np.ndarray]:

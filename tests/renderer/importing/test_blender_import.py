@@ -12,7 +12,7 @@ import pytest
 from blender_files import Loaded, needs_blender, run
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.readers import blender
+from photonfarm.renderer.tools.importing.readers import blender
 
 
 def test_a_fault_of_blenders_exporter_is_not_told_as_one_of_reading(tmp_path: Path, monkeypatch: Any) -> None:
@@ -218,8 +218,10 @@ def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Pa
         ("Coat Tint", "material 'varnished'"),
         ("Group", "material 'grouped'"),
     }
-    assert {"Blender's (x, y, z) is (x, z, −y) here", "the view's exposure of +1.5 stops is left out; photonfarm "
-            "sets its own"} <= {change.meaning for change in made.changes}  # fmt: skip
+    assert {
+        "Blender's (x, y, z) is (x, z, −y) here",
+        "the view's exposure of +1.5 stops is left out; photonfarm sets its own",
+    } <= {change.meaning for change in made.changes}
     for axis, colour in (((1, 0, 0), (1, 0, 0)), ((0, 1, 0), (0, 0, 1)), ((0, 0, -1), (0, 1, 0))):
         sky = mi.SurfaceInteraction3f()
         sky.wi = -mi.Vector3f(*axis)  # glTF's y is Blender's z, and its -z Blender's y
@@ -289,9 +291,12 @@ def test_lights_of_usd_and_fbx_that_blender_takes_for_points_are_a_loss(tmp_path
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "content", "said"),
-    [("it.blend", b"glTF", r"is no \.blend file that Blender [\d.]+ reads: [^\n]+$"),
-     ("it.usd", b"glTF", r"is no \.usd file "), ("it.fbx", b"glTF", r"is no \.fbx file ")],
-)  # fmt: skip
+    [
+        ("it.blend", b"glTF", r"is no \.blend file that Blender [\d.]+ reads: [^\n]+$"),
+        ("it.usd", b"glTF", r"is no \.usd file "),
+        ("it.fbx", b"glTF", r"is no \.fbx file "),
+    ],
+)
 def test_a_file_that_blender_cannot_open_is_told_in_a_sentence(
     tmp_path: Path, name: str, content: bytes, said: str
 ) -> None:

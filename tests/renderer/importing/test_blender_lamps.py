@@ -11,18 +11,28 @@ import numpy as np
 import pytest
 from blender_files import Loaded, needs_blender, run
 
-from photonfarm.renderer.importing import elements
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.readers.blender_lamps import Lamps
+from photonfarm.renderer.tools.importing import elements
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.readers.blender_lamps import Lamps
 
 STRAIGHT_DOWN = np.diag([1.0, 1, 1, 1]).tolist()
 
 
 LAMP: dict[str, Any] = {
-    "name": "Lamp", "kind": "POINT", "matrix": STRAIGHT_DOWN, "strength": [4.0, 2.0, 0.0], "normalize": True,
-    "shadow_soft_size": 0.0, "angle": 0.0, "spot_size": 1.0, "spot_blend": 0.0, "shape": "SQUARE", "size": 2.0,
-    "size_y": 1.0, "spread": np.pi,
-}  # fmt: skip
+    "name": "Lamp",
+    "kind": "POINT",
+    "matrix": STRAIGHT_DOWN,
+    "strength": [4.0, 2.0, 0.0],
+    "normalize": True,
+    "shadow_soft_size": 0.0,
+    "angle": 0.0,
+    "spot_size": 1.0,
+    "spot_blend": 0.0,
+    "shape": "SQUARE",
+    "size": 2.0,
+    "size_y": 1.0,
+    "spread": np.pi,
+}
 
 
 @pytest.fixture

@@ -21,8 +21,12 @@ def test_nodes_are_placed_by_all_above_them_and_mirrored_ones_keep_their_fronts(
     mesh = gltf.mesh(*square)
     gltf.document["meshes"][mesh]["primitives"] *= 2
     gltf.node("Leg", mesh, scale=[-1, 1, 1])
-    gltf.node("Chair", rotation=[0, 0, float(np.sin(np.pi / 4)), float(np.cos(np.pi / 4))], translation=[5, 0, 0],
-              children=[0])  # fmt: skip
+    gltf.node(
+        "Chair",
+        rotation=[0, 0, float(np.sin(np.pi / 4)), float(np.cos(np.pi / 4))],
+        translation=[5, 0, 0],
+        children=[0],
+    )
     gltf.node("Other", mesh)
     gltf.document["scenes"][0]["nodes"] = [1, 2]
     scene, made = loaded(gltf.write())
@@ -48,8 +52,11 @@ def test_strips_and_fans_become_triangles(gltf: Any, loaded: Loaded) -> None:
 
 
 def test_lights_stand_and_shine_where_the_file_says(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:
-    lights = [{"type": "point", "intensity": 3}, {"type": "spot", "spot": {"outerConeAngle": 0.5}},
-              {"type": "directional", "color": [1, 0, 0], "intensity": 2}]  # fmt: skip
+    lights = [
+        {"type": "point", "intensity": 3},
+        {"type": "spot", "spot": {"outerConeAngle": 0.5}},
+        {"type": "directional", "color": [1, 0, 0], "intensity": 2},
+    ]
     gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": lights}}
     for number in range(3):
         gltf.node(f"L{number}", translation=[1, 2, 3], extensions={"KHR_lights_punctual": {"light": number}})
@@ -93,7 +100,7 @@ def test_integers_that_are_normalised_and_sparse_ones_are_read(gltf: Any, loaded
 
 
 def test_a_glb_is_the_same_scene(gltf: Any, quad: Callable[..., Path], read: Read, tmp_path: Path) -> None:
-    from photonfarm.renderer.importing.elements import text
+    from photonfarm.renderer.tools.importing.elements import text
 
     separate = text(read(quad()).root)
     document = json.loads((tmp_path / "room.gltf").read_text())
@@ -218,8 +225,13 @@ def test_the_units_of_blenders_lamps_are_said(gltf: Any, quad: Callable[..., Pat
 def test_what_has_no_effect_on_a_still_picture_is_no_loss(gltf: Any, quad: Callable[..., Path], read: Read) -> None:
     gltf.document |= {"animations": [{}, {}], "extensionsUsed": ["EXT_unused"]}
     gltf.document["extensionsRequired"] = ["KHR_materials_variants"]
-    neutral = {"KHR_materials_sheen": {}, "KHR_materials_clearcoat": {"clearcoatFactor": 0}, "KHR_xmp_json_ld": {},
-               "KHR_materials_iridescence": {"iridescenceFactor": 0}, "KHR_materials_specular": {}}  # fmt: skip
+    neutral = {
+        "KHR_materials_sheen": {},
+        "KHR_materials_clearcoat": {"clearcoatFactor": 0},
+        "KHR_xmp_json_ld": {},
+        "KHR_materials_iridescence": {"iridescenceFactor": 0},
+        "KHR_materials_specular": {},
+    }
     changes = list(read(quad(extensions=neutral, occlusionTexture={"index": 0})).changes)
     assert {change.effect for change in changes} == {None}
     assert {change.name for change in changes} == {"animations", "KHR_xmp_json_ld", "occlusionTexture"}
@@ -240,9 +252,14 @@ def test_extensions_that_are_not_read_are_named_by_what_they_sit_on(
     document["meshes"].append({"primitives": [], "extensions": {"EXT_of_nothing": {}}})
     path.write_text(json.dumps(document))
     assert set(losses(read(path))) == {
-        ("light", "EXT_lights_image_based"), ("light", "EXT_of_light"), ("light", "area"), ("geometry", "EXT_of_node"),
-        ("geometry", "EXT_of_primitive"), ("colour", "KHR_materials_unlit"), ("colour", "KHR_materials_sheen"),
-    }  # fmt: skip
+        ("light", "EXT_lights_image_based"),
+        ("light", "EXT_of_light"),
+        ("light", "area"),
+        ("geometry", "EXT_of_node"),
+        ("geometry", "EXT_of_primitive"),
+        ("colour", "KHR_materials_unlit"),
+        ("colour", "KHR_materials_sheen"),
+    }
 
 
 def test_extensions_of_images_and_numbers_are_named_where_they_are_used(
@@ -260,9 +277,7 @@ def test_extensions_of_images_and_numbers_are_named_where_they_are_used(
 
 
 @pytest.mark.parametrize("fallback", [True, False])
-def test_what_is_compressed_is_read_only_where_it_has_its_data_beside_it(
-    gltf: Any, read: Read, fallback: bool
-) -> None:  # fmt: skip
+def test_what_is_compressed_is_read_only_where_it_has_its_data_beside_it(gltf: Any, read: Read, fallback: bool) -> None:
     primitive = gltf.document["meshes"][gltf.mesh(*TRIANGLE)]["primitives"][0]
     primitive["extensions"] = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {}}}
     gltf.node("It", 0)
@@ -301,7 +316,7 @@ def test_meshes_that_are_compressed_are_refused_by_name(case: Callable[[str], Pa
 
 def test_normal_maps_keep_their_upper_side_where_images_are_mirrored(
     case: Callable[[str], Path], loaded: Loaded
-) -> None:  # fmt: skip
+) -> None:
     _, scene = loaded(case("gltf-mirrored-uv-normal-map/scene.gltf"))
     for x in (0.5, 2.5, 4.5):
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f(x, 0.5, 5), mi.Vector3f(0, 0, -1)))
@@ -318,8 +333,14 @@ def test_grey_of_16_bits_has_its_value(case: Callable[[str], Path], loaded: Load
 def test_images_wrap_differently_along_both_axes(case: Callable[[str], Path], loaded: Loaded) -> None:
     _, scene = loaded(case("gltf-wrap/scene.gltf"))
     blue, white, green, red = [0, 0, 1], [1, 1, 1], [0, 1, 0], [1, 0, 0]
-    for place, colour in (((0.1, 0.9), blue), ((0.9, 0.9), white), ((0.9, 0.1), green),
-                          ((2.1, 0.9), green), ((2.9, 0.9), red), ((2.1, 0.1), white)):  # fmt: skip
+    for place, colour in (
+        ((0.1, 0.9), blue),
+        ((0.9, 0.9), white),
+        ((0.9, 0.1), green),
+        ((2.1, 0.9), green),
+        ((2.9, 0.9), red),
+        ((2.1, 0.1), white),
+    ):
         assert colour_at(scene, *place) == colour
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from imported_scenes import FOUR, Loaded, Read, colour_at, losses, of_type
 
-from photonfarm.renderer.importing import images
-from photonfarm.renderer.importing.elements import child
+from photonfarm.renderer.tools.importing import images
+from photonfarm.renderer.tools.importing.elements import child
 
 
 @pytest.mark.parametrize(
@@ -53,7 +53,7 @@ def test_roughness_is_the_green_channel_and_metallic_the_blue_one_raw_and_times_
         assert raw is not None
         assert file is not None
         assert raw.get("value") == "true"
-        stored = images.decoded(Path(file.get("value", "")).read_bytes(), "it")[0, 0, 0]
+        stored = images.decode(Path(file.get("value", "")).read_bytes(), "it")[0, 0, 0]
         assert stored * 255 == pytest.approx(value, abs=0.6)
 
 
@@ -63,9 +63,7 @@ def test_colours_are_multiplied_in_linear_light(gltf: Any, quad: Callable[..., P
     assert colour_at(scene, 0.75, 0.25) == pytest.approx([0.5, 1, 0.25], abs=0.01)
 
 
-def test_green_of_a_normal_map_tilts_upwards_in_the_image(
-    gltf: Any, quad: Callable[..., Path], loaded: Loaded
-) -> None:  # fmt: skip
+def test_green_of_a_normal_map_tilts_upwards_in_the_image(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:
     tilted = gltf.image(np.full((2, 2, 3), (128, 218, 218)), "normal.png")
     _, scene = loaded(quad(normalTexture=tilted, pbrMetallicRoughness={"metallicFactor": 0}))
     si = scene.ray_intersect(mi.Ray3f(mi.Point3f(0.5, 0.5, 1), mi.Vector3f(0, 0, -1)))
@@ -138,8 +136,9 @@ def test_thin_glass_is_as_much_of_a_surface_as_light_passes(
     quad: Callable[..., Path], loaded: Loaded, passes: float, metal: float, rough: float, share: float
 ) -> None:
     surface = {"roughnessFactor": rough, "metallicFactor": metal, "baseColorFactor": [1, 0.25, 1, 1]}
-    _, scene = loaded(quad(pbrMetallicRoughness=surface,
-                           extensions={"KHR_materials_transmission": {"transmissionFactor": passes}}))  # fmt: skip
+    _, scene = loaded(
+        quad(pbrMetallicRoughness=surface, extensions={"KHR_materials_transmission": {"transmissionFactor": passes}})
+    )
     for z in (1, -1):
         si = scene.ray_intersect(mi.Ray3f(mi.Point3f([0.3] * 4096, 0.4, z), mi.Vector3f(0, 0, -z)))
         numbers = (
@@ -170,7 +169,9 @@ def test_clear_glass_has_its_normal_map_and_says_that_it_has_no_coat(
     scene = read(quad(pbrMetallicRoughness=surface, extensions=glass, normalTexture=turned))
     assert of_type(of_type(scene.root, "normalmap"), "thindielectric") is not None
     assert [(change.effect, change.name) for change in scene.changes] == [
-        (None, "KHR_texture_transform"), ("colour", "KHR_materials_clearcoat")]  # fmt: skip
+        (None, "KHR_texture_transform"),
+        ("colour", "KHR_materials_clearcoat"),
+    ]
 
 
 def test_an_image_that_cannot_be_decoded_gives_way_to_its_fallback(
@@ -216,16 +217,35 @@ def test_textures_take_an_image_that_is_read_and_none_if_there_is_none(
     [
         (np.full((4, 3), 0.5, "<f4"), "VEC3", "OPAQUE", [0.25, 0.5, 0.5], [0.25, 0.5, 0.5], []),
         (np.full((4, 4), 51, "|u1"), "VEC4", "BLEND", [0.1, 0.2, 0.2], [0.1, 0.2, 0.2], []),
-        (np.array([[0], [1], [1], [0]], "<f4") * np.ones((1, 3), "<f4"), "VEC3", "OPAQUE",
-         [0.1, 0.2, 0.2], [0.4, 0.8, 0.8], []),
-        (np.array([[1, 1, 1, 0], [1, 1, 1, 1]] * 2, "<f4"), "VEC4", "BLEND", [0.5, 1, 1], [0.5, 1, 1],
-         [("colour", "COLOR_0")]),
+        (
+            np.array([[0], [1], [1], [0]], "<f4") * np.ones((1, 3), "<f4"),
+            "VEC3",
+            "OPAQUE",
+            [0.1, 0.2, 0.2],
+            [0.4, 0.8, 0.8],
+            [],
+        ),
+        (
+            np.array([[1, 1, 1, 0], [1, 1, 1, 1]] * 2, "<f4"),
+            "VEC4",
+            "BLEND",
+            [0.5, 1, 1],
+            [0.5, 1, 1],
+            [("colour", "COLOR_0")],
+        ),
     ],
-)  # fmt: skip
+)
 def test_colours_of_vertices_multiply_that_of_the_material(
-    gltf: Any, quad: Callable[..., Path], loaded: Loaded, colours: Any, kind: str, alpha: str, left: Any, right: Any,
+    gltf: Any,
+    quad: Callable[..., Path],
+    loaded: Loaded,
+    colours: Any,
+    kind: str,
+    alpha: str,
+    left: Any,
+    right: Any,
     lost: Any,
-) -> None:  # fmt: skip
+) -> None:
     surface = {"baseColorFactor": [0.5, 1, 1, 1], "metallicFactor": 0}
     path = quad(pbrMetallicRoughness=surface, alphaMode=alpha)
     gltf.document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = gltf.array(colours, kind)
@@ -327,7 +347,7 @@ def test_the_strength_of_a_normal_map_is_in_its_image(gltf: Any, quad: Callable[
     assert image is not None
     file = child(image, "filename")
     assert file is not None
-    x, y, z = 2 * images.decoded(Path(file.get("value", "")).read_bytes(), "it")[0, 0, :3] - 1
+    x, y, z = 2 * images.decode(Path(file.get("value", "")).read_bytes(), "it")[0, 0, :3] - 1
     assert x / z == pytest.approx(0.5, abs=0.01)
     assert x * x + y * y + z * z == pytest.approx(1, abs=0.01)
 

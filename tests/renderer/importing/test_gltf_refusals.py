@@ -37,14 +37,16 @@ def changed(**entries: Any) -> Callable[[Path], None]:
         (lambda folder: (folder / "room.gltf").write_bytes(b"\xce{"), "is no glTF: it is neither JSON nor binary"),
         (changed(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
         (changed(extensionsRequired=["EXT_of_the_future"]), "EXT_of_the_future"),
-        (changed(buffers=[{"byteLength": 4, "extensions": {"KHR_meshopt_compression": {"fallback": True}}}]),
-         "KHR_meshopt_compression"),
+        (
+            changed(buffers=[{"byteLength": 4, "extensions": {"KHR_meshopt_compression": {"fallback": True}}}]),
+            "KHR_meshopt_compression",
+        ),
         (changed(nodes=[{"children": [1]}, {"children": [0]}], scenes=[{"nodes": [0]}]), "below itself"),
         (changed(asset={"version": "1.0"}), "1.0"),
         (changed(meshes=[]), "room.gltf"),
         (changed(nodes=[], scenes=[{"nodes": []}]), "room.gltf"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_read_is_named(
     gltf: Any, quad: Callable[..., Path], read: Read, tmp_path: Path, break_it: Callable[[Path], None], named: str
 ) -> None:
@@ -77,7 +79,7 @@ def first(kind: str, **entries: Any) -> Callable[[Any], None]:
         (first("meshes", primitives=[{"attributes": []}]), r"meshes\[0\].primitives\[0\].attributes .*be an object"),
         (first("materials", extensions={"KHR_materials_specular": "x"}), "KHR_materials_specular .*be an object"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_is_told_with_its_node_and_its_key(
     gltf: Any, quad: Callable[..., Path], read: Read, break_it: Callable[[Any], None], named: str
 ) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing import images
+from photonfarm.renderer.tools.importing import images
 
 
 def written(values: np.ndarray, kind: str) -> bytes:
@@ -47,11 +47,28 @@ def encoded_as(kind: str) -> bytes:
 
 @pytest.mark.parametrize(
     "kind",
-    ["PNG L", "PNG LA", "PNG P", "PNG RGB", "PNG RGBA", "PNG 16", "PNG 16 RGB", "JPEG L", "JPEG CMYK", "WEBP RGB",
-     "GIF P", "BMP L", "TGA RGB", "TIFF 16", "TIFF F", "OpenEXR", "RGBE"],
-)  # fmt: skip
+    [
+        "PNG L",
+        "PNG LA",
+        "PNG P",
+        "PNG RGB",
+        "PNG RGBA",
+        "PNG 16",
+        "PNG 16 RGB",
+        "JPEG L",
+        "JPEG CMYK",
+        "WEBP RGB",
+        "GIF P",
+        "BMP L",
+        "TGA RGB",
+        "TIFF 16",
+        "TIFF F",
+        "OpenEXR",
+        "RGBE",
+    ],
+)
 def test_images_of_every_depth_have_their_values(kind: str) -> None:
-    image = images.decoded(encoded_as(kind), "it")
+    image = images.decode(encoded_as(kind), "it")
     assert image.shape == (1, 2, 4)
     assert np.allclose(image[0, :, :3], [[0.25] * 3, [0.75] * 3], atol=0.06)
     assert (image[..., 3] == 1).all()
@@ -59,12 +76,18 @@ def test_images_of_every_depth_have_their_values(kind: str) -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"no image", b"#?RADIANCE", b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 8\nabc", b"PF\n3 3\n-1\nabc",
-     b"\x76\x2f\x31\x01\x02\0\0\0"],
-)  # fmt: skip
+    [
+        b"",
+        b"no image",
+        b"#?RADIANCE",
+        b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 8\nabc",
+        b"PF\n3 3\n-1\nabc",
+        b"\x76\x2f\x31\x01\x02\0\0\0",
+    ],
+)
 def test_what_is_no_image_or_cut_off_is_told_without_addresses_and_temporary_files(data: bytes) -> None:
     with pytest.raises(SpecError, match=r"^it: is not a readable image: ") as raised:
-        images.decoded(data, "it")
+        images.decode(data, "it")
     assert not re.search(r"0x|MemoryStream|/tmp", str(raised.value))
 
 
@@ -73,10 +96,10 @@ def test_images_keep_their_depth_when_they_are_written(tmp_path: Path) -> None:
     for values, most in (
         (fine, 1e-5),
         (np.round(fine * 255) / 255, 1e-6),
-        (images.encoded(3 * images.linear(fine)), 2e-3),
+        (images.encode(3 * images.linear(fine)), 2e-3),
     ):
         file = images.save(values, tmp_path / "it.png")
-        assert np.abs(images.decoded(file.read_bytes(), "it")[..., :3] - values).max() < most
+        assert np.abs(images.decode(file.read_bytes(), "it")[..., :3] - values).max() < most
 
 
 def test_images_are_read_beyond_the_limit_of_pillow() -> None:

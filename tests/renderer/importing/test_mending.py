@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from photonfarm.renderer.importing.imported import ImportedScene
-from photonfarm.renderer.importing.meshes import Mesh, of_shape, write_ply
+from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.meshes import Mesh, read_mesh, write_ply
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 
@@ -28,7 +28,7 @@ def test_a_part_of_a_mesh_has_the_attributes_of_its_vertices_and_faces(tmp_path:
     tints = {"vertex_tint": np.linspace(0, 1, 12).reshape(4, 3), "face_tint": np.array([[0.25, 0, 0], [0.5, 1, 0]])}
     part = Mesh(QUAD.astype(np.float64), FACES, attributes=tints).part(np.array([False, True]))
     file = write_ply(part, tmp_path / "part.ply")
-    read = of_shape(mi.load_dict({"type": "ply", "filename": str(file), "face_normals": True}))
+    read = read_mesh(mi.load_dict({"type": "ply", "filename": str(file), "face_normals": True}))
     assert sorted(read.attributes) == ["face_tint", "vertex_tint"]
     assert read.attributes["face_tint"] == pytest.approx(tints["face_tint"][1:])
     assert read.attributes["vertex_tint"] == pytest.approx(tints["vertex_tint"][[0, 2, 3]])

@@ -12,7 +12,7 @@ from mitsuba_scenes import SPHERE, Loaded, Read, reflectance
 from PIL import Image
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.readers import mitsuba_parts
+from photonfarm.renderer.tools.importing.readers import mitsuba_parts
 from photonfarm.scene.files import SceneFile
 
 
@@ -140,11 +140,15 @@ def test_names_values_and_paths_are_resolved_by_mitsuba(
 ) -> None:
     (tmp_path / "parts/images").mkdir(parents=True)
     Image.fromarray(np.full((4, 4, 3), 128, np.uint8)).save(tmp_path / "parts/images/grey.png")
-    (tmp_path / "parts/more.xml").write_text('<scene version="2.1.0"><default name="colour" value=".3"/>\n'
+    (tmp_path / "parts/more.xml").write_text(
+        '<scene version="2.1.0"><default name="colour" value=".3"/>\n'
         '<bsdf type="diffuse" id="first"><rgb name="reflectance" value="$colour"/></bsdf>'
-        '<alias id="first" as="second"/><include filename="ball.xml"/></scene>')  # fmt: skip
-    (tmp_path / "parts/ball.xml").write_text('<scene version="0.5.0"><shape type="sphere" id="Ball"><ref id="second"/>'
-        '<float name="radius" value="$r"/><srgb name="wobbleIt" value=".5"/></shape></scene>')  # fmt: skip
+        '<alias id="first" as="second"/><include filename="ball.xml"/></scene>'
+    )
+    (tmp_path / "parts/ball.xml").write_text(
+        '<scene version="0.5.0"><shape type="sphere" id="Ball"><ref id="second"/>'
+        '<float name="radius" value="$r"/><srgb name="wobbleIt" value=".5"/></shape></scene>'
+    )
     content = """<default name="r" value="2"/><default name="file" value="more"/><path value="parts/images"/>
       <include filename="parts/$file.xml"/>
       <shape type="disk" id="Plate"><transform name="to_world"><translate z="3"/></transform><bsdf type="diffuse">
@@ -271,8 +275,12 @@ def test_a_spec_of_shapes_without_ids_is_told_of_the_import(write_xml: Callable[
 
     path = write_xml('<shape type="sphere"/>')
     everywhere = {"min": [0, 0, 0], "max": [1, 1, 1]}
-    described = {"name": "it", "scene": {"file": str(path)}, "view": {"origin": everywhere, "look_at": everywhere},
-                 "objects": [{"name": "ball", "shapes": ["Ball"], "at": [0, 0, 0], "box": everywhere}]}  # fmt: skip
+    described = {
+        "name": "it",
+        "scene": {"file": str(path)},
+        "view": {"origin": everywhere, "look_at": everywhere},
+        "objects": [{"name": "ball", "shapes": ["Ball"], "at": [0, 0, 0], "box": everywhere}],
+    }
     with pytest.raises(SpecError, match=r"no ids; `photonfarm scene import`"):
         parse_spec(described, where="spec")
 
@@ -285,8 +293,11 @@ def test_shapes_of_a_group_and_copied_files_keep_apart(write_xml: Callable[..., 
 
 @pytest.mark.parametrize("kind", ["rotate", "matrix", "translate"])
 def test_transforms_that_are_no_numbers_are_refused(write_xml: Callable[..., Path], read: Read, kind: str) -> None:
-    step = {"rotate": '<rotate x="1" angle="nan"/>', "translate": '<translate x="nan"/>',
-            "matrix": f'<matrix value="nan {"0 " * 15}"/>'}[kind]  # fmt: skip
+    step = {
+        "rotate": '<rotate x="1" angle="nan"/>',
+        "translate": '<translate x="nan"/>',
+        "matrix": f'<matrix value="nan {"0 " * 15}"/>',
+    }[kind]
     with pytest.raises(SpecError, match="line 2"):
         read(write_xml(f'<shape type="cube"><transform name="to_world">{step}</transform></shape>'))
 

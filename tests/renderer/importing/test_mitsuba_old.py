@@ -13,7 +13,7 @@ from mitsuba_scenes import SPHERE, Loaded, Read, from_sky, reflectance
 from PIL import Image
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.images import save_radiance
+from photonfarm.renderer.tools.importing.images import save_radiance
 
 
 def test_names_of_version_0_6_are_those_of_version_3(write_xml: Callable[..., Path], loaded: Loaded) -> None:
@@ -53,7 +53,7 @@ def test_names_of_version_0_6_are_those_of_version_3(write_xml: Callable[..., Pa
         ('<spectrum name="reflectance" value="400:.5, 700:.5"/>', [0.6, 0.475, 0.452]),  # of no white point
         ('<xyz name="reflectance" value=".3, .3, .3"/>', [0.361, 0.285, 0.273]),
     ],
-)  # fmt: skip
+)
 def test_colours_of_0_6_are_those_of_its_rgb_mode(
     write_xml: Callable[..., Path], loaded: Loaded, written: str, expected: list[float]
 ) -> None:
@@ -144,21 +144,38 @@ MIXTURE = """<bsdf type="mixturebsdf"><string name="weights" value="{}"/><bsdf t
     [
         ('<bsdf type="conductor"/>', "0.201005, 0.92375, 1.10222", None),  # copper
         ('<bsdf type="roughdielectric"><string name="distribution" value="phong"/></bsdf>', "beckmann", "distribution"),
-        ('<bsdf type="ward"><float name="alphaU" value=".2"/><float name="alphaV" value=".3"/></bsdf>',
-         "alpha_u = UniformSpectrum[value=[0.2]], alpha_v = UniformSpectrum[value=[0.3]]", "ward"),
+        (
+            '<bsdf type="ward"><float name="alphaU" value=".2"/><float name="alphaV" value=".3"/></bsdf>',
+            "alpha_u = UniformSpectrum[value=[0.2]], alpha_v = UniformSpectrum[value=[0.3]]",
+            "ward",
+        ),
         ('<bsdf type="roughdiffuse"><float name="alpha" value=".3"/></bsdf>', "SmoothDiffuse", "roughdiffuse"),
-        ('<bsdf type="conductor"><spectrum name="eta" value="1.5"/><spectrum name="k" value="400:3, 700:3"/></bsdf>',
-         "1.5, 1.5, 1.5", None),
-        ('<texture type="checkerboard" id="T"/><texture type="scale" id="S"><float name="scale" value=".25"/>'
-         '<ref id="T"/></texture><bsdf type="bumpmap"><ref id="S"/><bsdf type="diffuse"/></bsdf>',
-         "scale = 0.25", None),
-        ('<texture type="bitmap" id="T"><string name="filename" value="n.png"/><float name="gamma" value="1"/>'
-         '</texture><bsdf type="normalmap"><ref id="T"/><bsdf type="diffuse"/></bsdf>', "NormalMap", None),
+        (
+            '<bsdf type="conductor"><spectrum name="eta" value="1.5"/><spectrum name="k" value="400:3, 700:3"/></bsdf>',
+            "1.5, 1.5, 1.5",
+            None,
+        ),
+        (
+            '<texture type="checkerboard" id="T"/><texture type="scale" id="S"><float name="scale" value=".25"/>'
+            '<ref id="T"/></texture><bsdf type="bumpmap"><ref id="S"/><bsdf type="diffuse"/></bsdf>',
+            "scale = 0.25",
+            None,
+        ),
+        (
+            '<texture type="bitmap" id="T"><string name="filename" value="n.png"/><float name="gamma" value="1"/>'
+            '</texture><bsdf type="normalmap"><ref id="T"/><bsdf type="diffuse"/></bsdf>',
+            "NormalMap",
+            None,
+        ),
         (MIXTURE.format(".5, .5"), "weight = UniformSpectrum[value=[0.5]]", None),
-        ('<bsdf type="bumpmap"><texture type="scale"><float name="scale" value=".25"/><texture type="checkerboard"/>'
-         '</texture><bsdf type="diffuse"/></bsdf>', "scale = 0.25", None),
+        (
+            '<bsdf type="bumpmap"><texture type="scale"><float name="scale" value=".25"/><texture type="checkerboard"/>'
+            '</texture><bsdf type="diffuse"/></bsdf>',
+            "scale = 0.25",
+            None,
+        ),
     ],
-)  # fmt: skip
+)
 def test_materials_of_0_6_have_its_defaults_or_are_the_nearest(
     write_xml: Callable[..., Path], loaded: Loaded, tmp_path: Path, written: str, described: str, said: str | None
 ) -> None:
@@ -173,32 +190,57 @@ def test_materials_of_0_6_have_its_defaults_or_are_the_nearest(
 @pytest.mark.parametrize(
     ("content", "effect", "name"),
     [
-        ('<texture type="bitmap"><string name="filename" value="it.exr"/><float name="gamma" value="2.2"/></texture>',
-         "colour", "gamma"),
-        ('<texture type="bitmap"><string name="filename" value="grey.png"/><string name="wrapModeU" value="clamp"/>'
-         "</texture>", "colour", "wrapMode"),
-        ('<texture type="scale"><float name="scale" value=".5"/><texture type="checkerboard"/></texture>',
-         "colour", "scale"),
+        (
+            '<texture type="bitmap"><string name="filename" value="it.exr"/><float name="gamma" value="2.2"/>'
+            "</texture>",
+            "colour",
+            "gamma",
+        ),
+        (
+            '<texture type="bitmap"><string name="filename" value="grey.png"/><string name="wrapModeU" value="clamp"/>'
+            "</texture>",
+            "colour",
+            "wrapMode",
+        ),
+        (
+            '<texture type="scale"><float name="scale" value=".5"/><texture type="checkerboard"/></texture>',
+            "colour",
+            "scale",
+        ),
         ('<texture type="vertexcolors"/>', "colour", "vertexcolors"),
         ('<emitter type="sky"><float name="stretch" value="1.2"/></emitter>', "light", "stretch"),
         ('<emitter type="collimated"/>', "light", "collimated"),
-        ('<emitter type="envmap"><string name="filename" value="grey.png"/><float name="gamma" value="1"/></emitter>',
-         "light", "gamma"),
-        ('<shape type="disk"><bsdf type="phong"><texture name="exponent" type="checkerboard"/></bsdf></shape>',
-         "colour", "exponent"),
+        (
+            '<emitter type="envmap"><string name="filename" value="grey.png"/><float name="gamma" value="1"/>'
+            "</emitter>",
+            "light",
+            "gamma",
+        ),
+        (
+            '<shape type="disk"><bsdf type="phong"><texture name="exponent" type="checkerboard"/></bsdf></shape>',
+            "colour",
+            "exponent",
+        ),
         (f'<shape type="disk">{MIXTURE.format(".5, .2")}</shape>', "colour", "mixturebsdf"),
         ('<shape type="disk"><bsdf type="coating"><bsdf type="diffuse"/></bsdf></shape>', "colour", "coating"),
-        ('<shape type="disk"><bsdf type="mask"><rgb name="opacity" value=".9 .1 .1"/><bsdf type="diffuse"/></bsdf>'
-         "</shape>",
-         "colour", "opacity"),
+        (
+            '<shape type="disk"><bsdf type="mask"><rgb name="opacity" value=".9 .1 .1"/><bsdf type="diffuse"/></bsdf>'
+            "</shape>",
+            "colour",
+            "opacity",
+        ),
         ('<shape type="heightfield"/>', "geometry", "heightfield"),
         ('<shape type="sphere"><subsurface type="dipole"/></shape>', "colour", "subsurface"),
         ('<shape type="obj"><string name="filename" value="it.obj"/></shape>', "colour", "mtllib"),
-        ('<shape type="obj"><string name="filename" value="it.obj"/><bsdf type="diffuse" name="Red"/>'
-         '<bsdf type="diffuse" name="BlueWall"/></shape>', "colour", "usemtl"),
+        (
+            '<shape type="obj"><string name="filename" value="it.obj"/><bsdf type="diffuse" name="Red"/>'
+            '<bsdf type="diffuse" name="BlueWall"/></shape>',
+            "colour",
+            "usemtl",
+        ),
         ('<shape type="sphere"><float name="maxSmoothAngle" value="30"/></shape>', "geometry", "maxSmoothAngle"),
     ],
-)  # fmt: skip
+)
 def test_what_0_6_has_and_mitsuba_3_has_not_is_a_loss_by_its_name(
     write_xml: Callable[..., Path], loaded: Loaded, tmp_path: Path, content: str, effect: str, name: str
 ) -> None:
@@ -244,10 +286,12 @@ def test_what_looks_at_something_has_the_up_of_0_6(write_xml: Callable[..., Path
         ('<bsdf type="diffuse"><texture type="scale" name="reflectance"/></bsdf>', "line 2: .*no texture to scale"),
         ('<transform name="toWorld"><lookat origin="0 0 5" target="0 0"/></transform>', "line 2: .* got 2"),
         ('<transform name="toWorld"><lookAt target="0 0 0" up="0 1 0"/></transform>', "line 2: .*origin"),
-        ('<emitter type="area"/></shape><emitter type="sun"/><emitter type="sky"/><shape type="disk">',
-         "line 2: .* and .*line 2: .*keep one"),
+        (
+            '<emitter type="area"/></shape><emitter type="sun"/><emitter type="sky"/><shape type="disk">',
+            "line 2: .* and .*line 2: .*keep one",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_in_0_6_is_named(
     write_xml: Callable[..., Path], loaded: Loaded, content: str, named: str
 ) -> None:

@@ -29,8 +29,8 @@ from obj_scenes import (
 from PIL import Image
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing import images
-from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing import images
+from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 
 @pytest.mark.parametrize(

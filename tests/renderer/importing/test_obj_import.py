@@ -23,7 +23,7 @@ from obj_scenes import (
 )
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 
 def test_objects_and_materials_name_shapes_and_images_stand_upright(
@@ -219,8 +219,14 @@ def test_what_cannot_be_read_is_refused_with_its_line(
 def test_statements_that_are_not_carried_over_are_said(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
     others = "surf 0 1 0 1 1 2 3 4\nend\ncall x.obj\ntrace_obj y\nusemap z\nlod 1\nbogus 1\nusemtl gone\n"
     scene = read(obj(f"{FOUR_V}{others}f 1 2 3 4"))
-    assert lost(scene) == {"surf": "geometry", "call": "geometry", "trace_obj": "light", "usemap": "colour",
-                           "bogus": "geometry", "usemtl": "colour"}  # fmt: skip
+    assert lost(scene) == {
+        "surf": "geometry",
+        "call": "geometry",
+        "trace_obj": "light",
+        "usemap": "colour",
+        "bogus": "geometry",
+        "usemtl": "colour",
+    }
     assert "are in no material file, and their surfaces are grey ('gone', line 12)" in said(scene)
 
 

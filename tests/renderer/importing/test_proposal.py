@@ -13,11 +13,11 @@ from imported_scenes import proposed
 from pydantic import TypeAdapter
 
 from photonfarm.core.models import Name
-from photonfarm.renderer.importing.proposal import surfaces
-from photonfarm.renderer.importing.proposal.groups import group_name, is_furniture, is_shell
-from photonfarm.renderer.importing.proposal.proposed import largest_rectangle
-from photonfarm.renderer.importing.proposal.surfaces import Box, Frame
 from photonfarm.renderer.scene.surroundings import surroundings
+from photonfarm.renderer.tools.importing.proposal import surfaces
+from photonfarm.renderer.tools.importing.proposal.groups import group_name, is_furniture, is_shell
+from photonfarm.renderer.tools.importing.proposal.proposed import largest_rectangle
+from photonfarm.renderer.tools.importing.proposal.surfaces import Box, Frame
 
 pytestmark = pytest.mark.usefixtures("few_points")
 
@@ -235,9 +235,12 @@ def test_the_largest_rectangle_is_that_of_all_rectangles() -> None:
             assert free[top : bottom + 1, left : right + 1].all()
             best = max(
                 (b - t + 1) * (r - c + 1)
-                for t in range(row + 1) for b in range(row, 7) for c in range(column + 1) for r in range(column, 9)
+                for t in range(row + 1)
+                for b in range(row, 7)
+                for c in range(column + 1)
+                for r in range(column, 9)
                 if free[t : b + 1, c : r + 1].all()
-            )  # fmt: skip
+            )
             assert (bottom - top + 1) * (right - left + 1) == best
 
 

@@ -16,9 +16,13 @@ PANEL = ((2, 2.58, 1.5), (3, 2.58, 2.1))
 
 @pytest.mark.parametrize(
     ("low", "high", "name"),
-    [(*PANEL, "Panel"), ((2, 2.6, 1.5), (3, 2.6, 2.1), "Flush"), ((2, 2.5, 1.5), (3, 2.6, 2.1), "Ceiling light"),
-     ((2.5, 1.8, 1.6), (2.8, 2.1, 1.9), "Globe")],
-)  # fmt: skip
+    [
+        (*PANEL, "Panel"),
+        ((2, 2.6, 1.5), (3, 2.6, 2.1), "Flush"),
+        ((2, 2.5, 1.5), (3, 2.6, 2.1), "Ceiling light"),
+        ((2.5, 1.8, 1.6), (2.8, 2.1, 1.9), "Globe"),
+    ],
+)
 def test_a_lamp_moves_along_the_ceiling_where_it_hangs(
     room: None, put: Callable[..., None], gltf: Any, tmp_path: Path, low: Any, high: Any, name: str
 ) -> None:

@@ -17,9 +17,9 @@ from click.testing import CliRunner, Result
 from photonfarm.core.errors import BackendError, PhotonfarmError, SpecError
 from photonfarm.core.pictures import display_values
 from photonfarm.renderer.cli.scene_verbs import scene_import
-from photonfarm.renderer.importing import importer
-from photonfarm.renderer.importing.readers import blender
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.importing import importer
+from photonfarm.renderer.tools.importing.readers import blender
 from photonfarm.scene.modification import rest, sample_modification
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import sample_view
@@ -172,8 +172,11 @@ def test_no_camera_stands_in_a_cube_on_a_floor_which_gets_a_sky(
 def test_a_room_is_the_same_in_other_units_and_elsewhere(
     quick: None, gltf: Any, run: Callable[..., Result], scale: float, shift: float, unit: str | None
 ) -> None:
-    for name, low, high, light in (("Shell", (0, 0, 0), (5, 2.6, 4), 0), ("Table", (2, 0, 1.5), (3.2, 0.75, 2.2), 0),
-                                   ("Lamp", (2, 2.5, 1.6), (2.6, 2.58, 2.2), 1)):  # fmt: skip
+    for name, low, high, light in (
+        ("Shell", (0, 0, 0), (5, 2.6, 4), 0),
+        ("Table", (2, 0, 1.5), (3.2, 0.75, 2.2), 0),
+        ("Lamp", (2, 2.5, 1.6), (2.6, 2.58, 2.2), 1),
+    ):
         mesh = trimesh.creation.box(bounds=[low, high])
         if name == "Shell":
             mesh.invert()

@@ -326,7 +326,7 @@ def test_a_scene_file_that_is_not_the_planned_one_is_refused(
     with pytest.raises(SceneNotHereError):
         renderer.render(result.scene_id, 0)
     monkeypatch.setenv("PHOTONFARM_SCENES", str(folders[0]))
-    assert jobs.located(spec) == spec
+    assert jobs.locate(spec) == spec
 
 
 def test_a_job_that_is_not_planned_is_refused_and_one_of_a_forgotten_scene_is_dropped(

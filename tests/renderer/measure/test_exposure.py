@@ -13,9 +13,9 @@ from click.testing import CliRunner, Result
 from photonfarm.core.pictures import display_values
 from photonfarm.core.waiting import Steps, WorkLog
 from photonfarm.renderer.cli.measuring_verbs import scene_exposure
-from photonfarm.renderer.measure import exposure
-from photonfarm.renderer.measure.exposure import DarkError, Pictures, propose
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.measure import exposure
+from photonfarm.renderer.tools.measure.exposure import DarkError, Pictures, propose
 from photonfarm.scene.spec import Film, SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 
@@ -72,7 +72,7 @@ def test_other_images_of_a_scene_have_the_display_mean_that_was_wanted(quick: No
     assert found.scene_id == cornell().scene_id
     assert found.low < found.exposure < (found.high or 0)
     scene = LoadedScene.load(exposure.shrunk(cornell(), exposure.SIDE).model_copy(update={"exposure": 1.0}))
-    halves = np.stack(list(exposure._rendered(scene, 16, 32, Steps(16))))  # more samples
+    halves = np.stack(list(exposure._render_pairs(scene, 16, 32, Steps(16))))  # more samples
     assert display_values(np.float32(found.exposure) * halves.mean(axis=1)).mean() == pytest.approx(0.4, abs=0.004)
     again = propose(cornell().model_copy(update={"exposure": 9.0}), None, WorkLog(told.append), target=0.4, frames=16)
     assert again.exposure == found.exposure  # whatever the spec says
@@ -82,8 +82,9 @@ def test_other_images_of_a_scene_have_the_display_mean_that_was_wanted(quick: No
 
 def test_where_too_much_is_black_it_is_said_how_bright_it_can_get(quick: None) -> None:
     described = cornell()
-    away = described.view.model_copy(update={"look_at": described.view.look_at.model_copy(
-        update={"min": (0.0, 1.0, 9.0), "max": (0.0, 1.0, 9.0)})})  # fmt: skip
+    away = described.view.model_copy(
+        update={"look_at": described.view.look_at.model_copy(update={"min": (0.0, 1.0, 9.0), "max": (0.0, 1.0, 9.0)})}
+    )
     with pytest.raises(DarkError, match="stays below 0"):
         propose(described.model_copy(update={"view": away}), None, WorkLog(lambda _: None), frames=2)
 
@@ -91,7 +92,7 @@ def test_where_too_much_is_black_it_is_said_how_bright_it_can_get(quick: None) -
 def test_what_is_lit_gets_the_target_if_that_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     images = np.zeros((2, 2, 8, 8, 3), np.float32)
     images[:, :, :2] = 0.5  # a quarter
-    monkeypatch.setattr(exposure, "_rendered", lambda *_: iter(images))
+    monkeypatch.setattr(exposure, "_render_pairs", lambda *_: iter(images))
     work = WorkLog(lambda _: None)
     with pytest.raises(DarkError, match=r"stays below 0\.25"):
         propose(cornell(), None, work, frames=2, least=0.3)

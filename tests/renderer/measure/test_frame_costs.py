@@ -16,17 +16,17 @@ from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.renderer.cli.sample_verbs import measure_frames
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.renderer.measure.frame_costs import (
+from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.measure.frame_costs import (
     WARM_UPS,
     PartialFilm,
     TimedFrame,
     frame_costs,
-    in_turn,
     part_of,
     surface_kinds,
+    take_turns,
 )
-from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec
@@ -167,8 +167,8 @@ def test_a_sixteenth_of_the_pixels_takes_less_than_half_the_time_of_all() -> Non
 def test_neighbouring_frames_differ_in_configuration(somewhere: View) -> None:
     at_rest = rest(plain())
     frames = [frame(somewhere, at_rest, key, row) for row, key in enumerate("AAABBC")]
-    assert [each.row for each in islice(in_turn(frames), 10)] == [0, 3, 5, 1, 4, 5, 2, 3, 5, 0]
-    assert all(one.key != other.key for one, other in pairwise(islice(in_turn(frames), 50)))
+    assert [each.row for each in islice(take_turns(frames), 10)] == [0, 3, 5, 1, 4, 5, 2, 3, 5, 0]
+    assert all(one.key != other.key for one, other in pairwise(islice(take_turns(frames), 50)))
 
 
 @pytest.mark.parametrize("configurations", [1, 2])
@@ -198,7 +198,9 @@ def test_each_part_is_charged_with_its_own_seconds(
 
         return work
 
-    monkeypatch.setattr("photonfarm.renderer.measure.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0]))
+    monkeypatch.setattr(
+        "photonfarm.renderer.tools.measure.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0])
+    )
     monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
     monkeypatch.setattr(room, "guides", takes(lambda *_: 1000, lambda *_: None))
@@ -209,8 +211,13 @@ def test_each_part_is_charged_with_its_own_seconds(
     monkeypatch.setattr(PartialFilm, "render", takes(lambda film, *_: film.spec.film.width, lambda *_: None))
     costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[4, 1], timed=2)
     assert costs.medians() == {
-        "edit_s": 1, "buffers_s": 10, "guides_s": 1000, "points_s": 4096, "photons_s": 100, "photons_seen_s": 8192
-    }  # fmt: skip
+        "edit_s": 1,
+        "buffers_s": 10,
+        "guides_s": 1000,
+        "points_s": 4096,
+        "photons_s": 100,
+        "photons_seen_s": 8192,
+    }
     assert costs.render_medians() == {4: 12, 1: 24}
 
 

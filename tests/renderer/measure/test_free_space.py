@@ -9,9 +9,9 @@ from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.measure.free_space import measure
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE
+from photonfarm.renderer.tools.measure.free_space import measure
 from photonfarm.scene.modification import sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -64,8 +64,13 @@ SHAPES = """
 
 def of_file(file_scene: Any, folder: Path, **view: Any) -> LoadedScene:
     low, high = [-4, 0.2, -3], [4, 2.8, 3]  # larger than the room, whose floor is 6 × 4
-    crate = {"name": "crate", "shapes": ["Crate"], "at": [1.5, 0, 0], "removal_probability": 0,
-             "box": {"min": [-2.5, 0, -1.5], "max": [2.5, 0, 1.5]}}  # fmt: skip
+    crate = {
+        "name": "crate",
+        "shapes": ["Crate"],
+        "at": [1.5, 0, 0],
+        "removal_probability": 0,
+        "box": {"min": [-2.5, 0, -1.5], "max": [2.5, 0, 1.5]},
+    }
     box = {"min": low, "max": high}
     look_at = {"min": [-2.5, 0.5, -1.5], "max": [2.5, 2.5, 1.5]}
     return file_scene(folder, SHAPES, objects=[crate], view={"origin": box, "look_at": look_at, **view})

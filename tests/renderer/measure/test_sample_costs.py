@@ -12,11 +12,17 @@ from click.testing import CliRunner, Result
 from photonfarm.core.errors import SpecError
 from photonfarm.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.renderer.cli.measuring_verbs import scene_cost
-from photonfarm.renderer.measure import sample_costs as measuring
-from photonfarm.renderer.measure.frame_costs import WARM_UPS
-from photonfarm.renderer.measure.sample_costs import fewer_samples, line_through, measured_costs, sample_costs, timed
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.measure import sample_costs as measuring
+from photonfarm.renderer.tools.measure.frame_costs import WARM_UPS
+from photonfarm.renderer.tools.measure.sample_costs import (
+    fewer_samples,
+    line_through,
+    measure_costs,
+    sample_costs,
+    time_work,
+)
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec
@@ -110,7 +116,7 @@ def test_a_pass_of_more_samples_takes_the_seconds_that_were_predicted() -> None:
     costs = sample_costs(scene, 5)
     view = View(np.array([0, 1, 3.5], np.float32), np.array([0, 1, 0], np.float32))
     scene.render_halves(view, (1, 2), 16)
-    measured_s = min(timed(lambda: scene.render_halves(view, (3, 4), 16))[0] for _ in range(3))
+    measured_s = min(time_work(lambda: scene.render_halves(view, (3, 4), 16))[0] for _ in range(3))
     predicted_s = costs.seconds(32, configurations=0, views=0, samples=1)
     assert 0.4 < predicted_s / measured_s < 2.5
 
@@ -145,7 +151,7 @@ def test_the_noise_is_the_variance_between_many_images(room: LoadedScene, somewh
 
 
 def test_a_static_scene_is_measured_in_different_views() -> None:
-    costs = measured_costs(static(), frames=2)
+    costs = measure_costs(static(), frames=2)
     assert costs.configuration_s < 0.1  # nothing moves, and there are no photons
     assert costs.view_s > 0
     assert costs.relative_variance > 0

@@ -7,9 +7,8 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import make_key
 from photonfarm.core.records import STATIC
 from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.base_cloud import cloud_of, geometry_of
+from photonfarm.renderer.scene.base_cloud import cloud_of, geometry_of, triangles_of
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.tessellation import triangles_of
 from photonfarm.scene.modification import rebuild, sample_modification
 from photonfarm.scene.spec_loading import load_spec
 

@@ -115,11 +115,13 @@ def test_the_back_of_a_one_sided_surface_is_black(bsdf: dict[str, Any]) -> None:
     [
         ({"type": "principled", "base_color": DIFFUSE["reflectance"]}, COLOUR),
         ({"type": "mask", "opacity": 0.5, "bsdf": DIFFUSE}, COLOUR),
-        ({"type": "blendbsdf", "weight": 0.5, "one": {"type": "twosided", "bsdf": RED}, "two": DIFFUSE},
-         (0.55, 0.25, 0.35)),
+        (
+            {"type": "blendbsdf", "weight": 0.5, "one": {"type": "twosided", "bsdf": RED}, "two": DIFFUSE},
+            (0.55, 0.25, 0.35),
+        ),
     ],
     ids=lambda value: value["type"] if isinstance(value, dict) else "",
-)  # fmt: skip
+)
 def test_what_mitsuba_flags_as_two_sided_keeps_its_front_s_albedo_from_behind(
     bsdf: dict[str, Any], albedo: tuple[float, ...]
 ) -> None:

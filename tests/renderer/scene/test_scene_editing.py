@@ -5,10 +5,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene import backend, native
 from photonfarm.renderer.scene.gbuffer import view_buffers
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.native import acceleration
 from photonfarm.scene.modification import Modification, rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -168,8 +167,8 @@ def test_what_is_parked_stays_in_the_bounding_box_and_out_of_sight(room: LoadedS
 def test_embree_finds_the_same_surfaces_when_it_expects_changes(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch, somewhere: View
 ) -> None:
-    monkeypatch.setattr(acceleration, "_embree", lambda: None)
-    assert not acceleration.expect_changes(room.scene)
+    monkeypatch.setattr(native, "_open_embree", lambda: None)
+    assert not native.expect_changes(room.scene)
     as_mitsuba_builds_it = LoadedScene.load(room.spec)
     for i in range(3):
         modification = sample_modification(room.spec, 5, i)
@@ -185,15 +184,15 @@ def test_embree_can_be_told_to_expect_changes_and_each_scene_is_told_by_itself()
     mi = backend.load(1)
     scenes = [mi.load_dict({"type": "scene", "s": {"type": "sphere", "radius": r}}, optimize=False) for r in (1.0, 2.0)]
     pending = scenes[1].ray_test(mi.Ray3f(mi.Point3f(0), mi.Vector3f(0, 0, 1)))  # not to be taken for another's
-    (entry, first), (other_entry, second) = (acceleration._traced_by(scene) for scene in scenes)
+    (entry, first), (other_entry, second) = (native._find_embree_scene(scene) for scene in scenes)
     assert entry == other_entry != 0
     assert 0 != first != second != 0
-    assert all(acceleration.expect_changes(scene) for scene in scenes)
+    assert all(native.expect_changes(scene) for scene in scenes)
     assert pending[0]
 
 
 def test_a_ray_that_comes_from_no_known_function_of_embree_changes_nothing(
     room: LoadedScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(acceleration, "_entry_points", lambda _: {0xBAD})
-    assert not acceleration.expect_changes(room.scene)
+    monkeypatch.setattr(native, "_entry_points", lambda _: {0xBAD})
+    assert not native.expect_changes(room.scene)

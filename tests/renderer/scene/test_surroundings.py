@@ -122,10 +122,13 @@ HOUSE = cube("House", 0, 1.5, 0, (3, 1.5, 2))
     ("content", "place", "inside"),
     [
         (HOUSE + cube("Tree", 10, 1, 0, (0.3, 2, 0.3)), (-1, 1.5, 0), None),
-        (cube("House", 0, 1.5, 0, (5, 1.6, 5)) + cube("Cupboard", -4.4, 1, -4.4, (0.59, 1, 0.59)), (-4.4, 1, -4.4),
-         "Cupboard"),
+        (
+            cube("House", 0, 1.5, 0, (5, 1.6, 5)) + cube("Cupboard", -4.4, 1, -4.4, (0.59, 1, 0.59)),
+            (-4.4, 1, -4.4),
+            "Cupboard",
+        ),
     ],
-)  # fmt: skip
+)
 @pytest.mark.parametrize("there", [5, 3, 0])
 def test_a_room_is_no_solid_and_a_solid_no_room_whatever_groups_are_away(
     file_scene, tmp_path, content: str, place: tuple[float, float, float], inside: str | None, there: int

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from photonfarm.core.records import STATIC, BasePointCloud, Geometry, Photons, Visibility
 from photonfarm.renderer.jobs.render import visibility_of
 from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.gbuffer import seen_points
+from photonfarm.renderer.scene.gbuffer import find_seen_points
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.modification import Modification, rebuild, rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
@@ -203,7 +203,7 @@ def sees(*position: tuple[float, float, float], bsdf: str = "diffuse", **limits:
     """The eye at (0, 0, 3) looks past a square at the origin, ±1 across and facing the eye."""
     mi = backend.load(1)
     scene = mi.load_dict({"type": "scene", "square": {"type": "rectangle", "bsdf": {"type": bsdf}}}, optimize=False)
-    return seen_points(scene, ALONG_Z, spec(**limits), np.array(position, np.float32)).tolist()
+    return find_seen_points(scene, ALONG_Z, spec(**limits), np.array(position, np.float32)).tolist()
 
 
 @pytest.mark.parametrize("bsdf", ["diffuse", "dielectric", "null"])

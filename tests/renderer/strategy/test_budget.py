@@ -57,9 +57,9 @@ def test_items_are_taken_while_their_share_of_the_time_lasts() -> None:
     machine = Machine()
     budget = Budget(10, machine.clock)
     taken = []
-    for item in budget.within(0.25, range(9), 2):
+    for item in budget.take_within(0.25, range(9), 2):
         machine.now += 1
         taken.append(item)
     assert taken == [0, 1, 2]
     machine.now = 9
-    assert list(budget.within(0.25, range(9), 2)) == [0, 1]
+    assert list(budget.take_within(0.25, range(9), 2)) == [0, 1]

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from photonfarm.core.records import F32
-from photonfarm.renderer.strategy.noise import BlockSums, missed
+from photonfarm.renderer.strategy.noise import BlockSums, charge_for_missed
 
 SIDE, CANDIDATES, CONNECTED = 64, 6, 0.15
 WEIGHTS = np.ones((SIDE, SIDE, 3), np.float32)
@@ -47,7 +47,9 @@ def test_candidates_of_one_mean_are_charged_next_to_nothing_for_few_images(draw:
     for seed in range(10):
         rng = np.random.default_rng([seed, views])
         candidates = [sums_of(draw, views, pairs, rng) for _ in range(CANDIDATES)]
-        charges += [missed(sums, [other for other in candidates if other is not sums]) for sums in candidates]
+        charges += [
+            charge_for_missed(sums, [other for other in candidates if other is not sums]) for sums in candidates
+        ]
     assert np.mean(charges) < 0.02 * 0.25
 
 
@@ -62,5 +64,5 @@ def with_caustic(rng: np.random.Generator) -> NDArray[np.float64]:
 def test_a_candidate_that_misses_a_caustic_is_charged_for_one_pair_of_images_in_each_view(seed: int) -> None:
     rng = np.random.default_rng(seed)
     without, finds = sums_of(dependent, 8, 1, rng), sums_of(with_caustic, 8, 1, rng)
-    assert missed(without, [finds]) > 0.25  # more than the noise that is seen
-    assert missed(finds, [without]) < 0.02 * 0.25
+    assert charge_for_missed(without, [finds]) > 0.25  # more than the noise that is seen
+    assert charge_for_missed(finds, [without]) < 0.02 * 0.25

@@ -12,9 +12,9 @@ mi = backend.load(threads=1)
 
 from photonfarm.core.statistics import block_z_test  # noqa: E402
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, Render  # noqa: E402
-from photonfarm.renderer.strategy.noise import BlockSums, missed, pair_errors, view_weights  # noqa: E402
+from photonfarm.renderer.strategy.noise import BlockSums, charge_for_missed, pair_errors, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import choose  # noqa: E402
-from photonfarm.renderer.strategy.printed import reasons_for  # noqa: E402
+from photonfarm.renderer.strategy.plan_text import reasons_for  # noqa: E402
 from tests.stability.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
@@ -168,7 +168,7 @@ def test_one_lucky_sample_does_not_convict_the_others() -> None:
         c[3, 3] += 5000.0 * (i == 2)
         ordinary.add(a, b, weights)
         lucky.add(c, d, weights)
-    assert missed(ordinary, [lucky]) == 0
+    assert charge_for_missed(ordinary, [lucky]) == 0
 
 
 def test_bright_samples_that_all_candidates_share_are_not_counted() -> None:

@@ -16,7 +16,7 @@ from photonfarm.renderer.strategy.budget import ImageCost  # noqa: E402
 from photonfarm.renderer.strategy.candidates import GRID, PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
 from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
-from photonfarm.renderer.strategy.printed import lines, plus_minus  # noqa: E402
+from photonfarm.renderer.strategy.plan_text import lines, plus_minus  # noqa: E402
 from photonfarm.scene.spec import SceneSpec  # noqa: E402
 from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
 
@@ -62,7 +62,7 @@ def test_a_plan_for_training_says_so_and_what_its_figures_are() -> None:
 
 def test_half_estimates_for_training_share_the_fixed_part_of_a_launch() -> None:
     """Two images of 3 samples take 0.5 + 6·0.25 s in one launch."""
-    assert 2 * ImageCost(0.5, 0.25).of_a_half().time_s(3) == 2.0
+    assert 2 * ImageCost(0.5, 0.25).halve().time_s(3) == 2.0
 
 
 def test_no_measurement_for_one_purpose_is_taken_for_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -180,8 +180,9 @@ def test_savings_are_ratios_of_time_to_equal_error() -> None:
     """Plain path tracing has 9 samples in 0.1 s, (0, 1) has 4 and (1, 1) has 2: 0.2/9, 0.05/4, 0.05/2."""
     found = plan_of(spec_with(), measurement(), cached=False)
     assert [(s.over, s.factor) for s in found.savings] == [
-        (PLAIN, pytest.approx(0.2 / 9 / (0.05 / 4))), (JOINED, pytest.approx(2)),
-    ]  # fmt: skip
+        (PLAIN, pytest.approx(0.2 / 9 / (0.05 / 4))),
+        (JOINED, pytest.approx(2)),
+    ]
     assert found.savings[0].spread == pytest.approx(0.2 / 9 / (0.05 / 4) * 0.1 / 3**0.5)
     text = text_of(found)
     for sentence in (

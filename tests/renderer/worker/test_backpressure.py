@@ -79,7 +79,7 @@ def test_a_store_that_is_not_on_a_disk_has_no_reserve(store: Store, monkeypatch:
 def test_a_disk_that_refused_a_write_is_left_alone_for_a_while(store: Store) -> None:
     clock = Clock()
     disk = DiskReserve(store, 0, clock=clock)
-    disk.refused()
+    disk.note_refusal()
     assert "the disk is full" in disk.reason()
     clock.now += FULL_S
     assert disk.reason() is None

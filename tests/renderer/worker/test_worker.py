@@ -19,9 +19,8 @@ from photonfarm.core.processes import Stop
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
 from photonfarm.queue import connect, job_name, queue_status
-from photonfarm.renderer.worker import heartbeat
-from photonfarm.renderer.worker.queue_source import QueueSource
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
+from photonfarm.renderer.worker.source import QueueSource
 from photonfarm.renderer.worker.supervisor import ChildOutput, ending
 from photonfarm.renderer.worker.worker import check, render_job, run_worker
 from photonfarm.scene.spec import Source
@@ -202,7 +201,7 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
 def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
     scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(heartbeat, "REPORT_S", 0.02)
+    monkeypatch.setattr(f"{QueueSource.__module__}.REPORT_S", 0.02)
     connection, store = connect(redis_server.url), Store(tmp_path / "store")
     queue.reconcile(store, connection)
     settings = WorkerSettings(store=str(store.root), redis_url=redis_server.url, name="ada", idle_s=1)
@@ -267,9 +266,12 @@ def test_a_redis_that_refuses_for_good_ends_a_worker_with_a_sentence(
     def work() -> None:
         try:
             run_worker(
-                tmp_path / "store", redis_server.url.replace("://", "://ada:secret@"), child=analytic.command(),
-                idle_s=1, reserve_bytes=0,
-            )  # fmt: skip
+                tmp_path / "store",
+                redis_server.url.replace("://", "://ada:secret@"),
+                child=analytic.command(),
+                idle_s=1,
+                reserve_bytes=0,
+            )
         except QueueError as error:
             ended.append(error)
 

@@ -13,7 +13,7 @@ def settings_of(**changes: object) -> WorkerSettings:
 def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: pytest.LogCaptureFixture) -> None:
     log = WorkerLog(settings_of(report_s=3600))
     for job in range(5):
-        with log.timing(f"job-{job}"):
+        with log.time_job(f"job-{job}"):
             pass
     assert [record.getMessage() for record in caplog.records] == [
         "worker ada: 1 job in 0 s, 0.00 s each; the last was job-0"
@@ -21,7 +21,7 @@ def test_a_worker_says_a_line_after_its_first_job_and_then_one_a_minute(caplog: 
     caplog.clear()
     log = WorkerLog(settings_of(report_s=1e-9))
     for job in range(5):
-        with log.timing(f"job-{job}"):
+        with log.time_job(f"job-{job}"):
             pass
     assert len(caplog.records) == 5
 
@@ -34,10 +34,10 @@ def test_what_a_child_tells_of_its_jobs_is_summed_up_and_failures_are_in_it() ->
 
 def test_a_quiet_worker_says_only_why_it_pauses_and_that_once(caplog: pytest.LogCaptureFixture) -> None:
     log = WorkerLog(settings_of(quiet=True))
-    with log.timing("job"):
+    with log.time_job("job"):
         pass
     for reason in (None, "the disk is full", "the disk is fuller", None, None):
-        log.pausing(reason)
+        log.log_pause(reason)
     assert [record.getMessage() for record in caplog.records] == [
         "worker ada: takes no jobs: the disk is full",
         "worker ada: takes jobs again",

@@ -52,7 +52,7 @@ def test_the_doctor_tells_of_a_redis_that_fails(monkeypatch: pytest.MonkeyPatch)
             raise redis.exceptions.NoPermissionError("no permissions to run the 'info' command")
 
     monkeypatch.setattr(queue, "connect", lambda _: Failing())
-    found = doctor._tried("Redis", lambda: doctor._reaches("redis://h:1/0"))
+    found = doctor._try("Redis", lambda: doctor._reaches("redis://h:1/0"))
     assert (found.works, found.exit_code) == (False, QueueError.exit_code)
     assert "no permissions" in found.detail
 

@@ -116,7 +116,7 @@ def compare_weights(
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
     if settings.guided_light:
-        lights = lights.guided_by(random_guide(lights.count, seed), scene)
+        lights = lights.guide_with(random_guide(lights.count, seed), scene)
         useful = Usefulness.over(scene, random_usefulness(seed))
     else:
         useful = None

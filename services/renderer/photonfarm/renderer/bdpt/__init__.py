@@ -14,7 +14,7 @@ errors raised while rendering (a ValueError that says what is refused) in a Runt
 ``integrator.render(scene, …)`` raises them as they are.
 """
 
-from photonfarm.renderer.bdpt.variant import require_variant
+from photonfarm.renderer.bdpt.scenes import require_variant
 
 require_variant()
 

@@ -16,10 +16,10 @@ from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
 from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices
-from photonfarm.renderer.bdpt.light_paths import PathOptions, exchanged
+from photonfarm.renderer.bdpt.light_paths import PathOptions, exchange_directions
 from photonfarm.renderer.bdpt.lights.emission import DirectSample, Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
-from photonfarm.renderer.bdpt.recording import traced_once
+from photonfarm.renderer.bdpt.recording import loop_once
 
 _MAX_THROUGHPUT_KEPT = 0.95
 _NEAR_VERTICES = 2
@@ -87,7 +87,7 @@ def trace_eye_paths(
         dvc=mi.Float(0),
         depth=mi.UInt32(1),
     )
-    (state,) = traced_once(
+    (state,) = loop_once(
         state=(state,),
         cond=lambda s: s.active,
         body=partial(_bounce, scene=scene, lights=lights, options=options, connectable=connectable),
@@ -139,8 +139,8 @@ def _bounce(
         wo = mi.Vector3f(0, 0, 1)
     value, p_forward, bs, bs_weight = bsdf.eval_pdf_sample(ctx, si, wo, s.rng.next_1d(), s.rng.next_2d(), active)
     if lights is not None:
-        joined = _lit(scene, si, light, light.valid & (dr.max(value) > 0))
-        p_reverse = bsdf.pdf(ctx, *exchanged(si, wo), joined)
+        joined = _is_unoccluded(scene, si, light, light.valid & (dr.max(value) > 0))
+        p_reverse = bsdf.pdf(ctx, *exchange_directions(si, wo), joined)
         p_ratio, share = p_forward / light.density, mi.Float(1)
         if options.light_samples > 1:
             share = dr.select(first, mi.Float(1 / options.light_samples), 1)
@@ -178,7 +178,7 @@ def _matters(scene: mi.Scene, arrival: mi.PreliminaryIntersection3f) -> mi.Bool:
     return mi.Bool(True) if scene.environment() is not None else arrival.is_valid()
 
 
-def _lit(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: DirectSample, active: mi.Bool) -> mi.Bool:
+def _is_unoccluded(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: DirectSample, active: mi.Bool) -> mi.Bool:
     """Whether nothing is between a surface point and the sampled point of a light."""
     shadow = si.spawn_ray_to(light.p)
     shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), shadow)
@@ -186,9 +186,14 @@ def _lit(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: DirectSample, acti
 
 
 def _more_direct_light(
-    scene: mi.Scene, lights: Lights, options: PathOptions, s: EyeState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr,
+    scene: mi.Scene,
+    lights: Lights,
+    options: PathOptions,
+    s: EyeState,
+    si: mi.SurfaceInteraction3f,
+    bsdf: mi.BSDFPtr,
     active: mi.Bool,
-) -> mi.Spectrum:  # fmt: skip
+) -> mi.Spectrum:
     """Radiance at the first vertex from all samples of the lights but one; a light can only be hit instead (s=0)."""
     n = options.light_samples
     rng = s.rng.apart()  # so that eye paths are the same for every n
@@ -196,7 +201,7 @@ def _more_direct_light(
     for _ in range(n - 1):
         light = sample_direct(lights, si, rng, active)
         value, p_forward = bsdf.eval_pdf(mi.BSDFContext(), si, si.to_local(light.d), active)
-        joined = _lit(scene, si, light, light.valid & (dr.max(value) > 0))
+        joined = _is_unoccluded(scene, si, light, light.valid & (dr.max(value) > 0))
         w = weights.next_event(dr.select(light.delta, 0, p_forward / (n * light.density)), 0, 0, 0, 0, 0)
         total += dr.select(joined, s.throughput * value * light.radiance_over_density * (w / n), 0)
     return total
@@ -219,7 +224,7 @@ def _scatter(
     s.eta = s.eta * bs.eta
     s.active &= (bs.pdf > 0) & (dr.max(s.throughput) > 0)
 
-    p_reverse = bsdf.pdf(ctx, *exchanged(si, bs.wo), s.active & ~delta)
+    p_reverse = bsdf.pdf(ctx, *exchange_directions(si, bs.wo), s.active & ~delta)
     vcm, vc = weights.scatter(s.dvcm, s.dvc, count, cos_out, bs.pdf, p_reverse)
     delta_vcm, delta_vc = weights.scatter_delta(s.dvc, cos_out)
     s.dvcm, s.dvc = dr.select(delta, delta_vcm, vcm), dr.select(delta, delta_vc, vc)
@@ -273,7 +278,7 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
         active = own.active if k < later else own.active & near
         shift = dr.gather(mi.UInt32, connectable.shifts, row * options.connections + k, active)
         slot = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
-        vertex = connectable.vertices.drawn(slot, active)
+        vertex = connectable.vertices.draw(slot, active)
         value = _connect(scene, options, replace(own, active=active), vertex)
         if connectable.tally is not None:
             connectable.tally.add(vertex, value * share, active)
@@ -298,10 +303,10 @@ def _connect(scene: mi.Scene, options: PathOptions, own: OwnVertex, vertex: Kept
     # The eye vertex forward and backward; the light vertex with its directions exchanged, and forward
     f, p = own.bsdf.eval_pdf(ctx, si, wo, active)
     active &= dr.max(f) > 0
-    p_reverse = own.bsdf.pdf(ctx, *exchanged(si, wo), active)
+    p_reverse = own.bsdf.pdf(ctx, *exchange_directions(si, wo), active)
     bsdf_other = other.bsdf()
     p_other = bsdf_other.pdf(ctx, other, wo_other, active)
-    f_other, p_reverse_other = bsdf_other.eval_pdf(ctx, *exchanged(other, wo_other), active)
+    f_other, p_reverse_other = bsdf_other.eval_pdf(ctx, *exchange_directions(other, wo_other), active)
 
     light_sum = p * cos_other * (vertex.counted_dvcm + p_reverse_other * vertex.dvc)
     eye_sum = p_other * cos_own * (own.count * own.dvcm + p_reverse * own.dvc)

@@ -13,7 +13,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import ImageStack, Splat, Sums, check_sensor, primary_rays
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.guiding.grid import Grid, SparseLanes
-from photonfarm.renderer.bdpt.guiding.learning import Effort, LightGuide, learned
+from photonfarm.renderer.bdpt.guiding.learning import Effort, LightGuide, learn
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally, Totals
 from photonfarm.renderer.bdpt.guiding.usefulness import SIDE, Usefulness
@@ -182,7 +182,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             width, height = (int(n) for n in sensor.film().crop_size())
             lights = read_lights(scene)
             layout = Layout.of(lights.count)
-            lights = lights.guided_by(StartGuide.neutral(layout), scene)
+            lights = lights.guide_with(StartGuide.neutral(layout), scene)
             views = 1 if places is None else len(places)
             seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, views)
             launch = effort.launch(views)
@@ -195,7 +195,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             lanes.thin(effort.eye_paths // views)
             grid = Grid.over(bounding_box(scene), SIDE)
             images, totals = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes, grid)
-            return learned(layout, lights.emit_probability, images, totals, lanes)
+            return learn(layout, lights.emit_probability, images, totals, lanes)
 
     def _has_light_paths(self, scene: mi.Scene) -> bool:
         return bool(self.light_ratio > 0 and self.max_depth > 2 and scene.emitters())
@@ -224,12 +224,12 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             width, height = (int(n) for n in sensor.film().crop_size())
             pixels = width * height
             if self.guided_light and guide is None:
-                effort = Effort.of_image(pixels * spp, self.light_ratio, self.connections)
+                effort = Effort.for_image(pixels * spp, self.light_ratio, self.connections)
                 guide = self.learn_guide(scene, sensor, seeds[0], places, effort)
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if self._has_light_paths(scene) else 0
             if lights is not None and guide is not None and light_ratio:
-                lights = lights.guided_by(guide.starts, scene)
+                lights = lights.guide_with(guide.starts, scene)
             useful = None
             if guide is not None and guide.usefulness_table is not None and self.connections and light_ratio:
                 useful = Usefulness.over(scene, guide.usefulness_table)
@@ -329,9 +329,16 @@ def trace(
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
         offset = randomness.sampler(randomness.stream(lanes.keys, randomness.SLOTS), lanes.first_light_path)
         vertices = trace_light_paths(
-            scene, lens, lights, options,
-            rng=rng, path=path, paths=lanes.counts[2], offset=offset.next_independent(), splat=splat,
-        )  # fmt: skip
+            scene,
+            lens,
+            lights,
+            options,
+            rng=rng,
+            path=path,
+            paths=lanes.counts[2],
+            offset=offset.next_independent(),
+            splat=splat,
+        )
         dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
 
     image, sample, pixel = lanes.eye()

@@ -15,7 +15,7 @@ from typing import TypeAlias
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.recording import resampled
+from photonfarm.renderer.bdpt.recording import resample
 
 Record: TypeAlias = "tuple[mi.Vector4f, ...]"
 """What is read and written at once."""
@@ -39,9 +39,9 @@ class KeptVertex:
         """Everything in it, as it lies in memory."""
         si = self.si
         quads = (
-            (*si.p, _as_float(self.depth)),
-            (*si.n, _as_float(dr.reinterpret_array(mi.UInt32, si.shape))),
-            (*si.sh_frame.n, _as_float(si.prim_index)),
+            (*si.p, _bits_to_float(self.depth)),
+            (*si.n, _bits_to_float(dr.reinterpret_array(mi.UInt32, si.shape))),
+            (*si.sh_frame.n, _bits_to_float(si.prim_index)),
             (*si.sh_frame.s, self.counted_dvcm),
             (*si.wi, self.dvc),
             (*self.throughput_over_cos, si.uv.x),
@@ -66,14 +66,14 @@ class KeptVertices:
         and ``paths`` [1] is N.
         """
         n = dr.width(weight)
-        slots, factor = resampled(weight, offset, paths)
+        slots, factor = resample(weight, offset, paths)
         numbers = dr.empty(mi.Float, n * 4 * _QUADS)
         power = record[_POWER]
         scaled = mi.Vector4f(*(power[k] * factor for k in range(3)), power.w)
         _write(numbers, dr.arange(mi.UInt32, n), (*record[:_POWER], scaled, *record[_POWER + 1 :]))
         return cls(numbers, slots)
 
-    def drawn(self, slot: mi.UInt32, active: mi.Bool) -> KeptVertex:
+    def draw(self, slot: mi.UInt32, active: mi.Bool) -> KeptVertex:
         """The kept vertices of the paths in slots; their depth is 0 if no path of the image has one."""
         return self.read(dr.gather(mi.UInt32, self.slots, slot, active), active)
 
@@ -88,9 +88,9 @@ class KeptVertices:
         si.sh_frame = mi.Frame3f(s, dr.cross(normal, s), normal)
         si.dp_du, si.dp_dv = dp_du.xyz, dp_dv.xyz
         si.uv = mi.Point2f(throughput.w, dp_du.w)
-        si.prim_index = _as_uint(frame_n.w)
-        si.shape = dr.reinterpret_array(mi.ShapePtr, _as_uint(n.w))
-        return KeptVertex(si, mi.Spectrum(throughput.xyz), frame_s.w, wi.w, dp_dv.w, _as_uint(p.w))
+        si.prim_index = _float_to_bits(frame_n.w)
+        si.shape = dr.reinterpret_array(mi.ShapePtr, _float_to_bits(n.w))
+        return KeptVertex(si, mi.Spectrum(throughput.xyz), frame_s.w, wi.w, dp_dv.w, _float_to_bits(p.w))
 
 
 def empty_record() -> Record:
@@ -109,11 +109,11 @@ def _read(memory: mi.Float, place: mi.UInt32, quads: int, active: mi.Bool) -> Re
     return tuple(dr.gather(mi.Vector4f, memory, place * quads + k, active) for k in range(quads))
 
 
-def _as_float(bits: mi.UInt32) -> mi.Float:
+def _bits_to_float(bits: mi.UInt32) -> mi.Float:
     """The Float of these bits."""
     return dr.reinterpret_array(mi.Float, bits)
 
 
-def _as_uint(number: mi.Float) -> mi.UInt32:
+def _float_to_bits(number: mi.Float) -> mi.UInt32:
     """The bits of a Float."""
     return dr.reinterpret_array(mi.UInt32, number)

@@ -50,9 +50,13 @@ def launches(
             last_sample = min(first_sample + samples, spp)
             first_light, last_light = (_light_paths(pixels * s, light_ratio) for s in (first_sample, last_sample))
             yield Launch(
-                min(together, images - first_image), first_image, last_sample - first_sample, first_sample,
-                last_light - first_light, first_light,
-            )  # fmt: skip
+                min(together, images - first_image),
+                first_image,
+                last_sample - first_sample,
+                first_sample,
+                last_light - first_light,
+                first_light,
+            )
 
 
 def _paths(pixels: int, light_ratio: float) -> int:
@@ -106,14 +110,19 @@ class Lanes:
         pixels = size[0] * size[1]
         ratio = pixels * launch.samples / launch.light_paths if launch.light_paths else 0
         return cls(
-            launch.images, *size, launch.samples, launch.light_paths, keys, shifts,
+            launch.images,
+            *size,
+            launch.samples,
+            launch.light_paths,
+            keys,
+            shifts,
             counts=[dr.opaque(mi.UInt32, n) for n in (pixels, launch.samples, launch.light_paths)],
             first_sample=dr.opaque(mi.UInt32, launch.first_sample),
             first_light_path=dr.opaque(mi.UInt32, launch.first_light_path),
             eye_scale=dr.opaque(mi.Float, 1 / spp),
             splat_scale=dr.opaque(mi.Float, ratio / spp),
             poses=poses,
-        )  # fmt: skip
+        )
 
     @property
     def kind(self) -> tuple[int | bool, ...]:
@@ -131,9 +140,9 @@ class Lanes:
         pixels, samples, _ = self.counts
         layer = lane // pixels
         image = layer // samples if self.images > 1 else dr.zeros(mi.UInt32, dr.width(lane))
-        return image, layer - image * samples, self._in_squares(lane - layer * pixels)
+        return image, layer - image * samples, self._order_in_squares(lane - layer * pixels)
 
-    def _in_squares(self, place: mi.UInt32) -> mi.UInt32:
+    def _order_in_squares(self, place: mi.UInt32) -> mi.UInt32:
         """The pixel at a place of the order."""
         if self.width % SQUARE or self.height % SQUARE:
             return place

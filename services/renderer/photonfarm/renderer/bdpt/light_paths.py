@@ -28,7 +28,7 @@ from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, Record, empty_record
 from photonfarm.renderer.bdpt.lights.emission import AREA, Emission, Lights, sample_emission
 from photonfarm.renderer.bdpt.randomness import Sampler
-from photonfarm.renderer.bdpt.recording import traced_once
+from photonfarm.renderer.bdpt.recording import loop_once
 
 _MAX_THROUGHPUT_KEPT = 0.95
 
@@ -51,9 +51,14 @@ class PathOptions:
     def kind(self) -> tuple[int, ...]:
         """The numbers for which the kernels are compiled."""
         return (
-            self.max_depth, self.rr_depth, self.connections, self.connects, self.traces_light, self.light_samples,
+            self.max_depth,
+            self.rr_depth,
+            self.connections,
+            self.connects,
+            self.traces_light,
+            self.light_samples,
             self.useful is not None,
-        )  # fmt: skip
+        )
 
     def usefulness(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """How useful light vertices are for connections, 1 on average; 1 for all where it is not known."""
@@ -97,7 +102,7 @@ def trace_light_paths(
     start = sample_emission(lights, rng, path, paths)
     if isinstance(splat, TalliedSplat):
         splat.begin(start.cell)
-    (state,) = traced_once(
+    (state,) = loop_once(
         state=(first_state(scene, lights, start, rng, empty_record() if options.connects else ()),),
         cond=lambda s: s.active,
         body=partial(vertex_bounce, scene=scene, sensor=sensor, options=options, start=start, splat=splat),
@@ -123,9 +128,18 @@ def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler, 
     active &= hit.is_valid()
     dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
     return LightState(
-        active, rng, start.ray, hit, mi.Spectrum(start.throughput), dvcm, dvc, mi.Float(1), mi.UInt32(1), mi.Float(0),
+        active,
+        rng,
+        start.ray,
+        hit,
+        mi.Spectrum(start.throughput),
+        dvcm,
+        dvc,
+        mi.Float(1),
+        mi.UInt32(1),
+        mi.Float(0),
         kept,
-    )  # fmt: skip
+    )
 
 
 def vertex_bounce(
@@ -157,13 +171,13 @@ def vertex_bounce(
     if options.traces_light:
         aperture = s.rng.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
         seen = sample_sensor(sensor, si, aperture, active & smooth & ~first)
-        value, p_reverse = bsdf.eval_pdf(ctx, *exchanged(si, si.to_local(seen.d)), seen.valid)
+        value, p_reverse = bsdf.eval_pdf(ctx, *exchange_directions(si, si.to_local(seen.d)), seen.valid)
         cos_out = dr.abs(dr.dot(si.n, seen.d))
         w = weights.light_tracing(
             seen.area_density_over_cos * cos_out, options.light_ratio, s.count, p_reverse, dvcm, dvc
         )
         joined = seen.valid & (dr.max(value) > 0)
-        joined &= ~scene.ray_test(_from_lens(seen.start, si), joined)
+        joined &= ~scene.ray_test(_ray_from_lens(seen.start, si), joined)
         splat.add(seen.position, s.throughput * value * seen.weight * (w * cos_out / cos_in), joined)
 
     # ----------------------------- Keep for connections -----------------------------
@@ -190,7 +204,7 @@ def vertex_bounce(
     return (state,)
 
 
-def _from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
+def _ray_from_lens(start: mi.Point3f, si: mi.SurfaceInteraction3f) -> mi.Ray3f:
     """The ray from ``start`` on the near plane to a point just before a surface.
 
     ``spawn_ray_to`` makes a ray in the other direction that ends before ``start``. Objects right behind the near plane
@@ -210,7 +224,7 @@ def scatter(s: LightState, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, cos_in
     delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     d = si.to_world(bs.wo)
     cos_out = dr.abs(dr.dot(si.n, d))
-    value, p_reverse = bsdf.eval_pdf(mi.BSDFContext(), *exchanged(si, bs.wo), s.active & ~delta)
+    value, p_reverse = bsdf.eval_pdf(mi.BSDFContext(), *exchange_directions(si, bs.wo), s.active & ~delta)
 
     shading = dr.abs(mi.Frame3f.cos_theta(si.wi)) / dr.abs(mi.Frame3f.cos_theta(bs.wo))
     factor = dr.select(delta, delta_weight * shading, value / bs.pdf) * (cos_out / cos_in)
@@ -236,7 +250,7 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     s.throughput *= dr.rcp(kept)
 
 
-def exchanged(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
+def exchange_directions(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:
     """The arguments that evaluate a BSDF with exchanged directions: ``si`` with ``wo`` for ``si.wi``, and ``si.wi``.
 
     With them ``bsdf.eval`` is BSDF·|cos_s(wi)| for radiance that arrives along ``si.wi`` and leaves along ``wo``, and

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.light_paths import LightState, PathOptions, first_state, scatter
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights, sample_emission
-from photonfarm.renderer.bdpt.recording import Recorder, traced_once
+from photonfarm.renderer.bdpt.recording import Recorder, loop_once
 from photonfarm.renderer.bdpt.scenes import check_scene
 
 Floats = npt.NDArray[np.float32]
@@ -79,7 +79,7 @@ def trace(
     )
     bounce = dr.full(mi.Int32, -1, slots)
     options = PathOptions(depth + 1, depth + 1, 0, zero, zero, False, False)
-    traced_once(
+    loop_once(
         state=(first_state(scene, lights, start, rng),),
         cond=lambda s: s.active,
         body=partial(_hit, scene=scene, options=options, out=out, bounce=bounce, paths=count),

@@ -68,29 +68,29 @@ class PosedSensor:
         """A ray through a position of the film, and its weight, as ``mi.Sensor.sample_ray`` returns them."""
         ray, weight = self.sensor.sample_ray(time, wavelengths, position, aperture, active)
         to_near = self.sensor.near_clip() * dr.rcp(ray.d.z)
-        *axes, origin = self._of_lanes(self.poses.to_world)
-        d = _turned(axes, ray.d)
-        lens = _turned(axes, ray.o - ray.d * to_near)  # 0 of a pinhole
+        *axes, origin = self._gather_columns(self.poses.to_world)
+        d = _turn_to_world(axes, ray.d)
+        lens = _turn_to_world(axes, ray.o - ray.d * to_near)  # 0 of a pinhole
         return mi.Ray3f(origin + lens + d * to_near, d, ray.maxt, ray.time, ray.wavelengths), weight
 
     def sample_direction(
         self, it: mi.Interaction3f, aperture: mi.Point2f, active: mi.Bool | bool = True
     ) -> tuple[mi.DirectionSample3f, mi.Spectrum]:
         """The lens seen from a point, as ``mi.Sensor.sample_direction`` returns it."""
-        *axes, moved = self._of_lanes(self.poses.to_camera)
+        *axes, moved = self._gather_columns(self.poses.to_camera)
         seen_from = dr.zeros(mi.Interaction3f)
         seen_from.p = dr.fma(axes[2], it.p.z, dr.fma(axes[1], it.p.y, dr.fma(axes[0], it.p.x, moved)))
         ds, weight = self.sensor.sample_direction(seen_from, aperture, active)
-        *axes, origin = self._of_lanes(self.poses.to_world)
-        ds.p, ds.n = origin + _turned(axes, ds.p), mi.Normal3f(_turned(axes, ds.n))
+        *axes, origin = self._gather_columns(self.poses.to_world)
+        ds.p, ds.n = origin + _turn_to_world(axes, ds.p), mi.Normal3f(_turn_to_world(axes, ds.n))
         ds.d = (ds.p - it.p) * dr.rcp(ds.dist)
         return ds, weight
 
-    def _of_lanes(self, columns: list[mi.Vector3f]) -> list[mi.Vector3f]:
+    def _gather_columns(self, columns: list[mi.Vector3f]) -> list[mi.Vector3f]:
         """The columns of each lane's matrix."""
         return [dr.gather(mi.Vector3f, column, self.image) for column in columns]
 
 
-def _turned(axes: list[mi.Vector3f], v: mi.Vector3f | mi.Point3f) -> mi.Vector3f:
+def _turn_to_world(axes: list[mi.Vector3f], v: mi.Vector3f | mi.Point3f) -> mi.Vector3f:
     """A vector in the camera's frame, in the world."""
     return dr.fma(axes[2], v.z, dr.fma(axes[1], v.y, axes[0] * v.x))

@@ -50,7 +50,7 @@ class Recorder:
         if kind not in self._recorded:
             while len(self._recorded) >= RECORDINGS:
                 self._recorded.pop(next(iter(self._recorded)))
-            self._recorded[kind] = _Recording(_frozen(self._function), scene, sensor)
+            self._recorded[kind] = _Recording(_freeze(self._function), scene, sensor)
         recording = self._recorded[kind]
         if recording.failures < ATTEMPTS:
             try:
@@ -58,7 +58,7 @@ class Recorder:
             except RuntimeError as error:
                 log.debug("not recorded: %s", error)
                 recording.failures += 1
-                recording.call = _frozen(self._function)
+                recording.call = _freeze(self._function)
         return self._function(scene, sensor, *arguments)
 
 
@@ -72,13 +72,13 @@ class _Recording:
     failures: int = 0
 
 
-def _frozen(function: Callable[..., Any]) -> Callable[..., Any]:
+def _freeze(function: Callable[..., Any]) -> Callable[..., Any]:
     """The recorded function, in at most two variants: Dr.Jit records again if it took data for a constant."""
     frozen: Callable[..., Any] = dr.freeze(function, warn_after=1 << 30, limit=2)
     return frozen
 
 
-def traced_once(
+def loop_once(
     *,
     state: tuple[*State],
     cond: Callable[[*State], mi.Bool],
@@ -101,7 +101,7 @@ STEPS = 1 << 24
 same paths are drawn on any number of threads."""
 
 
-def resampled(weight: mi.Float, offset: mi.Float, paths: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
+def resample(weight: mi.Float, offset: mi.Float, paths: mi.UInt32) -> tuple[mi.UInt32, mi.Float]:
     """(the path that each slot gets, a factor for each path), [K·N] both.
 
     ``weight`` [K·N] ≥ 0 are those of ``paths`` [1] = N paths for each of K images, ``offset`` [K] are random numbers in

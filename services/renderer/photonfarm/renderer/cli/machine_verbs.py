@@ -27,22 +27,22 @@ def doctor(store: str | Path, redis_url: str, as_json: bool) -> None:
     from photonfarm.cli import show
     from photonfarm.renderer.tools.doctor import examine
 
-    console, found = Console(soft_wrap=True), []
+    console, checks = Console(soft_wrap=True), []
     for check in examine(store, redis_url, partial(click.echo, err=True)):
-        found.append(check)
+        checks.append(check)
         if not as_json:
             mark = "[green]ok[/]  " if check.works else ("[red]FAIL[/]" if check.exit_code else "[yellow]none[/]")
             console.print(f"{mark} [bold]{check.name}[/]: {markup.escape(check.detail)}", highlight=False)
     if as_json:
-        show.print_json([{"name": check.name, "works": check.works, "detail": check.detail} for check in found])
-    sys.exit(next((check.exit_code for check in found if not check.works and check.exit_code), 0))
+        show.print_json([{"name": check.name, "works": check.works, "detail": check.detail} for check in checks])
+    sys.exit(next((check.exit_code for check in checks if not check.works and check.exit_code), 0))
 
 
 def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noqa: ARG001
-    found = re.fullmatch(r"(\d+(?:\.\d+)?) *([kMGT]?)B?", size.strip())
-    if found is None:
+    match = re.fullmatch(r"(\d+(?:\.\d+)?) *([kMGT]?)B?", size.strip())
+    if match is None:
         raise click.BadParameter(f"{size!r} is not a size; write it like 500MB or 2GB")
-    return int(float(found[1]) * 1000 ** " kMGT".index(found[2] or " "))
+    return int(float(match[1]) * 1000 ** " kMGT".index(match[2] or " "))
 
 
 def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:  # noqa: ARG001
@@ -59,12 +59,17 @@ def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:
 @click.argument("specs", metavar="[SPEC]...", nargs=-1)
 @store_option
 @redis_option
-@click.option("--share", callback=_share, metavar="K/N",
-              help="Work without Redis: take the jobs whose number leaves K when it is divided by N, then what is "
-              "left of the others'. K is from 0 to N - 1. SPEC: render these scenes alone.")  # fmt: skip
+@click.option(
+    "--share",
+    callback=_share,
+    metavar="K/N",
+    help="Work without Redis: take the jobs whose number leaves K when it is divided by N, then what is "
+    "left of the others'. K is from 0 to N - 1. SPEC: render these scenes alone.",
+)
 @click.option("--name", help="Name of this worker, distinct among all.  [default: host and process]")
-@click.option("--scene", "scene_id", metavar="ID",
-              help="Work for this scene alone: its id, how it begins, or its name.")  # fmt: skip
+@click.option(
+    "--scene", "scene_id", metavar="ID", help="Work for this scene alone: its id, how it begins, or its name."
+)
 @click.option("--job", type=click.IntRange(0), help="Render this one job of --scene here, without Redis, and end.")
 @click.option("--until-complete", is_flag=True, help="Stop when nothing is missing.")
 @click.option(
@@ -77,16 +82,23 @@ def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:
     help="Take no job while less of the store's disk is free.",
 )
 @click.option(
-    "--ahead", type=click.FloatRange(1), metavar="RATIO",
+    "--ahead",
+    type=click.FloatRange(1),
+    metavar="RATIO",
     help="Take no job of a scene while more of its samples are committed than RATIO × those that its trainer has used. "
     "About the first 256 of a scene may always be (jobs are taken and finished whole, by each worker); without a "
     "trainer it stops there. Values below 1 would stop rendering for ever.",
-)  # fmt: skip
+)
 @click.option(
-    "--deadline", "deadline_s", type=click.FloatRange(0, min_open=True), default=1800.0, show_default=True,
-    metavar="SECONDS", help="End a job that takes longer; it is started up to five times. A worker that was "
+    "--deadline",
+    "deadline_s",
+    type=click.FloatRange(0, min_open=True),
+    default=1800.0,
+    show_default=True,
+    metavar="SECONDS",
+    help="End a job that takes longer; it is started up to five times. A worker that was "
     "stopped (SIGSTOP) for so long ends its job when it goes on; others have taken it over by then.",
-)  # fmt: skip
+)
 @device_option
 @click.option("--quiet", is_flag=True, help="Say only what is wrong.")
 @click.option("--check", is_flag=True, help="Only say whether a worker of this host is alive (exit 0) or not (7).")

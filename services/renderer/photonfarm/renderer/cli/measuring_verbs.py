@@ -15,10 +15,18 @@ from photonfarm.core.waiting import WorkLog
 
 @click.command()
 @click.argument("spec")
-@click.option("--frames", type=click.IntRange(1, 1000), default=6, show_default=True,
-              help="Random configurations to measure, a view of each, after some that do not count.")  # fmt: skip
-@click.option("--seconds", type=click.FloatRange(0, min_open=True),
-              help="Processor time for all of it; less of it, fewer views.  [default: no limit]")  # fmt: skip
+@click.option(
+    "--frames",
+    type=click.IntRange(1, 1000),
+    default=6,
+    show_default=True,
+    help="Random configurations to measure, a view of each, after some that do not count.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    help="Processor time for all of it; less of it, fewer views.  [default: no limit]",
+)
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @device_option
 @json_option
@@ -34,7 +42,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.measure.sample_costs import find_or_measure
+    from photonfarm.renderer.tools.measure.sample_costs import find_or_measure
 
     log = partial(click.echo, err=True)
     limit = math.inf if seconds is None else seconds
@@ -44,10 +52,20 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
 
 @click.command()
 @click.argument("spec")
-@click.option("--target", type=click.FloatRange(0, 1, min_open=True, max_open=True), default=0.45, show_default=True,
-              help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.")  # fmt: skip
-@click.option("--frames", type=click.IntRange(2, 1000), default=24, show_default=True,
-              help="Random configurations to render, a view of each.")  # fmt: skip
+@click.option(
+    "--target",
+    type=click.FloatRange(0, 1, min_open=True, max_open=True),
+    default=0.45,
+    show_default=True,
+    help="Display mean: that of clip(exposure · I, 0, 1)^(1/2.2) over all pixels.",
+)
+@click.option(
+    "--frames",
+    type=click.IntRange(2, 1000),
+    default=24,
+    show_default=True,
+    help="Random configurations to render, a view of each.",
+)
 @device_option
 @json_option
 @end_on_ctrl_c()
@@ -61,12 +79,12 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 
     loaded = load_spec(spec)
     backend.load(threads=1)
-    from photonfarm.renderer.measure.exposure import propose
+    from photonfarm.renderer.tools.measure.exposure import propose
 
     with WorkLog(partial(click.echo, err=True)) as work:
         work.begin(f"loading {loaded.name}")
-        found = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
-    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
+        proposal = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
+    click.echo(json.dumps(proposal.document(), indent=1) if as_json else proposal.line())
 
 
 @click.command()
@@ -86,15 +104,15 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 
     loaded = load_spec(spec, measured_again=True)
     backend.load(threads=1)
-    from photonfarm.renderer.measure.free_space import measure
     from photonfarm.renderer.tools import spec_file
+    from photonfarm.renderer.tools.measure.free_space import measure
 
     file = spec_file.writable(spec) if write else find_spec(spec)
     with WorkLog(partial(click.echo, err=True)) as work:
-        found = measure(loaded, file.parent, work.begin)
-    click.echo(json.dumps(found.entry()) if as_json else found.line())
+        measured = measure(loaded, file.parent, work.begin)
+    click.echo(json.dumps(measured.entry()) if as_json else measured.line())
     if write:
-        spec_file.write(file, {"view": {"free_space": found.entry()}})
+        spec_file.write(file, {"view": {"free_space": measured.entry()}})
         click.echo(f"{file}: [view.free_space] written", err=True)
 
 
@@ -130,7 +148,7 @@ def scene_plan(spec: str, seconds: int, purpose: str, write: bool, again: bool, 
     backend.load(threads=1)
     from photonfarm.renderer.strategy.noise import Purpose
     from photonfarm.renderer.strategy.plan import make_plan
-    from photonfarm.renderer.strategy.printed import lines
+    from photonfarm.renderer.strategy.plan_text import lines
     from photonfarm.renderer.tools import spec_file
 
     file = spec_file.writable(spec) if write else find_spec(spec)

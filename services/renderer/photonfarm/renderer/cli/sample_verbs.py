@@ -54,7 +54,7 @@ def preview(scene: str, store: str | Path, count: int, out: Path) -> None:
 @end_on_ctrl_c()
 def buffers(
     store: str | Path, scene: str, modification: str | None, path: Path | None, orbit: int | None, out: Path
-) -> None:  # fmt: skip
+) -> None:
     """Write the buffers of views along a camera path, and the photons: what `photonfarm infer --buffers` shows.
 
     Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
@@ -73,14 +73,37 @@ def buffers(
 @click.command("measure-frames")
 @store_option
 @click.option("--scene", required=True, metavar="ID", help="A scene of the store: its id, how it begins, or its name.")
-@click.option("--row", "rows", type=click.IntRange(0), multiple=True, required=True,
-              help="A complete sample, whose configuration and view are measured; may be repeated.")  # fmt: skip
-@click.option("--kept", type=click.IntRange(1), multiple=True, default=(1,), show_default=True, metavar="K",
-              help="Time a half-estimate of one of K pixels; may be repeated.")  # fmt: skip
-@click.option("--timed", type=click.IntRange(1), default=9, show_default=True, metavar="FRAMES",
-              help="Frames to time, after some that do not count.")  # fmt: skip
-@click.option("--points", type=click.IntRange(1), metavar="P",
-              help="Time the first P points of the base cloud, those that a network uses.  [default: all]")  # fmt: skip
+@click.option(
+    "--row",
+    "rows",
+    type=click.IntRange(0),
+    multiple=True,
+    required=True,
+    help="A complete sample, whose configuration and view are measured; may be repeated.",
+)
+@click.option(
+    "--kept",
+    type=click.IntRange(1),
+    multiple=True,
+    default=(1,),
+    show_default=True,
+    metavar="K",
+    help="Time a half-estimate of one of K pixels; may be repeated.",
+)
+@click.option(
+    "--timed",
+    type=click.IntRange(1),
+    default=9,
+    show_default=True,
+    metavar="FRAMES",
+    help="Frames to time, after some that do not count.",
+)
+@click.option(
+    "--points",
+    type=click.IntRange(1),
+    metavar="P",
+    help="Time the first P points of the base cloud, those that a network uses.  [default: all]",
+)
 @click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="frames.npz", show_default=True)
 @device_option
 @end_on_ctrl_c()
@@ -101,7 +124,7 @@ def measure_frames(
     from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
-    from photonfarm.renderer.measure.frame_costs import write_frame_costs
+    from photonfarm.renderer.tools.measure.frame_costs import write_frame_costs
 
     with tell_waiting(partial(click.echo, err=True), f"timing {timed} frames"):
         costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
@@ -114,10 +137,19 @@ def measure_frames(
 @click.argument("scene", metavar="SPEC_OR_SCENE")
 @store_option
 @click.option("--row", type=click.IntRange(0), required=True, help="A sample, by its row in the store.")
-@click.option("--pass", "pass_number", type=click.IntRange(0), metavar="P",
-              help="Another pass of its view, stored or not.  [default: that of the row]")  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-              help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.")  # fmt: skip
+@click.option(
+    "--pass",
+    "pass_number",
+    type=click.IntRange(0),
+    metavar="P",
+    help="Another pass of its view, stored or not.  [default: that of the row]",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.",
+)
 @device_option
 @json_option
 @end_on_ctrl_c()
@@ -134,9 +166,9 @@ def render(scene: str, store: str | Path, row: int, pass_number: int | None, out
 
     if out is not None:
         check_suffix(out)
-    found = repeat(store, scene, row, pass_number, partial(click.echo, err=True))
+    repeated = repeat(store, scene, row, pass_number, partial(click.echo, err=True))
     if out is not None:
-        found.write(out)
+        repeated.write(out)
         click.echo(f"written to {out}", err=True)
-    click.echo(json.dumps(found.document(), indent=1) if as_json else found.line())
-    sys.exit(found.exit_code)
+    click.echo(json.dumps(repeated.document(), indent=1) if as_json else repeated.line())
+    sys.exit(repeated.exit_code)

@@ -16,14 +16,22 @@ from photonfarm.core.waiting import tell_waiting
 
 @click.command()
 @click.argument("path", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), metavar="SPEC",
-              help="The spec to write; the scene goes into a folder beside it.  "
-                   "[default: in this folder, named as PATH]")  # fmt: skip
-@click.option("--up", type=click.Choice(["x", "y", "z"]),
-              help="The axis that points up.  [default: as the file says, or else y]")  # fmt: skip
-@click.option("--accept", multiple=True, metavar="NAME",
-              help="A change of the picture that may be made: by its name, as the refusal gives it; geometry, light or "
-                   "colour for all of a kind. May be given several times.")  # fmt: skip
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="SPEC",
+    help="The spec to write; the scene goes into a folder beside it.  [default: in this folder, named as PATH]",
+)
+@click.option(
+    "--up", type=click.Choice(["x", "y", "z"]), help="The axis that points up.  [default: as the file says, or else y]"
+)
+@click.option(
+    "--accept",
+    multiple=True,
+    metavar="NAME",
+    help="A change of the picture that may be made: by its name, as the refusal gives it; geometry, light or "
+    "colour for all of a kind. May be given several times.",
+)
 @json_option
 def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str, ...], as_json: bool) -> None:
     """Make a spec of a scene of another program, and a copy of the scene that photonfarm can render.
@@ -38,7 +46,7 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
     from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
-    from photonfarm.renderer.importing.importer import AXES, import_scene
+    from photonfarm.renderer.tools.importing.importer import AXES, import_scene
 
     made = import_scene(path, out, None if up is None else AXES[up], partial(click.echo, err=True), accept)
     if as_json:
@@ -53,8 +61,9 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
 
 @click.command()
 @click.argument("spec")
-@click.option("--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True,
-              help="The page.")  # fmt: skip
+@click.option(
+    "--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True, help="The page."
+)
 @device_option
 @json_option
 @end_on_ctrl_c()
@@ -72,10 +81,10 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 
     named = NamedSpec.load(spec)
     backend.load()
-    from photonfarm.renderer.check import page, scene_check
+    from photonfarm.renderer.tools.check import scene_check as checking
 
-    check, lines = scene_check.check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
-    page.write(check, lines, out)
+    check, lines = checking.check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
+    checking.write(check, lines, out)
     if as_json:
         show.print_json([finding.document(lines) for finding in check.findings])
         return
@@ -91,14 +100,14 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 def scene_shapes(spec: str, as_json: bool) -> None:
     """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
     from photonfarm.cli import show
-    from photonfarm.renderer.check import shapes
+    from photonfarm.renderer.tools.check import shapes
 
     with tell_waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):
-        found = shapes.listed(spec)
+        facts = shapes.list_shapes(spec)
     if as_json:
-        show.print_json([shape.document() for shape in found])
+        show.print_json([shape.document() for shape in facts])
         return
-    show.print_table((shape.row() for shape in found), shapes.HEAD)
-    unnamed = sum(not shape.id for shape in found)
+    show.print_table((shape.row() for shape in facts), shapes.HEAD)
+    unnamed = sum(not shape.id for shape in facts)
     if unnamed:
-        click.echo(f"{unnamed} of {len(found)} shapes have no id, without which no group can name them", err=True)
+        click.echo(f"{unnamed} of {len(facts)} shapes have no id, without which no group can name them", err=True)

@@ -68,12 +68,12 @@ def _finite(scene: Estimator, sample: tuple[Key, View], seeds: tuple[int, int], 
     thrown = 0
     for half, purpose in enumerate(PURPOSES):
         if not np.isfinite(halves[half]).all():
-            halves[half], more = _drawn_again(scene, sample[0], purpose, sample[1], seeds)
+            halves[half], more = _draw_again(scene, sample[0], purpose, sample[1], seeds)
             thrown += more
     return halves, thrown
 
 
-def _drawn_again(scene: Estimator, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
+def _draw_again(scene: Estimator, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
     """Another estimate in place of a non-finite one, with seeds that are not `taken`, and how many were discarded."""
     _log_discarded(key, purpose)
     for attempt, seed in enumerate(islice(_seeds(key, purpose, taken), ATTEMPTS - 1), start=1):

@@ -17,7 +17,7 @@ from photonfarm.renderer.jobs.render import (
     SceneRenderer,
     lit_points,
     load_scene,
-    located,
+    locate,
     visibility_of,
 )
 from photonfarm.scene.camera_path import CameraPath, Frames, check_clear, orbit
@@ -37,7 +37,7 @@ def write_buffers(store: str | Path, scene: str, modification: str | None, path:
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
     configuration = find_configuration(opened, stored, modification)
-    spec = located(stored.spec)
+    spec = locate(stored.spec)
     if isinstance(path, int):
         views = orbit(spec, path, configuration)
     else:
@@ -82,5 +82,5 @@ def _guides(
 ) -> Guides:
     """The guides of all views, stacked."""
     key, lit = modification.key(spec.radiance_id), lit_points(cloud, modification)
-    found = [arrays_of(scene.guides(view, view_key(key, view.vector), spec.guides, lit)) for view in views]
-    return Guides(**{name: np.stack([each[name] for each in found]).astype(np.float32) for name in found[0]})
+    guides = [arrays_of(scene.guides(view, view_key(key, view.vector), spec.guides, lit)) for view in views]
+    return Guides(**{name: np.stack([each[name] for each in guides]).astype(np.float32) for name in guides[0]})

@@ -82,7 +82,7 @@ OnProgress = Callable[[str, int, int], object]
 """A callback with the phase of a job in words, how many of its parts are done, and how many there are; 0: no parts."""
 
 
-def _ignored(phase: str, done: int, total: int) -> None:
+def _ignore_progress(phase: str, done: int, total: int) -> None:
     """No progress is asked for."""
 
 
@@ -118,7 +118,7 @@ class ShardRenderer:
     """Renders jobs of a store, keeping the most recently used scenes loaded."""
 
     def __init__(
-        self, store: Store, *, worker: str, load: SceneLoader = load_scene, on_progress: OnProgress = _ignored
+        self, store: Store, *, worker: str, load: SceneLoader = load_scene, on_progress: OnProgress = _ignore_progress
     ) -> None:
         """Take a store; `worker` is the name written into markers."""
         self._store = store
@@ -201,7 +201,7 @@ class ShardRenderer:
             self._scenes[scene_id] = known
         else:
             known = None  # freed before the next one is loaded
-            spec = located(stored.spec)  # before another scene is unloaded for it
+            spec = locate(stored.spec)  # before another scene is unloaded for it
             while len(self._scenes) >= SCENES_KEPT:
                 self._scenes.pop(next(iter(self._scenes)))
             self._on_progress(LOADS, 0, 0)
@@ -210,7 +210,7 @@ class ShardRenderer:
         return self._scenes[scene_id]
 
 
-def located(spec: SceneSpec) -> SceneSpec:
+def locate(spec: SceneSpec) -> SceneSpec:
     """The spec, once its scene file has been found on this machine and is the planned one.
 
     Raises SceneNotHereError otherwise: other machines may still render the job.
@@ -230,13 +230,13 @@ def located(spec: SceneSpec) -> SceneSpec:
 @cache
 def versions() -> Mapping[str, str]:
     """The versions of the packages that affect renders."""
-    found = {}
+    installed = {}
     for package in _PACKAGES:
         try:
-            found[package] = version(package)
+            installed[package] = version(package)
         except PackageNotFoundError:  # run from a checkout
             continue
-    return found
+    return installed
 
 
 # -------------------------------------------------------------------------------------------------------- rendering
@@ -317,8 +317,8 @@ class _Rendering:
             samples = [sample for sample in samples if not self._takes_over(sample, self._others)]
         if not samples:
             return
-        found = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in samples])
-        for sample, (halves, thrown) in zip(samples, found, strict=True):
+        estimates = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in samples])
+        for sample, (halves, thrown) in zip(samples, estimates, strict=True):
             self.redrawn += thrown
             self._out.radiance(sample.row, halves)
 

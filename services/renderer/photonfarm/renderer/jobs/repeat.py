@@ -21,7 +21,7 @@ from photonfarm.core.statistics import block_z_test
 from photonfarm.core.waiting import Log, tell_waiting
 from photonfarm.plan.request import sample_key
 from photonfarm.renderer.jobs.estimates import halves_of
-from photonfarm.renderer.jobs.render import SceneLoader, load_scene, located, versions
+from photonfarm.renderer.jobs.render import SceneLoader, load_scene, locate, versions
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
@@ -73,9 +73,9 @@ class Comparison:
         size = f"by at most {self.largest:.2g}, by {self.relative:.2g} of the image (RMS)"
         test = f"block z-test {self.z:.2g} of {self.z_limit:.2g}: {verdict}"
         versions_differ = f"; other versions: {', '.join(others)}" if others else ""
-        return f"{self.different} of {self.values} values differ, {size}; {test}{versions_differ}{self._on_cards()}"
+        return f"{self.different} of {self.values} values differ, {size}; {test}{versions_differ}{self._name_cards()}"
 
-    def _on_cards(self) -> str:
+    def _name_cards(self) -> str:
         """Why bytes need not be equal, where a card rendered."""
         there, here = self.devices
         return "" if self.repeats_bytes else f"; rendered on {there}, here on {here}: equal in distribution alone"
@@ -147,17 +147,17 @@ def repeat(
     stored = scene_or_spec(opened, scene)
     reader = SceneReader(store, stored.scene_id)
     reader.refresh()
-    modification, view, planned_pass = _planned(stored, row)
+    modification, view, planned_pass = _read_plan(stored, row)
     number = planned_pass if pass_number is None else pass_number
     key = sample_key(stored.spec.radiance_id, modification, view.vector, number)
     at = _row_of(stored, key)
-    spec = located(_beside(scene, _as_rendered(opened, stored, key)))
+    spec = locate(_use_scene_file_beside(scene, _spec_as_rendered(opened, stored, key)))
     with tell_waiting(log, f"loading scene {spec.name}"):
         loaded = load(spec)
         loaded.apply(modification)
     with tell_waiting(log, f"rendering pass {number} of the view in row {row}"):
         ((halves, _),) = halves_of(loaded, [(key, view)])
-    there = None if at is None or at not in reader.rows else _compared(stored, reader.read(at).radiance, at, halves)
+    there = None if at is None or at not in reader.rows else _compare(stored, reader.read(at).radiance, at, halves)
     return Repeated(stored.scene_id, at, number, key.hex(), spec.exposure, halves, there)
 
 
@@ -165,7 +165,7 @@ def _row_of(stored: SceneStore, key: Key) -> int | None:
     return next(iter(SceneMatch(stored, Query(sample=key)).rows.tolist()), None)
 
 
-def _as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
+def _spec_as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
     """The scene's spec with the strategy that a sample was rendered by, if it is there."""
     strategy: dict[str, Any] = {}
     holder, visited = stored, set[str]()
@@ -182,7 +182,7 @@ def _as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
     return stored.spec.model_copy(update={"transport": stored.spec.transport.model_copy(update=strategy)})
 
 
-def _beside(named: str, spec: SceneSpec) -> SceneSpec:
+def _use_scene_file_beside(named: str, spec: SceneSpec) -> SceneSpec:
     """The spec with the scene file that lies beside the spec's file, if a user has named that."""
     folder = scene_folder(named, spec) if is_spec_file(named) else None
     if folder is None:
@@ -191,7 +191,7 @@ def _beside(named: str, spec: SceneSpec) -> SceneSpec:
     return spec.model_copy(update={"scene": source})
 
 
-def _planned(stored: SceneStore, row: int) -> tuple[Modification, View, int]:
+def _read_plan(stored: SceneStore, row: int) -> tuple[Modification, View, int]:
     """The configuration, the view and the pass in a row; raises StoreError if no plan has a sample there."""
     plans = stored.plans()
     if plans and row < plans[-1].end_row:
@@ -203,11 +203,11 @@ def _planned(stored: SceneStore, row: int) -> tuple[Modification, View, int]:
     raise StoreError(f"row {row} of scene {stored.scene_id} ({stored.spec.name}): no sample is planned there; {there}")
 
 
-def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparison:
+def _compare(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparison:
     """The comparison of both halves with those in a row; what is rendered is rounded as the store rounds."""
     here = round_as_stored(halves, stored.spec.radiance_exponent)
     difference = here.astype(np.float64) - there
-    test = block_z_test(_interleaved(here), _interleaved(there), blocks=4)
+    test = block_z_test(_interleave(here), _interleave(there), blocks=4)
     root = float(np.sqrt(np.mean(there.astype(np.float64) ** 2)))
     figures = stored.marker(row // stored.plans()[0].shard_rows)["figures"]
     others = {
@@ -225,7 +225,7 @@ def _compared(stored: SceneStore, there: F32, row: int, halves: F32) -> Comparis
     )
 
 
-def _interleaved(images: F32) -> F32:
+def _interleave(images: F32) -> F32:
     """Each image as 16 small ones, of every fourth pixel: estimates of nearly the same image, with noise of their own.
 
     What differs between them beside the noise only makes the test more lenient; two estimates would be too few for it.

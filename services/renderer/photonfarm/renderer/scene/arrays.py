@@ -21,20 +21,20 @@ def floats(values: NDArray[Any]) -> Any:
     Dr.Jit uses numpy's memory without a copy, compiles a kernel anew for each combination of inputs at unaligned
     addresses (numpy aligns to 16 bytes only), and `dr.freeze` does not notice when a mesh gets other such memory.
     """
-    return _owned(mi.Float(_aligned(values, np.float32)) * dr.opaque(mi.Float, 1))
+    return _evaluate(mi.Float(_align(values, np.float32)) * dr.opaque(mi.Float, 1))
 
 
 def integers(values: NDArray[Any]) -> Any:
     """All values, in order, as mi.UInt32 in Dr.Jit's own memory."""
-    return _owned(mi.UInt32(_aligned(values, np.uint32)) * dr.opaque(mi.UInt32, 1))
+    return _evaluate(mi.UInt32(_align(values, np.uint32)) * dr.opaque(mi.UInt32, 1))
 
 
-def _owned(product: Any) -> Any:
+def _evaluate(product: Any) -> Any:
     dr.eval(product)
     return product
 
 
-def _aligned(values: NDArray[Any], dtype: type) -> NDArray[Any]:
+def _align(values: NDArray[Any], dtype: type) -> NDArray[Any]:
     spare = ALIGNMENT_BYTES // 4
     memory: NDArray[Any] = np.empty(values.size + spare, dtype)
     start = -(memory.ctypes.data // 4) % spare

@@ -25,7 +25,7 @@ from typing import Any
 from photonfarm.core.errors import BackendError
 from photonfarm.farm import devices
 from photonfarm.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
-from photonfarm.renderer.scene.native import gathers
+from photonfarm.renderer.scene import native
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "PHOTONFARM_VARIANT"
@@ -80,11 +80,11 @@ def _device(name: str, variant: str) -> Device:
         raise BackendError(
             f"{VARIANT_VARIABLE} = {variant!r} is no variant for the device {name}; leave one of the two out"
         )
-    found = devices.cards_here() if name != CPU else devices.Cards()
-    card = found.card(name)
-    if card is None and found.cards:
-        log.warning("rendering on the CPU, as %s", found.trouble)
-    return Device(variant or (CARD_VARIANT if card else DEFAULT_VARIANT), card, found.driver if card else "")
+    cards = devices.cards_here() if name != CPU else devices.Cards()
+    card = cards.card(name)
+    if card is None and cards.cards:
+        log.warning("rendering on the CPU, as %s", cards.trouble)
+    return Device(variant or (CARD_VARIANT if card else DEFAULT_VARIANT), card, cards.driver if card else "")
 
 
 def paths_at_once() -> int | None:
@@ -117,7 +117,7 @@ def load(threads: int | None = None) -> Any:
     mitsuba, drjit = _import("mitsuba"), _import("drjit")
     _set_variant(mitsuba, chosen.variant)
     if chosen.variant.startswith("llvm"):
-        gathers.use_where_faster()
+        native.use_gathers_if_asked()
     if threads is not None:
         drjit.set_thread_count(threads)
     _import("photonfarm.renderer.bdpt")
@@ -131,10 +131,10 @@ def find_llvm(roots: Iterable[Path] = (Path(sys.prefix), Path("/usr"))) -> str:
     """
     named = os.environ.get(LLVM_VARIABLE)
     if named:
-        return _opened(named, f"{LLVM_VARIABLE} = {named!r} cannot be opened")
+        return _open_llvm(named, f"{LLVM_VARIABLE} = {named!r} cannot be opened")
     for version in LLVM_VERSIONS:
-        for found in _libraries(roots, version):
-            return _opened(str(found), f"{found} cannot be opened")
+        for library in _libraries(roots, version):
+            return _open_llvm(str(library), f"{library} cannot be opened")
     raise BackendError(f"no libLLVM of version {' or '.join(LLVM_VERSIONS)} is installed; {_INSTALL_LLVM}")
 
 
@@ -145,7 +145,7 @@ def _libraries(roots: Iterable[Path], version: str) -> Iterable[Path]:
                 yield from sorted(root.glob(f"{folder}/{pattern}"))
 
 
-def _opened(library: str, failure: str) -> str:
+def _open_llvm(library: str, failure: str) -> str:
     try:
         ctypes.CDLL(library)
     except OSError as error:

@@ -1,8 +1,14 @@
-"""The geometry of a scene at rest, and the base point cloud on it [supplement 2.1, 2.3]."""
+"""The triangles of a scene at rest, and the base point cloud on them [supplement 2.1, 2.3].
+
+Light transport uses the shapes themselves. Meshes, rectangles and cubes are used unchanged. Spheres, disks and
+cylinders become fine meshes whose vertices lie on the surface (128 sections around, 64 from pole to pole): the area is
+short by at most 0.1 %.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -10,12 +16,80 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Stream, make_key
 from photonfarm.core.records import STATIC, BasePointCloud, Geometry
 from photonfarm.renderer.scene.arrays import floats, integers, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance
-from photonfarm.renderer.scene.tessellation import SECTIONS, triangles_of
 from photonfarm.scene.modification import sample_surface
+
+SECTIONS = 128
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Triangles:
+    """One shape's triangles in world coordinates."""
+
+    vertices: NDArray[np.float32]  # (V, 3)
+    faces: NDArray[np.uint32]  # (F, 3)
+
+
+def triangles_of(shape: Any, sections: int = SECTIONS) -> Triangles:
+    """The triangles of one shape, with so many `sections` around a round one.
+
+    Raises SpecError for curves, instances, ellipsoids and other unsupported shapes.
+    """
+    if shape.is_mesh():
+        positions = np.array(shape.vertex_positions_buffer(), np.float32)
+        faces = np.array(shape.faces_buffer(), np.uint32)
+        return Triangles(positions.reshape(-1, 3), faces.reshape(-1, 3))
+    make = {"Sphere": _sphere, "Disk": _disk, "Cylinder": _cylinder}.get(shape.class_name())
+    if make is None:
+        raise SpecError(
+            f"shape {shape.id()!r} is a {shape.class_name()}; "
+            "only meshes, rectangles, cubes, spheres, disks and cylinders can be used"
+        )
+    points = make(sections)
+    to_world = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
+    vertices = points.reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
+    corners = _grid_faces(*points.shape[:2])
+    if np.linalg.det(to_world[:3, :3]) < 0:
+        corners = corners[:, ::-1]
+    return Triangles(vertices.astype(np.float32), corners)
+
+
+def _around(sections: int) -> NDArray[np.float64]:
+    angle = np.linspace(0, 2 * np.pi, sections + 1)
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _sphere(sections: int) -> NDArray[np.float64]:
+    """Unit sphere, rows from the lower pole to the upper."""
+    polar = np.linspace(-np.pi / 2, np.pi / 2, sections // 2 + 1)
+    circle = _around(sections)
+    points = np.empty((len(polar), len(circle), 3))
+    points[..., :2] = np.cos(polar)[:, None, None] * circle
+    points[..., 2] = np.sin(polar)[:, None]
+    return points
+
+
+def _disk(sections: int) -> NDArray[np.float64]:
+    """Unit disk at z = 0, facing +z: rows from the rim to the centre."""
+    rim = np.pad(_around(sections), ((0, 0), (0, 1)))
+    return np.stack([rim, np.zeros_like(rim)])
+
+
+def _cylinder(sections: int) -> NDArray[np.float64]:
+    """Unit cylinder without caps, z from 0 to 1."""
+    rim = np.pad(_around(sections), ((0, 0), (0, 1)))
+    return np.stack([rim, rim + np.array([0, 0, 1])])
+
+
+def _grid_faces(rows: int, columns: int) -> NDArray[np.uint32]:
+    """Two triangles per cell of a grid of vertices; those at poles have no area and are never drawn."""
+    corner = (np.arange(rows - 1)[:, None] * columns + np.arange(columns - 1)).ravel()
+    quads = np.stack([corner, corner + 1, corner + columns + 1, corner + columns], axis=1)
+    return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]).astype(np.uint32)
 
 
 def geometry_of(shapes: list[Any], group_of: Mapping[str, int], sections: int = SECTIONS) -> Geometry:
@@ -27,14 +101,14 @@ def geometry_of(shapes: list[Any], group_of: Mapping[str, int], sections: int = 
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = [part.faces + np.uint32(start) for part, start in zip(parts, starts, strict=False)]
     return Geometry(
-        vertices=_stacked([part.vertices for part in parts], np.float32),
-        faces=_stacked(faces, np.uint32),
+        vertices=_stack([part.vertices for part in parts], np.float32),
+        faces=_stack(faces, np.uint32),
         face_shape=np.repeat(np.arange(len(parts), dtype=np.int32), [len(part.faces) for part in parts]),
         shape_group=np.array([group_of.get(shape.id(), STATIC) for shape in shapes], np.int16),
     )
 
 
-def _stacked(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
+def _stack(arrays: list[NDArray[Any]], dtype: type) -> NDArray[Any]:
     return np.concatenate(arrays).astype(dtype) if arrays else np.zeros((0, 3), dtype)
 
 

@@ -67,12 +67,12 @@ class TransformPlacement:
 
     def move(self, translation: F32) -> None:
         """Place the shape at `translation` (3,) from rest."""
-        self._put(_shifted(translation.astype(np.float64)) @ self._rest)
+        self._put(_shift(translation.astype(np.float64)) @ self._rest)
 
     def park(self, parking: Parking) -> None:
         """Shrink the shape into the parking place."""
         shrunk = np.diag([PARKED_SCALE] * 3 + [1.0])
-        self._put(_shifted(parking.astype(np.float64)) @ shrunk @ _shifted(-self._corner) @ self._rest)
+        self._put(_shift(parking.astype(np.float64)) @ shrunk @ _shift(-self._corner) @ self._rest)
 
     def _put(self, to_world: NDArray[np.float64]) -> None:
         kind = type(self._parameters["to_world"])
@@ -87,7 +87,8 @@ class LightSwitch:
     def __init__(self, emitter: Any) -> None:
         self._parameters = mi.traverse(emitter)
         keys = [key for key in self._parameters.keys() if key.startswith("radiance.")]  # noqa: SIM118 - no mapping
-        self._lit = {key: _copied(self._parameters[key]) for key in keys if not key.endswith("to_uv")}
+        values = {key: self._parameters[key] for key in keys if not key.endswith("to_uv")}
+        self._lit = {key: type(value)(value) for key, value in values.items()}  # references change with the scene
         self._dark = {key: zeros_like(value) for key, value in self._lit.items()}
 
     def switch(self, on: bool) -> None:
@@ -98,11 +99,7 @@ class LightSwitch:
         self._parameters.update()
 
 
-def _copied(value: Any) -> Any:
-    return type(value)(value)  # a parameter is a reference, which changes with the scene
-
-
-def _shifted(offset: NDArray[np.float64]) -> NDArray[np.float64]:
+def _shift(offset: NDArray[np.float64]) -> NDArray[np.float64]:
     shift = np.eye(4)
     shift[:3, 3] = offset
     return shift
@@ -119,7 +116,11 @@ class MovableGroup:
     def of(cls, shapes: list[Any]) -> MovableGroup:
         """The group of these shapes, which are placed as modelled."""
         shines = tuple(LightSwitch(shape.emitter()) for shape in shapes if shape.is_emitter())
-        return cls(tuple(_placement(shape) for shape in shapes), shines)
+        placements = (
+            MeshPlacement(shape) if "vertex_positions" in mi.traverse(shape) else TransformPlacement(shape)
+            for shape in shapes
+        )
+        return cls(tuple(placements), shines)
 
     def move(self, translation: F32, *, was_present: bool) -> None:
         """Place the group at `translation` (3,) from rest."""
@@ -137,11 +138,6 @@ class MovableGroup:
     def _switch(self, on: bool) -> None:
         for shine in self.shines:
             shine.switch(on)
-
-
-def _placement(shape: Any) -> MeshPlacement | TransformPlacement:
-    meshed = "vertex_positions" in mi.traverse(shape)
-    return MeshPlacement(shape) if meshed else TransformPlacement(shape)
 
 
 def dim(scene: Any, spec: SceneSpec) -> None:

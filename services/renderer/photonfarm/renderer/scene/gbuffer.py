@@ -54,11 +54,12 @@ RAYS = 1 << 20
 def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | None = None) -> ViewBuffers:
     """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is hit.
 
-    With a `recorder` of `look`, Python runs only the first time; it takes half of the time in scenes of many materials.
+    With a `recorder` of `trace_first_surfaces`, Python runs only the first time; it takes half of the time in scenes of
+    many materials.
     """
     camera = Camera.of(view, spec)
     directions = camera.rays()
-    hit, normal, distance = _seen("centre", scene, _rays(camera, directions, spec), recorder)
+    hit, normal, distance = _trace_recorded("centre", scene, _rays(camera, directions, spec), recorder)
     along = directions.reshape(-1, 3).astype(np.float64) @ camera.forward
     depth = np.where(np.array(hit), spec.view.near + np.array(distance) * along, 0)
     shape = (camera.height, camera.width)
@@ -74,7 +75,7 @@ def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec, recorder: Recorder
     total = np.zeros((camera.height, camera.width, 3))
     for start in range(0, len(within), at_once):
         directions = np.stack([camera.rays(u, v) for u, v in within[start : start + at_once]])
-        (albedo,) = _seen("albedo", scene, _rays(camera, directions, spec), recorder)
+        (albedo,) = _trace_recorded("albedo", scene, _rays(camera, directions, spec), recorder)
         total += rows(albedo, *directions.shape[:-1]).sum(axis=0, dtype=np.float64)
     return (total / len(within)).astype(np.float32)
 
@@ -84,23 +85,23 @@ Rays = tuple[Any, Any, Any]
 """The origins (Point3f), directions (Vector3f) and lengths (Float) of rays."""
 
 
-def _seen(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tuple[Any, ...]:
-    """The result of `look`, recorded by `what` and the number of rays."""
+def _trace_recorded(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tuple[Any, ...]:
+    """The result of `trace_first_surfaces`, recorded by `what` and the number of rays."""
     if recorder is None:
-        return look(scene, None, *rays, what)
-    found: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
-    return found
+        return trace_first_surfaces(scene, None, *rays, what)
+    columns: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
+    return columns
 
 
-def look(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
+def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
     """The hits, normals and distances of the first surfaces that rays meet, or their albedo; zeros without a hit."""
     si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
     hit = si.is_valid()
-    found: tuple[Any, ...] = (dr.select(hit, seen_reflectance(si, hit), 0),)
+    columns: tuple[Any, ...] = (dr.select(hit, seen_reflectance(si, hit), 0),)
     if what == "centre":
-        found = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
-    dr.eval(found)
-    return found
+        columns = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
+    dr.eval(columns)
+    return columns
 
 
 def first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
@@ -138,7 +139,7 @@ SELF_HIT = 1e-4
 """The share of its length by which a ray ends before its point, so that it does not meet the point's surface."""
 
 
-def seen_points(scene: Any, view: View, spec: SceneSpec, position: F32) -> NDArray[np.bool_]:
+def find_seen_points(scene: Any, view: View, spec: SceneSpec, position: F32) -> NDArray[np.bool_]:
     """Whether a view sees points (N, 3) of the present scene, (N,), by the definition of `records.Visibility`.
 
     There is a ray for every point, so that the number of rays depends on no view; those to points outside the image
@@ -150,7 +151,7 @@ def seen_points(scene: Any, view: View, spec: SceneSpec, position: F32) -> NDArr
     ahead = (z > spec.view.near) & (z < spec.view.far)
     z = np.where(ahead, z, 1.0)
     u, v = (camera.focal_px * (offset @ axis) / z for axis in (camera.right, camera.down))
-    in_image = ahead & _within(u, camera.width) & _within(v, camera.height)
+    in_image = ahead & _is_in_a_pixel(u, camera.width) & _is_in_a_pixel(v, camera.height)
 
     distance = np.where(ahead, np.linalg.norm(offset, axis=1), 1.0)
     direction = offset / distance[:, None]
@@ -171,7 +172,7 @@ def sight_shares(scene: Any, origins: F32, targets: F32) -> F32:
     return 1 - blocked.mean(axis=1, dtype=np.float32)
 
 
-def _within(place: NDArray[np.float64], pixels: int) -> NDArray[np.bool_]:
+def _is_in_a_pixel(place: NDArray[np.float64], pixels: int) -> NDArray[np.bool_]:
     """Whether places along one axis, in pixels from the image's centre, are in one of its pixels."""
-    found: NDArray[np.bool_] = (place >= -0.5 * pixels) & (place < 0.5 * pixels)
-    return found
+    inside: NDArray[np.bool_] = (place >= -0.5 * pixels) & (place < 0.5 * pixels)
+    return inside

@@ -49,13 +49,13 @@ class LoadedScene:
         paths_at_once = paths_at_once or backend.paths_at_once()
         self._integrator = integrator_of(spec.transport, paths_at_once)
         self.samples_at_once = 1 if paths_at_once is None else _samples_at_once(spec, paths_at_once)
-        self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.look)
+        self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.trace_first_surfaces)
         self._guide_recorder, self._point_recorder = Recorder(guides.trace), Recorder(guides.irradiance)
         self._materials = Materials.of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
         by_id = {shape.id(): shape for shape in shapes}
-        self._groups = [MovableGroup.of(_found(by_id, shape_ids(group), group.name)) for group in spec.groups]
+        self._groups = [MovableGroup.of(_find_shapes(by_id, shape_ids(group), group.name)) for group in spec.groups]
         self.boxes = boxes_of(shapes)
         self.still = np.array([shape.id() not in self._group_of for shape in shapes], np.bool_)
         self._parking = self.boxes[self.still if self.still.any() else slice(None), 0].min(axis=0)
@@ -74,7 +74,7 @@ class LoadedScene:
         """
         backend.load()
         from photonfarm.renderer.scene.loading import load_scene
-        from photonfarm.renderer.scene.native.acceleration import expect_changes
+        from photonfarm.renderer.scene.native import expect_changes
 
         loaded = cls(spec, load_scene(spec, beside), **options)
         if spec.groups:
@@ -172,9 +172,9 @@ class LoadedScene:
 
     def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
         """Whether the view sees points (N, 3) of the present configuration, (N,)."""
-        from photonfarm.renderer.scene.gbuffer import seen_points
+        from photonfarm.renderer.scene.gbuffer import find_seen_points
 
-        return seen_points(self.scene, view, self.spec, position)
+        return find_seen_points(self.scene, view, self.spec, position)
 
     @cached_property
     def hollow(self) -> NDArray[np.bool_]:
@@ -234,7 +234,7 @@ def integrator_of(transport: Transport, paths_at_once: int | None = None) -> Any
         raise SpecError(f"transport: {' '.join(str(error).split())}") from error
 
 
-def _found(by_id: dict[str, Any], wanted: tuple[str, ...], name: str) -> list[Any]:
+def _find_shapes(by_id: dict[str, Any], wanted: tuple[str, ...], name: str) -> list[Any]:
     missing = sorted(set(wanted) - set(by_id))
     if missing:
         raise SpecError(f"{name}.shapes: {missing[0]!r} is not a shape of the loaded scene")

@@ -85,7 +85,7 @@ def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
     Shapes stay separate (`optimize=False`), as merged ones could not move. Raises SpecError for a file that is missing,
     that changed since the spec was read, or that Mitsuba or the integrator refuses.
     """
-    scene = _builtin(spec) if spec.scene.builtin else _from_file(spec, beside)
+    scene = _load_builtin(spec) if spec.scene.builtin else _load_file(spec, beside)
     try:
         check_scene(scene, light_paths=bool(spec.transport.light_ratio or spec.photons.paths))
     except ValueError as error:
@@ -104,14 +104,14 @@ def _check_lights(spec: SceneSpec, scene: Any) -> None:
             )
 
 
-def _builtin(spec: SceneSpec) -> Any:
+def _load_builtin(spec: SceneSpec) -> Any:
     shapes = rooms.describe(str(spec.scene.builtin))
-    scene = mi.load_dict({"type": "scene", **shapes, **_added_lights(spec)}, optimize=False)
+    scene = mi.load_dict({"type": "scene", **shapes, **_describe_added_lights(spec)}, optimize=False)
     dim(scene, spec)
     return scene
 
 
-def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
+def _load_file(spec: SceneSpec, beside: Path | None) -> Any:
     file = SceneFile.read(find_scene(str(spec.scene.file), spec.name, beside))
     if file.digest != spec.content:
         raise SpecError(
@@ -121,11 +121,11 @@ def _from_file(spec: SceneSpec, beside: Path | None) -> Any:
         with threads_to_read_with():
             scene = mi.load_file(str(file.path), optimize=False, **spec.scene.parameters)
     except (RuntimeError, ValueError) as error:
-        raise SpecError(f"{file.path}: Mitsuba cannot load it: {_sentence(error)}") from error
+        raise SpecError(f"{file.path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from error
     dim(scene, spec)
     free = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     shining = [emitter for emitter in free if factor_of(emitter, spec) > 0]
-    added = _added_lights(spec)
+    added = _describe_added_lights(spec)
     if len(shining) == len(free) and not added:
         return scene
     return scene_of([*scene.shapes(), *shining], added)
@@ -152,13 +152,9 @@ def scene_of(parts: list[Any], added: Mapping[str, Any] = MappingProxyType({})) 
     return scene
 
 
-def _added_lights(spec: SceneSpec) -> dict[str, Any]:
+def _describe_added_lights(spec: SceneSpec) -> dict[str, Any]:
     return {
         light.name: rectangle_light(light.at, light.rectangle.size, spec.view.up, light.rectangle.radiance)
         for light in spec.lights
         if light.rectangle is not None
     }
-
-
-def _sentence(error: Exception) -> str:
-    return " ".join(str(error).split())

@@ -51,12 +51,12 @@ def has_other_lobes(flags: Any) -> Any:
 
 def _alpha(bsdf: Any) -> float:
     """The α of a BSDF: the mean of its roughness parameters; without any, 0 for pure delta lobes, otherwise 1."""
-    found = [
+    alphas = [
         mean ** (2 if "roughness" in key else 1)  # of `principled`: α = roughness²
-        for key, mean in _stated(bsdf, ROUGHNESS).items()
+        for key, mean in _read_means(bsdf, ROUGHNESS).items()
     ]
-    if found:
-        return float(np.clip(np.mean(found), 0, 1))
+    if alphas:
+        return float(np.clip(np.mean(alphas), 0, 1))
     return 0.0 if is_pure_delta(bsdf.flags()) else 1.0
 
 
@@ -66,13 +66,13 @@ def _diffuse_kept(bsdf: Any) -> float:
     It is 0 for all but Mitsuba's `principled`, alone or nested: that always evaluates all of its lobes, of which the
     diffuse one has about the share (1 − metallic) (1 − spec_trans) of the base colour; textures enter by their means.
     """
-    if not _stated(bsdf, {"base_color"}):
+    if not _read_means(bsdf, {"base_color"}):
         return 0.0
-    metallic, passes = (np.mean([*_stated(bsdf, {name}).values()] or [0.0]) for name in ("metallic", "spec_trans"))
+    metallic, passes = (np.mean([*_read_means(bsdf, {name}).values()] or [0.0]) for name in ("metallic", "spec_trans"))
     return float((1 - metallic) * (1 - passes))
 
 
-def _stated(bsdf: Any, names: Set[str]) -> dict[str, float]:
+def _read_means(bsdf: Any, names: Set[str]) -> dict[str, float]:
     """The parameters of these names in a BSDF and in nested ones: means, by key."""
     return {
         key: float(np.mean(np.array(value)))

@@ -58,5 +58,5 @@ class SceneGuides:
         places = np.stack([self._sensor.place(view) for view in views])
         eye_paths = 2 * spec.film.width * spec.film.height * spec.transport.half_spp
         images = 1 if spec.groups else STATIC
-        effort = Effort.of_image(eye_paths * images, integrator.light_ratio, integrator.connections)
+        effort = Effort.for_image(eye_paths * images, integrator.light_ratio, integrator.connections)
         return integrator.learn_guide(scene, self._sensor.at_origin, seed, places, effort)

@@ -68,23 +68,19 @@ class Budget:
     def require(self, what: str, more_s: float, best_s: float) -> None:
         """Raise IncompleteError unless `more_s` are left, needed for `what`; `best_s` would do all that is of use."""
         if more_s > self.left_s:
-            least, best = (_tens(self.spent_s + seconds) for seconds in (more_s, max(best_s, more_s)))
+            least, best = (10 * ceil((self.spent_s + seconds) / 10) for seconds in (more_s, max(best_s, more_s)))
             raise IncompleteError(
                 f"{what} does not fit in --seconds {self.seconds:g}: {self.spent_s:.0f} s of processor time are used, "
                 f"and about {max(ceil(more_s), 1)} s more are needed; give it {least}"
                 + (f", or {best} for all settings" if best > least else "")
             )
 
-    def within(self, share: float, items: Iterable[T], least: int) -> Iterator[T]:
+    def take_within(self, share: float, items: Iterable[T], least: int) -> Iterator[T]:
         """The items for as long as no more than a share of the whole time is used; so many in any case."""
         for count, item in enumerate(items):
             yield item
             if count + 1 >= least and self.spent_s > share * self.seconds:
                 return
-
-
-def _tens(seconds: float) -> int:
-    return 10 * ceil(seconds / 10)
 
 
 def affordable(
@@ -99,22 +95,22 @@ def affordable(
     compiling: list[float] = []
     images: list[float] = []
 
-    def needed(count: int) -> float:
+    def needed_s(count: int) -> float:
         timed = (LEAST_TURNS + 1) * (1 + RANGE) * count
         of_a_view = max(SCOUTS, count) + 2 * -(-LEAST_PAIRS // LEAST_VIEWS) * count
         rendered_s = (timed + LEAST_VIEWS * of_a_view) * np.mean(images)
         return float(rendered_s + TRACES * count * min(compiling) + EDITS * LEAST_VIEWS * edit_s)
 
     for count, candidate in enumerate(ordered, 1):
-        if count > len(first) and MARGIN * needed(count) + min(compiling) > budget.left_s:
+        if count > len(first) and MARGIN * needed_s(count) + min(compiling) > budget.left_s:
             return ordered[: count - 1]
         for seconds in (compiling, images):
             begun = budget.clock()
             render(candidate, 0, 1)
             seconds.append(budget.clock() - begun)
         if count <= len(first):
-            every = MARGIN * needed(len(ordered)) + (len(ordered) - count) * min(compiling)
-            budget.require(what, needed(len(first)) + (len(first) - count) * min(compiling), every)
+            every = MARGIN * needed_s(len(ordered)) + (len(ordered) - count) * min(compiling)
+            budget.require(what, needed_s(len(first)) + (len(first) - count) * min(compiling), every)
     return ordered
 
 
@@ -131,7 +127,7 @@ class ImageCost:
         sample_s = max((many_s - few_s) / (many - few), 0.02 * few_s / few)  # if noise hides it
         return cls(max(few_s - few * sample_s, 0.0), sample_s)
 
-    def of_a_half(self) -> ImageCost:
+    def halve(self) -> ImageCost:
         """The cost of one of two half-estimates that share a launch, and so the fixed part of an image."""
         return ImageCost(self.fixed_s / 2, self.sample_s)
 

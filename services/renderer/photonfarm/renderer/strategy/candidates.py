@@ -110,8 +110,8 @@ class RelativeErrors(Frozen):
         independent, which overstates the result.
         """
         if self.images == other.images:
-            return _standard_error(_scaled(self.own) - _scaled(other.own))
-        parts = [_standard_error(_scaled(errors.own) - _scaled(errors.plain)) for errors in (self, other)]
+            return _standard_error(_scale(self.own) - _scale(other.own))
+        parts = [_standard_error(_scale(errors.own) - _scale(errors.plain)) for errors in (self, other)]
         return None if parts[0] is None or parts[1] is None else math.hypot(parts[0], parts[1])
 
 
@@ -119,7 +119,7 @@ def _mean(errors: Sequence[float]) -> float:
     return max(float(np.mean(errors)), 1e-30)
 
 
-def _scaled(errors: Sequence[float]) -> NDArray[np.float64]:
+def _scale(errors: Sequence[float]) -> NDArray[np.float64]:
     return np.array(errors, np.float64) / _mean(errors)
 
 

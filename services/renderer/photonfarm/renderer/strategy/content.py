@@ -114,14 +114,14 @@ def _why_no_light_paths(content: SceneContent, max_depth: int, hit_share: float)
 def sentences(content: SceneContent, max_depth: int) -> Sequence[str]:
     """What every plan models, and the lights that are off."""
     lights = ", ".join(f"{count} {kind}" for kind, count in sorted(content.lights.items())) or "none"
-    found = [
+    lines = [
         f"lights: {lights}",
         f"surfaces: {content.surfaces}, of which {content.specular} are mirrors or clear glass alone",
         f"camera: {content.camera}; paths of {'any number of' if max_depth < 0 else f'up to {max_depth}'} edges",
     ]
     if content.dark:
-        found.append(f"lights that do not shine: {content.dark}, selected with probability 0")
-    return found
+        lines.append(f"lights that do not shine: {content.dark}, selected with probability 0")
+    return lines
 
 
 # ----------------------------------------------------------------------------------------------------------- photons
@@ -149,10 +149,12 @@ def light_reach(scenes: Iterable[Any], view: ViewSpec, seed: int) -> LightReach:
         photons = trace_photons(scene, seed=seed + i, paths=PATHS, depth=DEPTH)
         near = _inside(photons.position, view)
         of_bounce = [photons.bounce == d for d in range(DEPTH)]
-        rows.append([
-            [float(np.sum(at & near)) / PATHS for at in of_bounce],
-            [float(np.sum(photons.power[at & near], dtype=np.float64)) for at in of_bounce],
-        ])  # fmt: skip
+        rows.append(
+            [
+                [float(np.sum(at & near)) / PATHS for at in of_bounce],
+                [float(np.sum(photons.power[at & near], dtype=np.float64)) for at in of_bounce],
+            ]
+        )
         hits.append(np.sum(of_bounce[0]) / PATHS)
     near_share, power = np.array(rows).transpose(1, 0, 2)
     arrived = power.sum(axis=1, keepdims=True)

@@ -158,23 +158,23 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         scene = PilotScene(spec, beside)
         budget.require(f"{spec.name}: loading it", 0.0, budget.spent_s)
         work_log.begin(f"following the light of {spec.name}", budget.words)
-        found, depth = content.read(scene.loaded.scene, scene.camera()), spec.transport.max_depth
+        scene_content, depth = content.read(scene.loaded.scene, scene.camera()), spec.transport.max_depth
         loaded_s = budget.spent_s
-        reach = content.light_reach(budget.within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
+        reach = content.light_reach(budget.take_within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
         edit_s = (budget.spent_s - loaded_s) / len(reach.near)
-        useful, left_out = content.restrict(found, depth, reach.hit, GRID)
+        useful, left_out = content.restrict(scene_content, depth, reach.hit, GRID)
 
         now, half_spp = present(spec), spec.transport.half_spp
         every = list(dict.fromkeys([*useful, now]))
         work_log.begin("compiling and timing images", budget.words)
-        scene = _on_quick_film(scene, budget)
+        scene = _shrink_film(scene, budget)
         render, first = scene.renders(1)[0], {PLAIN, now} & set(every)
         candidates = affordable(render, every, first, budget, edit_s, f"{spec.name}: comparing settings")
         pixels, quick = spec.film.width * spec.film.height, scene.spec.film
         timed = time_images(render, candidates, half_spp, TIMING * budget.left_s, scene.clock)
         scale = pixels / (quick.width * quick.height)
         costs = {c: ImageCost(cost.fixed_s, scale * cost.sample_s) for c, cost in timed.items()}
-        halves = {c: cost.of_a_half() if purpose is Purpose.TRAINING else cost for c, cost in costs.items()}
+        halves = {c: cost.halve() if purpose is Purpose.TRAINING else cost for c, cost in costs.items()}
         half_s = halves[now].time_s(half_spp)
 
         left_s = max(budget.left_s - EDITS * LEAST_VIEWS * edit_s, 0.0)
@@ -205,7 +205,7 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         spp=spp,
         half_s=half_s,
         views=choice.views,
-        modelled=(*content.sentences(found, depth), *[fewer] * (len(candidates) < len(every))),
+        modelled=(*content.sentences(scene_content, depth), *[fewer] * (len(candidates) < len(every))),
         left_out=tuple(left_out),
         rows=tuple(
             CandidateRow(
@@ -224,7 +224,7 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
     )
 
 
-def _on_quick_film(pilot_scene: PilotScene, budget: Budget) -> PilotScene:
+def _shrink_film(pilot_scene: PilotScene, budget: Budget) -> PilotScene:
     """The scene on a film whose images are quick to render, halved as often as it helps; not below 32 pixels."""
     target_s = budget.left_s / IMAGES
     before = np.inf
@@ -237,10 +237,10 @@ def _on_quick_film(pilot_scene: PilotScene, budget: Budget) -> PilotScene:
         if image_s <= target_s or min(film.width, film.height) < 64 or image_s > 0.7 * before:
             return pilot_scene
         before = image_s
-        pilot_scene = pilot_scene.on_film(_halved(film))
+        pilot_scene = pilot_scene.on_film(_halve(film))
 
 
-def _halved(film: Film) -> Film:
+def _halve(film: Film) -> Film:
     return Film(width=film.width // 16 * 8, height=film.height // 16 * 8)
 
 
@@ -256,7 +256,7 @@ def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: 
     spp = int(np.clip((budget / LEAST_VIEWS - fixed) / sample, 1, spec.transport.half_spp))
     film = spec.film
     while LEAST_VIEWS * (fixed + spp * sample) > budget and spp * sample > fixed and min(film.width, film.height) >= 64:
-        film = _halved(film)
+        film = _halve(film)
         sample /= 4
     return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
 

@@ -187,7 +187,7 @@ class BlockSums:
         )
 
 
-def missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:
+def charge_for_missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:
     """The charge for light that other candidates find and this one misses, as an error, mean over the views.
 
     For each view it is the largest over the sizes of blocks, since light may be missing in a spot or everywhere, of
@@ -202,10 +202,10 @@ def missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:
 
     All sums are over the same views, in the same order.
     """
-    return float(np.max([_missed_in_blocks(sums, others, blocks) for blocks in BLOCKS], axis=0).mean())
+    return float(np.max([_charge_in_blocks(sums, others, blocks) for blocks in BLOCKS], axis=0).mean())
 
 
-def _missed_in_blocks(sums: BlockSums, others: Sequence[BlockSums], blocks: int) -> NDArray[np.float64]:
+def _charge_in_blocks(sums: BlockSums, others: Sequence[BlockSums], blocks: int) -> NDArray[np.float64]:
     """The charge of each view, (V,), for one size of blocks."""
     own = sums.evidence(blocks)
     charge = np.zeros_like(own.mean)

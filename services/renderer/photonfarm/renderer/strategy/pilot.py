@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from photonfarm.core.records import F32
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, MeasuredCandidate, RelativeErrors, Render
-from photonfarm.renderer.strategy.noise import BlockSums, Weigh, missed, pair_errors, view_weights
+from photonfarm.renderer.strategy.noise import BlockSums, Weigh, charge_for_missed, pair_errors, view_weights
 
 LEAST_PAIRS = 4
 """The least number of pairs of images in the first round, over all views: fewer would give no standard error."""
@@ -81,7 +81,7 @@ def choose(
         return Choice(PLAIN, (), 0.0, 0)
     _halve(rounds, every, pairs, {PLAIN, *keep}, seconds)
     best = min(longest(every, rounds.images), key=rounds.cost)
-    return Choice(best, tuple(map(rounds.measured, every)), rounds.shared(), len(rounds.weights))
+    return Choice(best, tuple(map(rounds.describe, every)), rounds.shared_error(), len(rounds.weights))
 
 
 def _halve(rounds: Rounds, every: Sequence[Candidate], pairs: int, kept: set[Candidate], seconds: float) -> None:
@@ -193,34 +193,41 @@ class Rounds:
     def _time_later(self, candidate: Candidate) -> float:
         return self._time(candidate) * self._later.get(candidate, 1.0)
 
-    def missed(self, candidate: Candidate) -> float:
+    def inferred_error(self, candidate: Candidate) -> float:
         """The part of a candidate's error that is inferred from light that others found."""
-        return missed(self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate])
+        return charge_for_missed(
+            self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate]
+        )
 
-    def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
+    def _errors_that_count(self, candidate: Candidate) -> NDArray[np.float64]:
         """The error that counts, by pairs and views, (pairs, views)."""
         return np.stack([record.errors for record in self._records[candidate].values()], axis=1)
 
-    def shared(self) -> float:
+    def shared_error(self) -> float:
         """The error of rare bright samples that all candidates share in an image, which is left out."""
         return float(np.mean([np.mean(shared) for shared in self._shared.values()]))
 
     def is_suspect(self, candidate: Candidate) -> bool:
         """Whether a candidate seems to miss light that others find; the estimate grows with the number of images."""
-        inferred = self.missed(candidate)
-        return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
+        inferred = self.inferred_error(candidate)
+        return bool(inferred > SUSPICIOUS * (self._errors_that_count(candidate).mean() + inferred))
 
     def cost(self, candidate: Candidate) -> float:
         """Error × time of a candidate: less is better."""
-        return float((self._seen(candidate).mean() + self.missed(candidate)) * self._time_later(candidate))
+        return float(
+            (self._errors_that_count(candidate).mean() + self.inferred_error(candidate)) * self._time_later(candidate)
+        )
 
     def errors(self, candidate: Candidate) -> RelativeErrors:
         """The errors beside those of plain path tracing, over the images that both rendered with equal seeds."""
-        seen = self._seen(candidate)
-        own, plain = seen + self.missed(candidate), self._seen(PLAIN)[: len(seen)] + self.missed(PLAIN)
-        return RelativeErrors(images=self.images(candidate), own=_by_views(own), plain=_by_views(plain))
+        seen = self._errors_that_count(candidate)
+        own, plain = (
+            seen + self.inferred_error(candidate),
+            self._errors_that_count(PLAIN)[: len(seen)] + self.inferred_error(PLAIN),
+        )
+        return RelativeErrors(images=self.images(candidate), own=_mean_over_pairs(own), plain=_mean_over_pairs(plain))
 
-    def measured(self, candidate: Candidate) -> MeasuredCandidate:
+    def describe(self, candidate: Candidate) -> MeasuredCandidate:
         """The error × time against plain path tracing."""
         errors = self.errors(candidate)
         cost = errors.ratio * self._time_later(candidate) / self._time_later(PLAIN)
@@ -228,13 +235,13 @@ class Rounds:
         return MeasuredCandidate(
             candidate=candidate,
             errors=errors,
-            missed=self.missed(candidate),
+            missed=self.inferred_error(candidate),
             time_s=self._time(candidate),
             relative_cost=cost,
             spread=None if relative is None else cost * relative,
         )
 
 
-def _by_views(errors: NDArray[np.float64]) -> tuple[float, ...]:
+def _mean_over_pairs(errors: NDArray[np.float64]) -> tuple[float, ...]:
     """The means over pairs, given (pairs, views); for a single view the pairs themselves."""
     return tuple((errors.mean(axis=0) if errors.shape[1] > 1 else errors[:, 0]).tolist())

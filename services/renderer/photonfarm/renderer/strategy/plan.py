@@ -51,10 +51,10 @@ def candidates_at_equal_cost(measurement: Measurement, half_s: float) -> dict[Ca
     The variance of an image is that of one sample over the number of samples n. So error × time is the error of one
     sample × time / n.
     """
-    return {row.candidate: _at_cost(row, measurement, half_s) for row in measurement.rows}
+    return {row.candidate: _settings_at_cost(row, measurement, half_s) for row in measurement.rows}
 
 
-def _at_cost(row: CandidateRow, measurement: Measurement, half_s: float) -> CandidateAtCost:
+def _settings_at_cost(row: CandidateRow, measurement: Measurement, half_s: float) -> CandidateAtCost:
     plain, samples = measurement.row(PLAIN), row.cost.bought(half_s)
     cost = row.errors.ratio * row.cost.per_sample_s(half_s) / plain.cost.per_sample_s(half_s)
     relative = row.errors.relative_spread(plain.errors)
@@ -82,7 +82,7 @@ def fitting(candidates: Mapping[Candidate, CandidateAtCost]) -> dict[Candidate, 
     return {c: at_cost for c, at_cost in candidates.items() if at_cost.fits}
 
 
-def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
+def settle(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int]:
     """The settings to choose, given present ones: these, or others that are significantly better at the same cost.
 
     Rounding to a whole number of samples changes the cost a little, and at the new cost another candidate may be better
@@ -99,10 +99,10 @@ def settled(measurement: Measurement, candidate: Candidate, half_spp: int) -> tu
 
 def _better(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int] | None:
     candidates = candidates_at_equal_cost(measurement, measurement.row(candidate).cost.time_s(half_spp))
-    found = best(fitting(candidates))
-    if found.candidate == candidate or not saving(found, over=candidates[candidate]).significant:
+    chosen = best(fitting(candidates))
+    if chosen.candidate == candidate or not saving(chosen, over=candidates[candidate]).significant:
         return None
-    return found.candidate, found.half_spp
+    return chosen.candidate, chosen.half_spp
 
 
 # -------------------------------------------------------------------------------------------------- the plan
@@ -173,9 +173,9 @@ def make_plan(
     spec: SceneSpec, beside: Path | None, purpose: Purpose, *, seconds: float, again: bool, log: Log
 ) -> TransportPlan:
     """The plan of a spec for a purpose; a cached measurement is used if it took `seconds`, unless `again` is set."""
-    found = None if again else find(spec, purpose)
-    if found is not None and found.asked_s >= seconds and _knows(found, spec):
-        return plan_of(spec, found, cached=True)
+    kept = None if again else find(spec, purpose)
+    if kept is not None and kept.asked_s >= seconds and _knows(kept, spec):
+        return plan_of(spec, kept, cached=True)
     measurement = measure(spec, beside, purpose, seconds, log)
     try:
         keep(spec, measurement)
@@ -201,4 +201,4 @@ def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Trans
     if not measurement.rows:
         return TransportPlan(spec, measurement, cached, PLAIN, half_spp, *photons, {})
     at_equal_cost = candidates_at_equal_cost(measurement, measurement.row(now).cost.time_s(half_spp))
-    return TransportPlan(spec, measurement, cached, *settled(measurement, now, half_spp), *photons, at_equal_cost)
+    return TransportPlan(spec, measurement, cached, *settle(measurement, now, half_spp), *photons, at_equal_cost)

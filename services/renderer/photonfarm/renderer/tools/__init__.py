@@ -1,1 +1,1 @@
-"""Tools for people: the contact sheet, and the doctor."""
+"""Tools for scenes, and for people: import, check, measure, plan view, preview, and the doctor of a machine."""

@@ -37,10 +37,10 @@ def examine(store: str | Path, redis_url: str, log: Log = lambda _: None) -> Ite
     """Every check in turn; optional parts that are absent are reported and give exit code 0."""
     yield _packages()
     yield _optional(_cards(cards_here()), "needed by `--device cuda` only")
-    yield _tried("renderer", lambda: _renders(log))
-    yield _tried("store", lambda: _writes(store))
-    yield _tried("embedded Redis", _starts_redis)
-    yield _optional(_tried("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
+    yield _try("renderer", lambda: _renders(log))
+    yield _try("store", lambda: _writes(store))
+    yield _try("embedded Redis", _starts_redis)
+    yield _optional(_try("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
     yield _optional(_scenes(), "needed by the ready specs under scenes/ only")
 
 
@@ -49,7 +49,7 @@ def _packages() -> MachineCheck:
     return MachineCheck("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
 
 
-def _tried(name: str, check: Callable[[], str]) -> MachineCheck:
+def _try(name: str, check: Callable[[], str]) -> MachineCheck:
     try:
         return MachineCheck(name, True, check())
     except PhotonfarmError as error:
@@ -60,15 +60,15 @@ def _optional(finding: MachineCheck, note: str) -> MachineCheck:
     return finding if finding.works else MachineCheck(finding.name, False, f"{finding.detail} ({note})")
 
 
-def _cards(found: Cards) -> MachineCheck:
+def _cards(here: Cards) -> MachineCheck:
     """The NVIDIA cards, their driver and OptiX; without them the processor renders."""
-    driver = f"driver {found.driver or 'of unknown version'}, CUDA {found.cuda // 100}.{found.cuda % 100}"
+    driver = f"driver {here.driver or 'of unknown version'}, CUDA {here.cuda // 100}.{here.cuda % 100}"
     cards = [
         f"cuda:{card.number} {card.name}, compute capability {card.capability}, {card.memory_bytes / 2**30:.0f} GiB"
-        for card in found.cards
+        for card in here.cards
     ]
-    if found.trouble:
-        return MachineCheck("GPU", False, "; ".join([found.trouble, *([driver] if cards else []), *cards]))
+    if here.trouble:
+        return MachineCheck("GPU", False, "; ".join([here.trouble, *([driver] if cards else []), *cards]))
     return MachineCheck("GPU", True, "; ".join([*cards, driver, "OptiX"]))
 
 
@@ -140,6 +140,6 @@ def _scenes() -> MachineCheck:
     from photonfarm.scene.spec_loading import SCENES_VARIABLE
 
     folders = [Path(p) for p in os.environ.get(SCENES_VARIABLE, "").split(os.pathsep) if p]
-    found = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))
-    detail = ", ".join(found) or f"no scene files; set {SCENES_VARIABLE} to the folder that holds them"
-    return MachineCheck("scenes", bool(found), detail)
+    names = sorted(scene.parent.name for folder in folders for scene in folder.glob("*/scene.xml"))
+    detail = ", ".join(names) or f"no scene files; set {SCENES_VARIABLE} to the folder that holds them"
+    return MachineCheck("scenes", bool(names), detail)

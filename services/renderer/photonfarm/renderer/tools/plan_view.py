@@ -64,8 +64,8 @@ class PlanView:
 
     def places(self) -> Markup:
         """The scene at rest, and the boxes that objects, lights and cameras are placed in."""
-        boxes = [self._rectangle(self._placed(g.box), f"may hue{i}") for i, g in enumerate(self.spec.groups)]
-        boxes += [self._rectangle(self._placed(self.spec.view.origin), "origins")]
+        boxes = [self._rectangle(self._place(g.box), f"may hue{i}") for i, g in enumerate(self.spec.groups)]
+        boxes += [self._rectangle(self._place(self.spec.view.origin), "origins")]
         return self._svg([*boxes, *self._groups(rest(self.spec))], "where objects and cameras may stand, from above")
 
     def configuration(self, modification: Modification, views: Sequence[View]) -> Markup:
@@ -73,7 +73,7 @@ class PlanView:
         cameras = [part for view in views for part in self._camera(view)]
         return self._svg([*self._groups(modification), *cameras], "what stands where, from above, and the camera")
 
-    def _placed(self, box: Box) -> F64:
+    def _place(self, box: Box) -> F64:
         return _flat(self.spec, np.stack([box.low, box.high]))
 
     def _groups(self, modification: Modification) -> list[Markup]:

@@ -65,7 +65,7 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
         hues=[hue(i) for i in range(len(spec.groups))],
         shell=plan.shell(),
         places=plan.places(),
-        groups=[(_of_group(spec, i), group) for i, group in enumerate(spec.groups)],
+        groups=[(_find_group(spec, i), group) for i, group in enumerate(spec.groups)],
         rows=[_row(reader, plan, int(row)) for row in shown],
     )
 
@@ -92,12 +92,12 @@ def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:
         row,
         f"camera at {said(sample.view.origin)}, looking at {said(sample.view.target)}",
         plan.configuration(sample.modification, [sample.view]),
-        [_of_group(spec, i, sample.modification) for i in range(len(spec.groups))],
+        [_find_group(spec, i, sample.modification) for i in range(len(spec.groups))],
         list(zip(COLUMNS, panels, strict=True)),
     )
 
 
-def _of_group(spec: SceneSpec, i: int, modification: Modification | None = None) -> Standing:
+def _find_group(spec: SceneSpec, i: int, modification: Modification | None = None) -> Standing:
     """Where a group stands, or where it was modelled."""
     group, place = spec.groups[i], None
     if modification is None or modification.present[i]:

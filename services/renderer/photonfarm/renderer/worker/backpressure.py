@@ -10,7 +10,6 @@ import errno
 import shutil
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from redis import Redis
 
@@ -41,7 +40,7 @@ class DiskReserve:
         self._clock = clock
         self._refused_until = 0.0
 
-    def refused(self) -> None:
+    def note_refusal(self) -> None:
         """Record that the disk has just refused a write; it may do so with free space left, because of a quota."""
         self._refused_until = self._clock() + FULL_S
 
@@ -50,17 +49,13 @@ class DiskReserve:
         if self._clock() < self._refused_until:
             return "the disk is full; trying again now and then"
         with store_errors("ask how much of the disk is free", str(self._root)):
-            free = _free_bytes(self._root)
+            free = None if self._root is None else shutil.disk_usage(self._root).free
         if free is None or free >= self._reserve_bytes:
             return None
         return (
             f"{free / 1e9:.1f} GB are free on the disk of {self._root}, and {self._reserve_bytes / 1e9:g} GB are to "
             "stay free (--reserve)"
         )
-
-
-def _free_bytes(root: Path | None) -> int | None:
-    return None if root is None else shutil.disk_usage(root).free
 
 
 def is_full(error: BaseException) -> bool:
@@ -97,7 +92,7 @@ class TrainerPace:
         """The scenes of which no job should be taken now: the reason, by scene id. Raises redis.RedisError."""
         if self._clock() >= self._due:
             began = self._clock()
-            self._ahead = self._look()
+            self._ahead = self._find_ahead()
             self._due = self._clock() + pause_after_look(self._clock() - began, AHEAD_LOOK_S)
         return self._ahead
 
@@ -107,7 +102,7 @@ class TrainerPace:
             return self._store.each(_progress)[0]
         return {self._scene_id: _progress(self._store.scene(self._scene_id))}
 
-    def _look(self) -> dict[str, str]:
+    def _find_ahead(self) -> dict[str, str]:
         committed = {
             scene_id: progress.committed_samples
             for scene_id, progress in self._progress().items()

@@ -2,29 +2,30 @@
 
 from __future__ import annotations
 
+import contextlib
+import faulthandler
 import logging
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import redis
 
 from photonfarm import queue
-from photonfarm.core.errors import PhotonfarmError
+from photonfarm.core.errors import IncompleteError, PhotonfarmError, SceneNotHereError, StoreError
 from photonfarm.core.processes import Stop
 from photonfarm.queue import Activity, RenderArguments, job_name
 from photonfarm.renderer.jobs import render as jobs
-from photonfarm.renderer.worker.heartbeat import deadline
-from photonfarm.renderer.worker.outcomes import Outcomes, WorkerLog, is_complete, missing_jobs, send_line
-from photonfarm.renderer.worker.queue_source import QueueSource
-from photonfarm.renderer.worker.settings import GRACE_S, LOG_FORMAT, RECYCLED, REFUSED, WorkerSettings
-from photonfarm.renderer.worker.share_source import ShareSource
-from photonfarm.renderer.worker.source import Ending, JobSource, TakenError
+from photonfarm.renderer.worker.outcomes import Outcomes, WorkerLog, send_line
+from photonfarm.renderer.worker.settings import GRACE_S, JOB_IN_HAND, LOG_FORMAT, RECYCLED, REFUSED, WorkerSettings
+from photonfarm.renderer.worker.source import Ending, JobSource, QueueSource, ShareSource, TakenError, missing_jobs
 from photonfarm.store import Store
 from photonfarm.store.model.lease import read_leases
+
+STDERR = 2
 
 log = logging.getLogger(__name__)
 
@@ -92,8 +93,8 @@ class RenderWorker:
 
     def step(self) -> int | None:
         """Render a job, or wait for one; an exit code ends the worker."""
-        paused, left = self._outcomes.disk.reason(), self._left()
-        self._talk.pausing(paused)
+        paused, left = self._outcomes.disk.reason(), self._skipped_scenes()
+        self._talk.log_pause(paused)
         job = self._source.take(paused, left)
         if job is not None:
             self._render(job)
@@ -103,11 +104,11 @@ class RenderWorker:
         self._stop.wait(self._settings.idle_s if paused else self._source.pause_s)
         return None
 
-    def _left(self) -> Mapping[str, str]:
+    def _skipped_scenes(self) -> Mapping[str, str]:
         """Why this worker now takes no jobs of some scenes, by their ids."""
         waiting = {**self._source.ahead(), **read_leases(self._store.storage)}
-        self._talk.waiting(waiting)
-        return {**waiting, **self._outcomes.left()}
+        self._talk.log_waiting(waiting)
+        return {**waiting, **self._outcomes.skipped_scenes()}
 
     def _is_complete(self, paused: str | None) -> bool:
         """Whether nothing is left to do or to wait for, after nothing was taken.
@@ -130,15 +131,15 @@ class RenderWorker:
         self._in_hand, rendered = name, False
         ending: Ending = "done"
         reason = ""
-        with deadline(self._settings, self._pipe, name), self._talk.timing(name):
+        with deadline(self._settings, self._pipe, name), self._talk.time_job(name):
             try:
                 rendered = self._renderer.render(*job)
                 if not rendered:
                     self._store.check()  # its scene may be gone with the whole store
             except TakenError:
-                self._talk.given_up(name)
+                self._talk.log_given_up(name)
             except Exception as error:
-                ending, reason = self._outcomes.failed(name, error), f"{type(error).__name__}: {error}"
+                ending, reason = self._outcomes.judge_failure(name, error), f"{type(error).__name__}: {error}"
         self._in_hand = None
         self._outcomes.count(name, time.monotonic() - began, done=rendered, failed=ending != "done")
         if self._source.end(name, ending, reason):
@@ -152,6 +153,45 @@ class RenderWorker:
 
     def _on_progress(self, phase: str, done: int, total: int) -> None:
         self._source.tell_doing(Activity(phase, done, total, self._in_hand))
+
+
+@contextlib.contextmanager
+def deadline(settings: WorkerSettings, pipe: int | None, name: str) -> Iterator[None]:
+    """Tell the supervisor of a job that the block renders; past the deadline the process ends, and prints where."""
+    if pipe is not None:
+        send_line(pipe, f"{JOB_IN_HAND}{name}")
+    # its watchdog is a thread without Python's lock, so that it also ends native code that never returns
+    faulthandler.dump_traceback_later(settings.deadline_s, exit=True, file=STDERR if pipe is None else pipe)
+    try:
+        yield
+    finally:
+        faulthandler.cancel_dump_traceback_later()
+
+
+def is_complete(
+    missing: Mapping[str, list[int]],
+    unreadable: Mapping[str, StoreError],
+    failed: Mapping[str, str],
+    not_here: Mapping[str, SceneNotHereError],
+) -> bool:
+    """Whether a worker that is to stop when nothing is missing may stop; `failed` are reasons by the jobs' names.
+
+    Raises the error for which it should rather end, as nothing is left that it could do or wait for.
+    """
+    scene_of = {queue.job_name(scene_id, job): scene_id for scene_id, jobs in missing.items() for job in jobs}
+    not_failed = scene_of.keys() - failed.keys()
+    if not_failed and all(scene_of[name] in not_here for name in not_failed):
+        raise not_here[scene_of[min(not_failed)]]
+    if unreadable and not not_failed:  # and nothing else is left: the other scenes' jobs were taken before
+        raise unreadable[min(unreadable)]
+    if scene_of and not not_failed:
+        first = min(scene_of)
+        failures = "1 job has" if len(scene_of) == 1 else f"{len(scene_of)} jobs have"
+        raise IncompleteError(
+            f"{failures} failed; {first}: {failed[first]}. `photonfarm status` has the causes, and commands that "
+            "repeat them"
+        )
+    return not scene_of
 
 
 if __name__ == "__main__":

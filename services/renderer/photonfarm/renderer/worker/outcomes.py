@@ -13,11 +13,9 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm import queue
 from photonfarm.core.errors import (
     BackendError,
     CorruptError,
-    IncompleteError,
     PhotonfarmError,
     QueueError,
     SceneNotHereError,
@@ -63,10 +61,10 @@ class JobCounts:
     def __str__(self) -> str:
         """The counts in words."""
         failed = f", {self.failed} failed" if self.failed else ""
-        return f"{counted(self.jobs)} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
+        return f"{jobs_in_words(self.jobs)} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
 
 
-def counted(jobs: int) -> str:
+def jobs_in_words(jobs: int) -> str:
     """A number of jobs, in words."""
     return f"{jobs} job{'s' * (jobs != 1)}"
 
@@ -86,7 +84,7 @@ class WorkerLog:
         self._waiting: set[str] = set()
 
     @contextlib.contextmanager
-    def timing(self, name: str) -> Iterator[None]:
+    def time_job(self, name: str) -> Iterator[None]:
         """Time a job while the block runs."""
         began = time.monotonic()
         yield
@@ -98,17 +96,17 @@ class WorkerLog:
             log.info(
                 "worker %s: %s in %.0f s, %.2f s each; the last was %s",
                 self._name,
-                counted(self._jobs),
+                jobs_in_words(self._jobs),
                 self._seconds,
                 self._seconds / self._jobs,
                 name,
             )
 
-    def given_up(self, name: str) -> None:
+    def log_given_up(self, name: str) -> None:
         """Log that a job in hand was given up, as another worker has committed it."""
         log.info("worker %s: gives up %s, which another worker has committed", self._name, name)
 
-    def pausing(self, reason: str | None) -> None:
+    def log_pause(self, reason: str | None) -> None:
         """Log once that no jobs are taken, and once that they are taken again."""
         if reason and not self._pausing:
             log.warning("worker %s: takes no jobs: %s", self._name, reason)
@@ -116,7 +114,7 @@ class WorkerLog:
             log.warning("worker %s: takes jobs again", self._name)
         self._pausing = bool(reason)
 
-    def waiting(self, ahead: Mapping[str, str]) -> None:
+    def log_waiting(self, ahead: Mapping[str, str]) -> None:
         """Log once for each scene why its jobs are skipped, and once that they are taken again."""
         for scene_id in ahead.keys() - self._waiting:
             log.warning("worker %s: takes no jobs of scene %s: %s", self._name, scene_id, ahead[scene_id])
@@ -168,13 +166,13 @@ class Outcomes:
         worn = self._jobs >= self._settings.max_jobs or _resident_bytes() > self._settings.max_rss_bytes
         return RECYCLED if worn or self._tainted else None
 
-    def left(self) -> dict[str, str]:
+    def skipped_scenes(self) -> dict[str, str]:
         """Why this worker takes no jobs of some scenes, by their ids: their files are not here."""
         for scene_id in [scene_id for scene_id, until in self._look_again.items() if time.monotonic() >= until]:
             del self.not_here[scene_id], self._look_again[scene_id]
         return {scene_id: str(error) for scene_id, error in self.not_here.items()}
 
-    def failed(self, name: str, error: Exception) -> Ending:
+    def judge_failure(self, name: str, error: Exception) -> Ending:
         """Decide the consequences of a failed job, for this worker, and return those for the job."""
         if self._is_committed(name):
             log.warning("job %s is committed, and nothing lost: %s", name, error)
@@ -184,7 +182,7 @@ class Outcomes:
             return "again"
         log.warning("job %s failed: %s", name, error, exc_info=None if isinstance(error, PhotonfarmError) else error)
         if is_full(error):
-            self.disk.refused()
+            self.disk.note_refusal()
             return "again"
         if isinstance(error, SceneNotHereError) and self._settings.scene_id is None:
             scene_id = name.rpartition("-")[0]
@@ -230,45 +228,3 @@ def _resident_bytes() -> int:
         import resource
 
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # bytes on macOS
-
-
-# ---------------------------------------------------------------------------------------------------------- at the end
-
-
-def missing_jobs(
-    store: Store, scene_ids: tuple[str, ...], *, followed: bool = False
-) -> tuple[dict[str, list[int]], dict[str, StoreError]]:
-    """The missing jobs of some scenes, or of all if none are named; and why scenes cannot be read. Both by scene id.
-
-    `followed` is as in `SceneStore.missing_jobs`. Raises StoreError if the store, or a scene that is named, cannot be
-    read.
-    """
-    if scene_ids:
-        return {scene_id: store.scene(scene_id).missing_jobs(followed=followed) for scene_id in scene_ids}, {}
-    return store.each(lambda scene: scene.missing_jobs(followed=followed))
-
-
-def is_complete(
-    missing: Mapping[str, list[int]],
-    unreadable: Mapping[str, StoreError],
-    failed: Mapping[str, str],
-    not_here: Mapping[str, SceneNotHereError],
-) -> bool:
-    """Whether a worker that is to stop when nothing is missing may stop; `failed` are reasons by the jobs' names.
-
-    Raises the error for which it should rather end, as nothing is left that it could do or wait for.
-    """
-    scene_of = {queue.job_name(scene_id, job): scene_id for scene_id, jobs in missing.items() for job in jobs}
-    not_failed = scene_of.keys() - failed.keys()
-    if not_failed and all(scene_of[name] in not_here for name in not_failed):
-        raise not_here[scene_of[min(not_failed)]]
-    if unreadable and not not_failed:  # and nothing else is left: the other scenes' jobs were taken before
-        raise unreadable[min(unreadable)]
-    if scene_of and not not_failed:
-        first = min(scene_of)
-        failures = "1 job has" if len(scene_of) == 1 else f"{len(scene_of)} jobs have"
-        raise IncompleteError(
-            f"{failures} failed; {first}: {failed[first]}. `photonfarm status` has the causes, and commands that "
-            "repeat them"
-        )
-    return not scene_of

@@ -45,7 +45,7 @@ class Registration:
             queue.serve(self._connection, store)
 
     @contextlib.contextmanager
-    def named(self, wanted: str) -> Iterator[str]:
+    def hold_name(self, wanted: str) -> Iterator[str]:
         """Hold a name that no other live worker has, until the block ends. Raises QueueError."""
         if self._connection is None:
             yield wanted
@@ -66,7 +66,7 @@ class Registration:
                 queue.beat(pipeline, name, queue.WorkerReport(), ttl_s=self._ttl_s)
                 pipeline.execute()
 
-    def ended(self, store: Store, name: str, lost: str | None, how: str) -> None:
+    def release_work(self, store: Store, name: str, lost: str | None, how: str) -> None:
         """Free at once what a child had in hand when it ended; the job that is `lost` was tried, and is kept as failed.
 
         A job of a child that was to stop, or that has ended and could not tell Redis, counts as no try.
@@ -148,8 +148,8 @@ class Supervisor:
             if store is not None:
                 known.serve(store)
             try:
-                with self._named(known):
-                    store = store or self._waited_for(known)
+                with self._hold_name(known):
+                    store = store or self._wait_for_store(known)
                     if store is not None:
                         known.serve(store)
                         self._supervise(store, known)
@@ -160,16 +160,16 @@ class Supervisor:
                     known.release(store)
 
     @contextlib.contextmanager
-    def _named(self, known: Registration) -> Iterator[None]:
+    def _hold_name(self, known: Registration) -> Iterator[None]:
         """Hold a name that no other live worker has, until the block ends; raises QueueError if Redis fails."""
         wanted = self._settings.name
-        with known.named(wanted) as name:
+        with known.hold_name(wanted) as name:
             if name != wanted:
                 self._report(f"worker {wanted}: another one of this name is alive, so this one goes by {name}")
             self._settings = self._settings.model_copy(update={"name": name})
             yield
 
-    def _waited_for(self, known: Registration) -> Store | None:
+    def _wait_for_store(self, known: Registration) -> Store | None:
         """Wait for the store; None if asked to stop before. The worker counts as alive meanwhile."""
         settings = self._settings
         self._report(f"worker {settings.name}: waiting for a store at {settings.store}")
@@ -189,7 +189,7 @@ class Supervisor:
             code, output = self._run_child()
             how = ending(code, output, self._settings.deadline_s)
             lost = output.job if output.in_hand and not self._stop.is_set() else None
-            known.ended(store, self._settings.name, lost, how)
+            known.release_work(store, self._settings.name, lost, how)
             if code == 0 or self._stop.is_set():
                 return
             _raise_final(code, output.last)

@@ -96,13 +96,13 @@ def frame_about(n: mi.Vector3f) -> mi.Frame3f:
     return mi.Frame3f(s, dr.cross(n, s), n)
 
 
-def on_area(n: mi.Vector3f, d: mi.Vector3f) -> mi.Point2f:
+def map_area_to_square(n: mi.Vector3f, d: mi.Vector3f) -> mi.Point2f:
     """The point of a square for light that leaves a surface of normal ``n`` along ``d``."""
     local = frame_about(n).to_local(d)
     return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(local.x, local.y))
 
 
-def on_disk(d: mi.Vector3f, offset: mi.Vector3f) -> mi.Point2f:
+def map_disk_to_square(d: mi.Vector3f, offset: mi.Vector3f) -> mi.Point2f:
     """The point of a square for light from infinity along ``d``, which passes ``offset``.
 
     The offset is from the centre of the scene's sphere, and its unit is the radius.
@@ -111,7 +111,7 @@ def on_disk(d: mi.Vector3f, offset: mi.Vector3f) -> mi.Point2f:
     return mi.warp.uniform_disk_to_square_concentric(mi.Point2f(local.x, local.y))
 
 
-def in_cone(axis: mi.Vector3f, cos_cutoff: mi.Float, d: mi.Vector3f) -> mi.Point2f:
+def map_cone_to_square(axis: mi.Vector3f, cos_cutoff: mi.Float, d: mi.Vector3f) -> mi.Point2f:
     """The point of a square for light along ``d`` in a cone about ``axis``."""
     local = mi.Frame3f(axis).to_local(d)
     turn = dr.atan2(local.y, local.x) * dr.inv_two_pi
@@ -132,7 +132,7 @@ def corner_of(cell: mi.UInt32) -> mi.Point2f:
     return mi.Point2f(mi.Float(every_other_bit(cell)), mi.Float(every_other_bit(cell >> 1)))
 
 
-def within_cell(place: mi.Float64, below: mi.Point2f) -> mi.Point2f:
+def decode_morton(place: mi.Float64, below: mi.Point2f) -> mi.Point2f:
     """The points in [0, 1)² at places in [0, 1) along Morton's curve, with 16 bits for each coordinate.
 
     ``below`` in [0, 1)² are the bits below them.

@@ -16,7 +16,7 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.bdpt.guiding.grid import cell_of, corner_of, within_cell
+from photonfarm.renderer.bdpt.guiding.grid import cell_of, corner_of, decode_morton
 from photonfarm.renderer.bdpt.randomness import Sampler
 
 F64 = NDArray[np.float64]
@@ -44,14 +44,14 @@ class Layout:
         return cls(lights, directions, positions)
 
     @property
-    def of_a_light(self) -> int:
+    def cells_per_light(self) -> int:
         """The number of cells of one light, K²·P²."""
         return (self.directions * self.positions) ** 2
 
     @property
     def cells(self) -> int:
         """The number of all cells, T."""
-        return self.lights * self.of_a_light
+        return self.lights * self.cells_per_light
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -100,14 +100,14 @@ class GuidedStarts:
             raise ValueError(
                 f"bdpt: the guide was learned with {layout.lights} lights, the scene has {len(ids)}; learn another one"
             )
-        rectangle = mi.UInt32([int(found) for found in rectangles])
-        light = dr.arange(mi.UInt32, layout.cells) // layout.of_a_light
+        rectangle = mi.UInt32([int(is_rectangle) for is_rectangle in rectangles])
+        light = dr.arange(mi.UInt32, layout.cells) // layout.cells_per_light
         places = layout.positions**2
         gain = guide.gain
         if places > 1:
             mean = dr.repeat(dr.block_sum(gain, places), places) / places
             gain = dr.select(dr.gather(mi.UInt32, rectangle, light) > 0, gain, mean)
-        table = mi.Float64(gain) * mi.Float64(dr.gather(mi.Float, probability, light) / layout.of_a_light)
+        table = mi.Float64(gain) * mi.Float64(dr.gather(mi.Float, probability, light) / layout.cells_per_light)
         cdf = dr.cumsum(table)
         total = dr.gather(mi.Float64, cdf, mi.UInt32(layout.cells - 1))
         gain = dr.select(total > 0, mi.Float(mi.Float64(gain) / total), 0)
@@ -139,7 +139,7 @@ class GuidedStarts:
         cell = mi.UInt32(dr.binary_search(0, last, lambda i: dr.gather(mi.Float64, self.cdf, i) <= target))
         start = dr.gather(mi.Float64, self.cdf, dr.maximum(cell, 1) - 1, cell > 0)
         rest = (target - start) / (dr.gather(mi.Float64, self.cdf, cell) - start)
-        inside = within_cell(dr.clip(rest, 0, 1 - 2.0**-33), below)
+        inside = decode_morton(dr.clip(rest, 0, 1 - 2.0**-33), below)
         square = cell // layout.positions**2
         light = square // layout.directions**2
         direction = (corner_of(square - light * layout.directions**2) + inside) / layout.directions

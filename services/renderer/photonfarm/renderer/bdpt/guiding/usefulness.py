@@ -63,16 +63,16 @@ def cell_of(grid: Grid, si: mi.SurfaceInteraction3f) -> mi.UInt32:
     return grid.cell(si.p) * NORMALS + 2 * axis + dr.select(along < 0, mi.UInt32(1), mi.UInt32(0))
 
 
-def usefulness(sums: F64, connections: F64) -> F64:
+def estimate_usefulness(sums: F64, connections: F64) -> F64:
     """The table [U] from sums of weighted squares over the ``connections`` [U] to vertices of each cell. Pure numpy.
 
     It is estimated coarse to fine, as few connections go to most cells. All are 1 where no connection added anything.
     """
-    found = np.sqrt(_means(*(a.reshape(SIDE, SIDE, SIDE, NORMALS) for a in (sums, connections)))).ravel()
-    mean = (found * connections).sum() / max(connections.sum(), 1.0)
+    root_means = np.sqrt(_means(*(a.reshape(SIDE, SIDE, SIDE, NORMALS) for a in (sums, connections)))).ravel()
+    mean = (root_means * connections).sum() / max(connections.sum(), 1.0)
     if not (np.isfinite(mean) and mean > 0):
         return np.ones(CELLS)
-    return np.asarray(np.maximum(found / mean, LEAST))
+    return np.asarray(np.maximum(root_means / mean, LEAST))
 
 
 def _means(sums: F64, counts: F64) -> F64:

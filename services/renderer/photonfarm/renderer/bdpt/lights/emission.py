@@ -34,7 +34,7 @@ from photonfarm.renderer.bdpt.lights.selection import (
     read_selection,
     sampling_weight,
 )
-from photonfarm.renderer.bdpt.lights.shapes import Spheres, column, cones, is_unmirrored
+from photonfarm.renderer.bdpt.lights.shapes import Spheres, column, cones, is_textured, is_unmirrored, registry_id
 from photonfarm.renderer.bdpt.randomness import RandomNumbers, Sampler, along_curve
 from photonfarm.renderer.bdpt.scenes import bounding_box, bounding_sphere
 
@@ -109,13 +109,13 @@ class Lights:
         before = dr.gather(mi.Float, self.emit_cdf, dr.maximum(lane, 1) - 1, lane > 0)
         return (self.emit_cdf - before) / dr.gather(mi.Float, self.emit_cdf, mi.UInt32(self.count - 1))
 
-    def guided_by(self, guide: StartGuide, scene: mi.Scene) -> Lights:
+    def guide_with(self, guide: StartGuide, scene: mi.Scene) -> Lights:
         """The same lights of ``scene``, with light paths that start as ``guide`` says.
 
         Raises ValueError for a guide of another number of lights.
         """
         emitters = list(scene.emitters())
-        ids = [_registry_id(emitter) for emitter in emitters]
+        ids = [registry_id(emitter) for emitter in emitters]
         return replace(self, guided=GuidedStarts.bind(guide, self.emit_probability, ids, rectangles(emitters)))
 
     def gain(
@@ -130,13 +130,13 @@ class Lights:
         light, d = self.guided.number_of(emitter), -ds.d
         u = mi.Point2f(0)
         if self.has(AREA):
-            u = grid.on_area(n, d)
+            u = grid.map_area_to_square(n, d)
         if self.has(INFINITE) or self.has(DIRECTION):
             at_infinity = self.is_kind(light, INFINITE) | self.is_kind(light, DIRECTION)
-            u = dr.select(at_infinity, grid.on_disk(d, (x - self.centre) / self.radius), u)
+            u = dr.select(at_infinity, grid.map_disk_to_square(d, (x - self.centre) / self.radius), u)
         if self.has(POSITION):
             axis, cutoff = dr.gather(mi.Vector3f, self.axis, light), dr.gather(mi.Float, self.cos_cutoff, light)
-            u = dr.select(self.is_kind(light, POSITION), grid.in_cone(axis, cutoff, d), u)
+            u = dr.select(self.is_kind(light, POSITION), grid.map_cone_to_square(axis, cutoff, d), u)
         return self.guided.gain_at(light, u, ds.uv, active & (dr.reinterpret_array(mi.UInt32, emitter) != 0))
 
 
@@ -147,8 +147,8 @@ def read_lights(scene: mi.Scene) -> Lights:
     """The scene's lights as they are now, by some small arrays and one small kernel, without host synchronisation."""
     emitters = list(scene.emitters())
     n = len(emitters)
-    ids = [_registry_id(emitter) for emitter in emitters]
-    shapes = {_registry_id(shape.emitter()): shape for shape in scene.shapes() if shape.is_emitter()}
+    ids = [registry_id(emitter) for emitter in emitters]
+    shapes = {registry_id(shape.emitter()): shape for shape in scene.shapes() if shape.is_emitter()}
     kinds = tuple(_kind(emitter, shapes.get(key)) for emitter, key in zip(emitters, ids, strict=True))
     parameters = [mi.traverse(emitter) for emitter in emitters]
     pointers = scene.emitters_dr()
@@ -158,8 +158,8 @@ def read_lights(scene: mi.Scene) -> Lights:
     weights = [sampling_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
-            found = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if _is_textured(emitters[i]) else True)
-            weights[i] = dr.select(found, weights[i], 0)
+            has_densities = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if is_textured(emitters[i]) else True)
+            weights[i] = dr.select(has_densities, weights[i], 0)
         elif kinds[i] == AREA and shapes[key].class_name() == "Cylinder":
             weights[i] = dr.select(is_unmirrored(shapes[key]), weights[i], 0)
     weight = column(n, weights)
@@ -181,14 +181,20 @@ def read_lights(scene: mi.Scene) -> Lights:
     dr.scatter(emission_by_id, emission, index)
     dr.eval(alive, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
     return Lights(
-        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius,
+        pointers,
+        n,
+        kinds,
+        kind,
+        selection,
+        alive,
+        emit_cdf,
+        emission_by_id,
+        axis,
+        cos_cutoff,
+        centre,
+        radius,
         Spheres.of([shapes.get(key) for key in ids]),
-    )  # fmt: skip
-
-
-def _registry_id(emitter: mi.Emitter) -> int:
-    """Dr.Jit's registry id of an emitter; it is a literal, so reading it waits for nothing."""
-    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
+    )
 
 
 def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
@@ -198,7 +204,7 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
         return kind
     if shape is None:
         return HIT_ONLY  # on an instanced shape: it can be hit, but has no place of its own to be sampled from
-    if _is_textured(emitter) and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
+    if is_textured(emitter) and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
         return HIT_ONLY  # Mitsuba's sampling of such a light does not know the surface's texture coordinates
     return AREA
 
@@ -208,10 +214,6 @@ def _normalise(weight: mi.Float, n: int) -> tuple[mi.Float, mi.Float]:
     cdf = dr.cumsum(weight) if n > 1 else weight
     total = dr.gather(mi.Float, cdf, mi.UInt32(n - 1))
     return cdf, dr.select(total > 0, weight / total, 0)
-
-
-def _is_textured(emitter: mi.Emitter) -> bool:
-    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
 
 
 # ------------------------------------- Next event estimation (y₀ from x) -------------------------------------
@@ -271,9 +273,14 @@ def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumber
 
 
 def hit_densities(
-    scene: mi.Scene, lights: Lights, emitter: mi.EmitterPtr, si: mi.SurfaceInteraction3f,
-    origin: mi.Point3f, vertex: mi.Point3f, active: mi.Bool,
-) -> tuple[mi.Float, mi.Float]:  # fmt: skip
+    scene: mi.Scene,
+    lights: Lights,
+    emitter: mi.EmitterPtr,
+    si: mi.SurfaceInteraction3f,
+    origin: mi.Point3f,
+    vertex: mi.Point3f,
+    active: mi.Bool,
+) -> tuple[mi.Float, mi.Float]:
     """(p_NEE in solid angle, e) of the light hit at ``si`` by a ray from ``origin``, which was spawned at ``vertex``.
 
     Next event estimation would have chosen the light at the vertex itself: the ray's origin may lie in another cell.

@@ -168,6 +168,6 @@ def is_unfolded(mesh: mi.Mesh) -> mi.Bool:
     uv = mi.Point2f(0)
     for weight, vertex in zip(share, vertices, strict=True):
         uv += weight * dr.gather(mi.Point2f, mesh.vertex_texcoords_buffer(), vertex)
-    found = mesh.eval_parameterization(uv)
-    itself = found.is_valid() & (found.prim_index == lane // len(_PROBES)) & dr.all((uv >= 0) & (uv <= 1))
+    hit = mesh.eval_parameterization(uv)
+    itself = hit.is_valid() & (hit.prim_index == lane // len(_PROBES)) & dr.all((uv >= 0) & (uv <= 1))
     return dr.max(dr.select(itself, 0, 1)) < 1

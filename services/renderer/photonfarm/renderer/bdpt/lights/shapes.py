@@ -1,6 +1,6 @@
 """What the starts of light paths need to know of the lights' shapes.
 
-These are the cones of spot lights, the normals of spheres, and which cylinders are mirrored.
+These are the cones of spot lights, the normals of spheres, which cylinders are mirrored, and which lights are textured.
 
 All of it is data in device memory, so that edits in place change no kernel. Index letter: N lights.
 """
@@ -37,6 +37,16 @@ def cones(parameters: Sequence[mi.SceneParameters], emitters: Sequence[mi.Emitte
     return mi.Vector3f(*(column(n, [axis[k] for axis in axes]) for k in range(3))), column(n, cosines)
 
 
+def registry_id(emitter: mi.Emitter) -> int:
+    """Dr.Jit's registry id of an emitter; it is a literal, so reading it waits for nothing."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0])
+
+
+def is_textured(emitter: mi.Emitter) -> bool:
+    """Whether a light's radiance is a texture."""
+    return bool(mi.has_flag(emitter.flags(), mi.EmitterFlags.SpatiallyVarying))
+
+
 def is_unmirrored(cylinder: mi.Shape) -> mi.Bool:
     """Whether a cylinder light's ``to_world`` keeps its orientation, as data [1].
 
@@ -66,7 +76,7 @@ class Spheres:
             return None
         centres, sides = [], []
         for shape in shapes:
-            centre, side = _measured(shape) if _is_sphere(shape) else (mi.Point3f(0), mi.Float(0))
+            centre, side = _measure_sphere(shape) if _is_sphere(shape) else (mi.Point3f(0), mi.Float(0))
             centres.append(centre)
             sides.append(side)
         n = len(shapes)
@@ -85,7 +95,7 @@ def _is_sphere(shape: Any) -> bool:
     return shape is not None and shape.class_name() == "Sphere"
 
 
-def _measured(sphere: mi.Shape) -> tuple[mi.Point3f, mi.Float]:
+def _measure_sphere(sphere: mi.Shape) -> tuple[mi.Point3f, mi.Float]:
     """(centre, side) of a sphere, [1] each."""
     to_world = mi.traverse(sphere)["to_world"]
     centre, outside = to_world @ mi.Point3f(0), dr.zeros(mi.Interaction3f)

@@ -16,10 +16,16 @@ import numpy as np
 from photonfarm.core.keys import Key, Stream
 from photonfarm.core.records import F32
 from photonfarm.renderer.bdpt.lights.emission import Lights, hit_densities, read_lights, sample_direct
-from photonfarm.renderer.bdpt.recording import traced_once
+from photonfarm.renderer.bdpt.recording import loop_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, reflects_here
-from photonfarm.renderer.scene.guides.pattern import SUB_PIXELS, GuideSettings, PatternSampler, pattern_of, shifted
+from photonfarm.renderer.scene.guides.pattern import (
+    SUB_PIXELS,
+    GuideSettings,
+    PatternSampler,
+    pattern_of,
+    shift_pattern,
+)
 from photonfarm.renderer.scene.materials import has_other_lobes
 from photonfarm.scene.spec import GuideSpec
 
@@ -42,8 +48,8 @@ def point_light(
     at, facing = (np.repeat(each, SUB_PIXELS, axis=0) for each in (position, normal))
     arguments = lights, points(at), points(facing), [floats(column) for column in u.reshape(-1, 3).T]
     traced = functools.partial(recorder, (len(at), lights.kinds)) if recorder else irradiance
-    found = traced(scene, None, *arguments)
-    mean: F32 = rows(found, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
+    irradiances = traced(scene, None, *arguments)
+    mean: F32 = rows(irradiances, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
     return mean
 
 
@@ -58,9 +64,9 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
     shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
     lit = light.valid & (cosine > 0)
     lit &= ~scene.ray_test(shadow, lit)
-    found = dr.select(lit, light.radiance_over_density * cosine, 0)
-    dr.eval(found)
-    return found
+    arriving = dr.select(lit, light.radiance_over_density * cosine, 0)
+    dr.eval(arriving)
+    return arriving
 
 
 # -------------------------------------------------------------------------------------------------------- on surfaces
@@ -109,7 +115,7 @@ class _Surface:
     settings: GuideSettings
 
 
-def lit(
+def direct_light(
     scene: Any, lights: Lights | None, si: Any, seen: RayArrival, pattern: Any, shift: Any, settings: GuideSettings
 ) -> ReflectedLight:
     """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
@@ -120,17 +126,21 @@ def lit(
     reached = seen.met & (seen.followed + 2 <= settings.max_depth)
     diffuse = reached & reflects_here(si) & mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
     other = reached & has_other_lobes(flags) & settings.glossy
-    at = _Surface(scene, lights, si, turned(si.sh_frame.n, seen.direction), seen.direction, diffuse, other, settings)
-    return _by_lights(at, pattern, shift) + (_by_bsdf(at, pattern, shift) if settings.glossy else nothing)
+    at = _Surface(
+        scene, lights, si, turn_towards(si.sh_frame.n, seen.direction), seen.direction, diffuse, other, settings
+    )
+    return _sample_lights(at, pattern, shift) + (_sample_bsdf(at, pattern, shift) if settings.glossy else nothing)
 
 
-def _by_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
+def _sample_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     """The mean over shadow rays to points of lights; other lobes get the share of the balance heuristic."""
     count = at.settings.light_samples
     context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
 
     def body(s: _Sum) -> tuple[_Sum]:
-        light = sample_direct(at.lights, si, PatternSampler(shifted(pattern, shift, s.index)), at.diffuse | at.other)
+        light = sample_direct(
+            at.lights, si, PatternSampler(shift_pattern(pattern, shift, s.index)), at.diffuse | at.other
+        )
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
         lit = light.valid & ~at.scene.ray_test(shadow, light.valid)
         cosine = dr.dot(at.normal, light.d)
@@ -145,28 +155,26 @@ def _by_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
 
     width = dr.width(at.diffuse)
     start = _Sum(dr.zeros(mi.UInt32, width), dr.zeros(mi.Color3f, width), dr.zeros(mi.Color3f, width))
-    (sums,) = traced_once(
-        state=(start,), cond=lambda s: s.index < count, body=body, labels=("sum",), label="shadow rays"
-    )
+    (sums,) = loop_once(state=(start,), cond=lambda s: s.index < count, body=body, labels=("sum",), label="shadow rays")
     diffuse = sums.diffuse / count
     of_diffuse = dr.select(at.other, 0, diffuse_reflectance(si, at.diffuse) * diffuse)
     return ReflectedLight(diffuse, sums.whole / count + of_diffuse)
 
 
-def _by_bsdf(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
+def _sample_bsdf(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
     """The light of one ray along a sample of the BSDF, with the share that shadow rays leave."""
-    u = shifted(pattern, shift, mi.UInt32(at.settings.light_samples))
+    u = shift_pattern(pattern, shift, mi.UInt32(at.settings.light_samples))
     bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
     ray = at.si.spawn_ray(at.si.to_world(bs.wo))
-    found = at.scene.ray_intersect(ray, active=at.other)
-    emitter = found.emitter(at.scene, at.other)
-    by_light, _ = hit_densities(at.scene, at.lights, emitter, found, ray.o, at.si.p, at.other)
+    hit = at.scene.ray_intersect(ray, active=at.other)
+    emitter = hit.emitter(at.scene, at.other)
+    by_light, _ = hit_densities(at.scene, at.lights, emitter, hit, ray.o, at.si.p, at.other)
     is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
     share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
-    emitted = emitter.eval(found, at.other)
+    emitted = emitter.eval(hit, at.other)
     return ReflectedLight(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
 
 
-def turned(normal: Any, direction: Any) -> Any:
+def turn_towards(normal: Any, direction: Any) -> Any:
     """The normal on the side that a ray along `direction` comes from."""
     return dr.select(dr.dot(normal, direction) > 0, -normal, normal)

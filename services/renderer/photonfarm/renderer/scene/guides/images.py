@@ -30,9 +30,15 @@ PURPOSE = "direct"
 
 
 def view_guides(
-    scene: Any, view: View, spec: SceneSpec, wanted: GuideSpec, key: Key, materials: Materials, arrives: F32,
+    scene: Any,
+    view: View,
+    spec: SceneSpec,
+    wanted: GuideSpec,
+    key: Key,
+    materials: Materials,
+    arrives: F32,
     recorder: Recorder | None = None,
-) -> Guides:  # fmt: skip
+) -> Guides:
     """The guides of a view in the scene's present configuration; `key` is the view's.
 
     `arrives` is the result of `point_light`. With a `recorder` of `trace` Python runs only once for all views.
@@ -43,9 +49,9 @@ def view_guides(
     shifts = Stream(key, PURPOSE).uniform(pixels, 3).astype(np.float32)
     at_once = max(1, RAYS // SUB_PIXELS)  # pixels
     blocks = [slice(start, start + at_once) for start in range(0, pixels, at_once)]
-    parts = [_traced(scene, camera, spec, (directions[block], shifts[block]), materials, recorder) for block in blocks]
-    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _guides(found, camera, arrives)
+    parts = [_trace(scene, camera, spec, (directions[block], shifts[block]), materials, recorder) for block in blocks]
+    sums = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return _guides(sums, camera, arrives)
 
 
 def _grid(camera: Camera) -> F32:
@@ -55,7 +61,7 @@ def _grid(camera: Camera) -> F32:
     return np.stack(within, axis=1)
 
 
-def _traced(
+def _trace(
     scene: Any, camera: Camera, spec: SceneSpec, given: tuple[F32, F32], materials: Materials, recorder: Recorder | None
 ) -> dict[str, NDArray[np.float64]]:
     """Sums over the grids of some pixels, (pixels, channels), by name; see `trace`."""
@@ -80,8 +86,8 @@ def _traced(
 
 
 def _rows(column: Any) -> NDArray[np.float64]:
-    found = np.array(column, np.float64)
-    return found.T if found.ndim > 1 else found
+    values = np.array(column, np.float64)
+    return values.T if values.ndim > 1 else values
 
 
 def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) -> Guides:
@@ -91,7 +97,7 @@ def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) 
         shaped = values.reshape(camera.height, camera.width, -1).astype(np.float32)
         return shaped[..., 0] if shaped.shape[-1] == 1 else shaped
 
-    def of_those(name: str, count: str) -> F32:
+    def divide(name: str, count: str) -> F32:
         return image(sums[name] / np.maximum(sums[count], 1))
 
     mean = {name: values / SUB_PIXELS for name, values in sums.items()}
@@ -101,11 +107,11 @@ def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) 
         gloss=image(mean["gloss"]),
         specular=image(np.maximum(mean["specular"], 0)),
         roughness=image(mean["roughness"]),
-        mean_depth=of_those("depth", "hits"),
+        mean_depth=divide("depth", "hits"),
         mean_normal=image(mean["normal"]),
         throughput=image(mean["throughput"]),
-        beyond_albedo=of_those("beyond_albedo", "beyond"),
-        beyond_normal=of_those("beyond_normal", "beyond"),
-        beyond_depth=of_those("beyond_depth", "beyond"),
+        beyond_albedo=divide("beyond_albedo", "beyond"),
+        beyond_normal=divide("beyond_normal", "beyond"),
+        beyond_depth=divide("beyond_depth", "beyond"),
         point_light=arrives,
     )

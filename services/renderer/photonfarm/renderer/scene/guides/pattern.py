@@ -46,7 +46,7 @@ def pattern_of(light_samples: int) -> F32:
     return (number * np.array(STEPS) % 1).astype(np.float32)
 
 
-def shifted(pattern: Any, shift: Any, sample: Any) -> list[Any]:
+def shift_pattern(pattern: Any, shift: Any, sample: Any) -> list[Any]:
     """The three random numbers of sample number `sample`, for each ray."""
     within = dr.arange(mi.UInt32, dr.width(shift)) % SUB_PIXELS
     place = sample * SUB_PIXELS + within

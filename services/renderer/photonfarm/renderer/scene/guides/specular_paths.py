@@ -14,17 +14,25 @@ import drjit as dr
 import mitsuba as mi
 
 from photonfarm.renderer.bdpt.lights.emission import Lights
-from photonfarm.renderer.bdpt.recording import traced_once
+from photonfarm.renderer.bdpt.recording import loop_once
 from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, seen_reflectance
-from photonfarm.renderer.scene.guides.direct import RayArrival, lit, turned
+from photonfarm.renderer.scene.guides.direct import RayArrival, direct_light, turn_towards
 from photonfarm.renderer.scene.guides.pattern import STEPS, SUB_PIXELS, GuideSettings
 from photonfarm.renderer.scene.materials import is_pure_delta
 
 
 def trace(
-    scene: Any, _: Any, lights: Lights | None, tables: Any, o: Any, d: Any, reach: Any, along: Any, shift: Any,
+    scene: Any,
+    _: Any,
+    lights: Lights | None,
+    tables: Any,
+    o: Any,
+    d: Any,
+    reach: Any,
+    along: Any,
+    shift: Any,
     settings: GuideSettings,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """The quantities that `images` averages, by name, for each ray; zeros where there is nothing.
 
     `tables` are the roughness of BSDFs, their `diffuse_kept`, and three columns of points; rays begin on the near
@@ -35,14 +43,14 @@ def trace(
     first = scene.ray_intersect(ray)
     hit, bsdf, before = first.is_valid(), first.bsdf(), settings.near / along
     number = dr.reinterpret_array(mi.UInt32, bsdf)
-    path, last = _followed(scene, ray, first, before, settings)
+    path, last = _follow_to_end(scene, ray, first, before, settings)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
     albedo = seen_reflectance(last, met)
-    arrives = lit(scene, lights, last, RayArrival(met, path.ray.d, path.followed), pattern, shift, settings)
-    found = {
+    arrives = direct_light(scene, lights, last, RayArrival(met, path.ray.d, path.followed), pattern, shift, settings)
+    columns = {
         "hits": dr.select(hit, mi.Float(1), 0),
         "depth": dr.select(hit, settings.near + first.t * along, 0),
-        "normal": dr.select(hit, turned(first.sh_frame.n, d), 0),
+        "normal": dr.select(hit, turn_towards(first.sh_frame.n, d), 0),
         "specular": specular_of(bsdf, first, hit, dr.gather(mi.Float, diffuse_kept, number, hit)),
         "roughness": dr.gather(mi.Float, roughness, number, hit),
         "emission": path.emission,
@@ -51,11 +59,11 @@ def trace(
         "throughput": dr.select(is_beyond, path.throughput, 0),
         "beyond": dr.select(is_beyond & met, mi.Float(1), 0),
         "beyond_albedo": dr.select(is_beyond & met, albedo, 0),
-        "beyond_normal": dr.select(is_beyond & met, turned(last.sh_frame.n, path.ray.d), 0),
+        "beyond_normal": dr.select(is_beyond & met, turn_towards(last.sh_frame.n, path.ray.d), 0),
         "beyond_depth": dr.select(is_beyond & met, path.length + last.t, 0),
     }
-    dr.eval(found)
-    return found
+    dr.eval(columns)
+    return columns
 
 
 @dataclass(slots=True)
@@ -70,7 +78,7 @@ class _Path:
     followed: Any  # UInt32: surfaces passed on the way
 
 
-def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: GuideSettings) -> tuple[_Path, Any]:
+def _follow_to_end(scene: Any, ray: Any, first: Any, before: Any, settings: GuideSettings) -> tuple[_Path, Any]:
     """Follow each ray from `first`, which it meets, to the first surface that is no pure mirror, glass or null.
 
     Returns the path, and that surface.
@@ -80,7 +88,7 @@ def _followed(scene: Any, ray: Any, first: Any, before: Any, settings: GuideSett
     start = _follow(scene, start, first, settings)
     if not settings.followed:
         return start, first
-    (path,) = traced_once(
+    (path,) = loop_once(
         state=(start,),
         cond=lambda s: s.active,
         body=lambda s: (_follow(scene, s, scene.ray_intersect(s.ray, active=s.active), settings),),

@@ -7,10 +7,6 @@ from typing import Any
 
 def describe(name: str) -> dict[str, Any]:
     """The shapes of a built-in room by id, for `mi.load_dict`; Mitsuba must be loaded."""
-    if name == "cornell":
-        from photonfarm.renderer.scene.rooms import cornell
-
-        return cornell.describe()
     from photonfarm.renderer.scene.rooms import room
 
-    return room.describe()
+    return room.describe_cornell() if name == "cornell" else room.describe_room()

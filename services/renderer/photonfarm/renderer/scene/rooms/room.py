@@ -1,4 +1,8 @@
-"""The room `room`: a furnished room, 5.2 × 2.6 × 4.2 m, closed, with nine movable pieces and two ceiling lights.
+"""The two built-in rooms.
+
+`cornell` is a static box, 2 × 2 × 2 m, with a tall and a short block (after Goral et al., SIGGRAPH 1984). The open side
+is at z = 1; the light hangs 5 mm below the ceiling. `room` is a furnished room, 5.2 × 2.6 × 4.2 m, closed, with nine
+movable pieces and two ceiling lights.
 
 x runs right, y up, z towards the front; the origin is in the middle of the floor. Floor and ceiling reach 5 cm beyond
 the walls, so that groups parked at the corner of the bounding box are outside.
@@ -11,14 +15,17 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
 from photonfarm.renderer.scene.rooms import furniture, materials
 from photonfarm.renderer.scene.rooms.materials import diffuse, glossy, metal, textured
-from photonfarm.renderer.scene.rooms.solids import Point, box, joined, mesh, quad, rectangle_light
+from photonfarm.renderer.scene.rooms.solids import Point, box, join, mesh, quad, rectangle_light, standing_box
 
 X, Y, Z = 2.6, 2.6, 2.1  # half width, height, half depth
+WHITE, RED, GREEN = (0.73, 0.71, 0.68), (0.60, 0.06, 0.05), (0.12, 0.43, 0.10)
+
 OVERHANG = 0.05
+
+UNIT_UV = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
 
 PLACES: dict[str, tuple[Point, float]] = {
     "table": ((-0.9, 0, 0.45), 0.0),
@@ -40,7 +47,7 @@ LIGHT_RADIANCE, LIGHT_SIZE = (10.8, 9.8, 8.2), (1.6, 0.8)  # large and dim: smal
 LIGHT_PLACES = ((-1.2, Y - 0.01, 0.0), (1.2, Y - 0.02, 0.0))  # a centimetre apart, so that they never coincide
 
 
-def describe() -> dict[str, Any]:
+def describe_room() -> dict[str, Any]:
     """The shapes by id, for `mi.load_dict`."""
     shapes = {**_walls(), **_decoration(), **_furniture()}
     for i, place in enumerate(LIGHT_PLACES, start=1):
@@ -60,16 +67,16 @@ def _walls() -> dict[str, Any]:
     walls = {name: mesh(name, solid, diffuse(colour)) for name, (solid, colour) in surfaces.items()}
     floor = quad((-x, 0, z), (2 * x, 0, 0), (0, 0, -2 * z))
     boards = textured(materials.planks((0.50, 0.33, 0.19)), (2, 1))
-    return {"floor": mesh("floor", floor, boards, uv=_unit_uv()), **walls}
+    return {"floor": mesh("floor", floor, boards, uv=UNIT_UV), **walls}
 
 
 def _decoration() -> dict[str, Any]:
     t, h = 0.015, 0.09  # skirting board
-    skirting = joined(
+    skirting = join(
         *(box((2 * X, h, t), (0, h / 2, side * (Z - t / 2))) for side in (-1, 1)),
         *(box((t, h, 2 * Z - 2 * t), (side * (X - t / 2), h / 2, 0)) for side in (-1, 1)),
     )
-    door = joined(
+    door = join(
         box((0.02, 2.05, 0.95), (-X + 0.01, 1.025, 1.2)),
         *(box((0.01, 0.8, 0.62), (-X + 0.025, y, 1.2)) for y in (0.58, 1.50)),
     )
@@ -80,8 +87,8 @@ def _decoration() -> dict[str, Any]:
         "skirting": mesh("skirting", skirting, diffuse((0.75, 0.74, 0.71))),
         "door": mesh("door", door, glossy((0.62, 0.58, 0.50), 0.25)),
         "painting-frame": mesh("painting-frame", frame, diffuse(WALNUT)),
-        "painting": mesh("painting", canvas, textured(materials.painting()), uv=_unit_uv()),
-        "rug": mesh("rug", rug, textured(materials.rug((0.50, 0.12, 0.10), (0.72, 0.60, 0.40)), (1, 1)), uv=_unit_uv()),
+        "painting": mesh("painting", canvas, textured(materials.painting()), uv=UNIT_UV),
+        "rug": mesh("rug", rug, textured(materials.rug((0.50, 0.12, 0.10), (0.72, 0.60, 0.40)), (1, 1)), uv=UNIT_UV),
     }
 
 
@@ -91,12 +98,19 @@ def _furniture() -> dict[str, Any]:
         for part, solid in parts.items():
             shape_id = f"{piece}-{part}"
             shapes[shape_id] = mesh(
-                shape_id, _placed(solid, piece), looks[part],
-                smooth=part in SMOOTH, radiance=LAMP_RADIANCE if part == "shade" else None,
-            )  # fmt: skip
+                shape_id,
+                _place(solid, piece),
+                looks[part],
+                smooth=part in SMOOTH,
+                radiance=LAMP_RADIANCE if part == "shade" else None,
+            )
     x, _, z = PLACES["pedestal"][0]
-    shapes["pedestal-ball"] = {"type": "sphere", "center": mi.ScalarPoint3f(x, 0.72 + 0.17, z), "radius": 0.17,
-                               "bsdf": materials.glass()}  # fmt: skip
+    shapes["pedestal-ball"] = {
+        "type": "sphere",
+        "center": mi.ScalarPoint3f(x, 0.72 + 0.17, z),
+        "radius": 0.17,
+        "bsdf": materials.glass(),
+    }
     return shapes
 
 
@@ -122,12 +136,31 @@ def _pieces() -> dict[str, tuple[furniture.Parts, dict[str, dict[str, Any]]]]:
 SMOOTH = ("bowl", "cushion", "fabric", "pillows", "copper")
 
 
-def _placed(solid: Any, piece: str) -> Any:
+def _place(solid: Any, piece: str) -> Any:
     place, angle = PLACES[piece]
     solid.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 1, 0)))
     solid.apply_translation(place)
     return solid
 
 
-def _unit_uv() -> NDArray[np.float32]:
-    return np.array([[0, 0], [1, 0], [1, 1], [0, 1]], np.float32)
+def describe_cornell() -> dict[str, Any]:
+    """The shapes by id, for `mi.load_dict`."""
+    walls = {
+        "floor": (quad((-1, 0, 1), (2, 0, 0), (0, 0, -2)), WHITE),
+        "ceiling": (quad((-1, 2, -1), (2, 0, 0), (0, 0, 2)), WHITE),
+        "back-wall": (quad((-1, 0, -1), (2, 0, 0), (0, 2, 0)), WHITE),
+        "left-wall": (quad((-1, 0, 1), (0, 0, -2), (0, 2, 0)), RED),
+        "right-wall": (quad((1, 0, -1), (0, 0, 2), (0, 2, 0)), GREEN),
+        "tall-block": (_block((0.6, 1.2, 0.6), (-0.34, 0, -0.30), 0.30), WHITE),
+        "short-block": (_block((0.6, 0.6, 0.6), (0.34, 0, 0.36), -0.29), WHITE),
+    }
+    shapes = {name: mesh(name, solid, diffuse(colour)) for name, (solid, colour) in walls.items()}
+    light = rectangle_light((0, 1.995, 0), (0.5, 0.5), (0, 1, 0), (17.0, 12.0, 5.5))
+    return {**shapes, "ceiling-light": light}
+
+
+def _block(size: tuple[float, float, float], foot: tuple[float, float, float], angle: float) -> Any:
+    block = standing_box(size, (0, 0, 0))
+    block.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 1, 0)))
+    block.apply_translation(foot)
+    return block

@@ -111,7 +111,7 @@ def rounded_box(size: Point, centre: Point, radius: float) -> Any:
     return trimesh.Trimesh(np.sign(direction) * inner + radius * direction + centre, triangles, process=False)
 
 
-def turned(profile: list[tuple[float, float]], sections: int = 32) -> Any:
+def lathe(profile: list[tuple[float, float]], sections: int = 32) -> Any:
     """A solid of revolution about y from its profile, (radius, height) from the bottom of the axis to the top of it."""
     mesh = trimesh.creation.revolve(np.array(profile), sections=sections)
     mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
@@ -120,7 +120,7 @@ def turned(profile: list[tuple[float, float]], sections: int = 32) -> Any:
 
 def rod(radius: float, foot: Point, height: float, sections: int = 16) -> Any:
     """A vertical cylinder that stands at `foot`."""
-    rod = turned([(0, 0), (radius, 0), (radius, height), (0, height)], sections)
+    rod = lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sections)
     rod.apply_translation(foot)
     return rod
 
@@ -131,7 +131,7 @@ def quad(corner: Point, u: Point, v: Point) -> Any:
     return trimesh.Trimesh([a, a + b, a + b + c, a + c], [[0, 1, 2], [0, 2, 3]], process=False)
 
 
-def joined(*meshes: Any) -> Any:
+def join(*meshes: Any) -> Any:
     """One mesh made of several."""
     return trimesh.util.concatenate(list(meshes))
 

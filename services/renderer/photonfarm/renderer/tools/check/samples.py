@@ -1,0 +1,181 @@
+"""Random configurations rendered quickly, with what they show of brightness and cameras.
+
+They are the first that `photonfarm submit` plans by default, a view of each, on a small film. What cameras stand in and
+see is found by rays from many of them.
+
+Shape letters: N cameras, R rays of a camera's image, P points of the base cloud.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.core.pictures import Picture, display
+from photonfarm.core.records import F32, BasePointCloud
+from photonfarm.core.waiting import Steps, WorkLog
+from photonfarm.renderer.scene.arrays import floats, points
+from photonfarm.renderer.scene.gbuffer import reflects_here, sight_shares
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import LEAVING, NONE
+from photonfarm.renderer.tools.measure import exposure
+from photonfarm.scene.modification import Modification, rebuild, sample_modification
+from photonfarm.scene.spec import Film, SceneSpec
+from photonfarm.scene.view import Camera, View, sample_view
+
+COUNT = 16
+"""The rendered configurations."""
+
+SIDE = 128
+"""The most pixels along the longer side of their pictures."""
+
+VIEWS = 32
+"""The cameras of each configuration that rays are sent from."""
+
+POINTS = 2048
+"""The most points of the base cloud."""
+
+MOST_SPP = 64
+"""The most samples per pixel of a half of a picture."""
+
+RAYS_ALONG = 16
+"""The rays along each side of a camera's image."""
+
+BEHIND = 0.1
+"""The share of look-at points that a camera must have a free line to; outside and with fewer, a wall is between."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Cameras:
+    """Random cameras of one or several configurations."""
+
+    inside: tuple[str | None, ...]  # N ids of the shapes that cameras stand inside of
+    behind: NDArray[np.bool_]  # (N,) outside the room, with a wall between them and nearly all look-at points
+    nothing: NDArray[np.bool_]  # (N,) no surface at all in the image
+    dark: F32  # (N,) the share of the image that shows the black back of a one-sided surface
+    seen: F32  # (N,) the share of the points that the view sees
+
+    def __len__(self) -> int:
+        return len(self.inside)
+
+    def holders(self) -> list[tuple[str, int]]:
+        """The shapes that most cameras stand inside of, with how many do."""
+        return Counter(name for name in self.inside if name is not None).most_common()
+
+    @property
+    def placed_well(self) -> NDArray[np.bool_]:
+        """Which cameras are neither inside a shape nor behind a wall, (N,)."""
+        well: NDArray[np.bool_] = np.array([name is None for name in self.inside]) & ~self.behind
+        return well
+
+    @property
+    def inside_share(self) -> float:
+        """The share of cameras inside shapes."""
+        return sum(name is not None for name in self.inside) / len(self)
+
+
+def join_cameras(parts: Sequence[Cameras]) -> Cameras:
+    """The cameras of several configurations."""
+    arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ("behind", "nothing", "dark", "seen"))
+    return Cameras(tuple(name for part in parts for name in part.inside), *arrays)
+
+
+def examine_cameras(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Cameras:
+    """Cameras of the scene's present configuration; `cloud` (P, 3) are points that are there in it."""
+    ids = [shape.id() or f"shape {number}" for number, shape in enumerate(scene.scene.shapes())]
+    origin, target = (np.stack([getattr(view, name) for view in views]) for name in ("origin", "target"))
+    here = scene.surroundings(origin)
+    sights = sight_shares(scene.scene, origin, target)
+    hit, dark = _images(scene, views)
+    seen = [scene.sees(view, cloud).mean(dtype=np.float32) for view in views]
+    return Cameras(
+        inside=tuple(None if number == NONE else ids[number] for number in here.solid),
+        behind=(here.leaving > LEAVING) & (sights < BEHIND),
+        nothing=hit == 0,
+        dark=dark,
+        seen=np.array(seen, np.float32),
+    )
+
+
+def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
+    """The shares of images that show a surface between the near and the far plane, and a black back; (N,) each."""
+    small = scene.spec.model_copy(update={"film": Film(width=RAYS_ALONG, height=RAYS_ALONG)})
+    rays = [_rays(small, view) for view in views]
+    origin, direction, reach = (np.concatenate(column) for column in zip(*rays, strict=True))
+    ray = mi.Ray3f(o=points(origin), d=mi.Vector3f(points(direction)))
+    ray.maxt = floats(reach)
+    si = scene.scene.ray_intersect(ray)
+    hit = si.is_valid()
+    lit = reflects_here(si) | (si.shape.is_emitter()) | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
+    dark = hit & ~lit
+    dr.eval(hit, dark)
+    shares = [np.array(mask).reshape(len(views), -1).mean(axis=1, dtype=np.float32) for mask in (hit, dark)]
+    return shares[0], shares[1]
+
+
+def _rays(small: SceneSpec, view: View) -> tuple[F32, F32, F32]:
+    """Origins (R, 3) at the near plane, directions (R, 3) and lengths (R,) of the rays of a view's image."""
+    camera = Camera.of(view, small)
+    direction = camera.rays().reshape(-1, 3)
+    along = direction @ camera.forward
+    near = small.view.near / along
+    origin = camera.origin + near[:, None] * direction
+    return origin.astype(np.float32), direction, (small.view.far / along - near).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Shown:
+    """One configuration, and a view of it."""
+
+    number: int
+    modification: Modification
+    view: View
+    picture: Picture
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Samples:
+    """All configurations."""
+
+    shown: list[Shown]
+    images: exposure.Pictures
+    cameras: Cameras
+
+
+def small(spec: SceneSpec) -> SceneSpec:
+    """The spec as it is loaded for a check."""
+    return exposure.shrunk(spec, SIDE).model_copy(update={"points": min(spec.points, POINTS)})
+
+
+def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, work: WorkLog) -> Samples:
+    """Render the configurations of a spec in a scene that was loaded from `small` of it."""
+    film = scene.spec.film
+    half_spp = int(np.clip(exposure.PATHS // (film.width * film.height), 1, MOST_SPP))
+    shown: list[Shown] = []
+    halves, seen, steps = [], [], Steps(COUNT, slow=2)
+    work.begin(f"rendering {COUNT} configurations", steps.words)
+    for number in range(COUNT):
+        modification, views = _draw_views(spec, number)
+        scene.apply(modification)
+        halves.append(scene.render_halves(views[0], (2 * number, 2 * number + 1), half_spp))
+        position, there = rebuild(cloud, modification)
+        seen.append(examine_cameras(scene, views, position[there]))
+        picture = display(halves[-1].mean(axis=0), spec.exposure)
+        shown.append(Shown(number, modification, views[0], picture))
+        steps.reach(len(shown))
+    return Samples(shown, exposure.Pictures(np.stack(halves)), join_cameras(seen))
+
+
+def _draw_views(spec: SceneSpec, number: int) -> tuple[Modification, list[View]]:
+    """A configuration, and its views; the first is that of the configuration's sample."""
+    modification = sample_modification(spec, exposure.SEED, number)
+    key = modification.key(spec.radiance_id)
+    first = 0 if spec.groups else number  # as a plan numbers the views of a configuration
+    others = (COUNT + number * VIEWS + index for index in range(1, VIEWS))
+    return modification, [sample_view(spec, key, exposure.SEED, index, modification) for index in (first, *others)]

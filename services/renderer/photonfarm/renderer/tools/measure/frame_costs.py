@@ -1,0 +1,242 @@
+"""`photonfarm measure-frames`: the cost of the parts of one frame on this machine, and the surfaces in its pixels.
+
+A part is timed on the wall clock until its result is in numpy's memory, in a process whose thread pool is one thread.
+
+*Images of 1/k of the pixels* tell the cost of rendering only the pixels that a method keeps. They stand for some pixels
+of the whole image: the same field of view on a smaller film, with as many light paths as the whole image has, since
+their splats cannot be limited to some of its pixels. The integrator allows 64 light paths per eye path at most, so that
+the cost of an image that would need more is too low. Sides are rounded to whole pixels, so that the image may have a
+few more or fewer than 1/k.
+
+*The kind of the first surface* at each pixel's centre goes by the lobes that its BSDF has. Flags describe a whole BSDF
+and not a point on it: a blend or a `principled` whose glossy part is textured away somewhere is glossy there too, and a
+two-sided surface has the lobes of both sides. A null lobe, which masks have beside the lobes of what they mask, lets
+light pass unchanged, and does not count as a coat.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import cycle, islice
+from math import sqrt
+from pathlib import Path
+from typing import Any, TypeVar
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.core.archives import PARTS, FrameCosts, Surface
+from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.keys import Key, view_key
+from photonfarm.core.records import F32, BasePointCloud, Guides, arrays_of
+from photonfarm.renderer.jobs.estimates import photons_of
+from photonfarm.renderer.jobs.render import lit_points, locate
+from photonfarm.renderer.scene.gbuffer import first_surfaces
+from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
+from photonfarm.renderer.scene.loading import AimedSensor
+from photonfarm.scene.modification import Modification, rebuild, rest
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.read.find import scene_named
+
+
+def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:
+    """The kind of surface at each pixel's centre, (H, W) of `Surface`, between the view's clipping planes."""
+    camera = Camera.of(view, spec)
+    si = first_surfaces(scene, camera, camera.rays(), spec)
+    kind = dr.select(si.shape.is_emitter(), mi.UInt32(Surface.EMITTER), _kind_of_lobes(si.bsdf().flags()))
+    kinds = np.array(dr.select(si.is_valid(), kind, int(Surface.NOTHING)))
+    return kinds.astype(np.uint8).reshape(camera.height, camera.width)
+
+
+def _kind_of_lobes(flags: Any) -> Any:
+    """The kind DIFFUSE, SPECULAR or MIRROR (UInt32), by a BSDF's flags."""
+    diffuse = mi.has_flag(flags, mi.BSDFFlags.Diffuse)
+    glossy = mi.has_flag(flags, mi.BSDFFlags.Glossy)
+    delta = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
+    specular = glossy | (diffuse & delta)
+    unmixed = dr.select(diffuse, mi.UInt32(Surface.DIFFUSE), mi.UInt32(Surface.MIRROR))
+    return dr.select(specular, mi.UInt32(Surface.SPECULAR), unmixed)
+
+
+MOST_LIGHT_PATHS = 64.0
+"""The most light paths per eye path that the integrator allows."""
+
+
+class PartialFilm:
+    """About 1/k of the pixels of a spec's film, and their integrator; k = 1 gives the spec's own images."""
+
+    def __init__(self, spec: SceneSpec, k: int) -> None:
+        self.spec = part_of(spec, k)
+        self._sensor = AimedSensor(self.spec)
+        self._integrator = integrator_of(self.spec.transport)
+
+    def render(self, scene: Any, view: View, seed: int) -> F32:
+        """One half-estimate of linear radiance of a Mitsuba scene, (h, w, 3)."""
+        half_spp = self.spec.transport.half_spp
+        images = self._integrator.render_seeds(scene, self._sensor.aim(view), (seed,), half_spp)
+        return np.array(images, np.float32)[0]
+
+
+def part_of(spec: SceneSpec, k: int) -> SceneSpec:
+    """The spec with about 1/k of the pixels, in about the same proportions, and as many light paths in all."""
+    pixels = spec.film.width * spec.film.height
+    height = max(1, round(spec.film.height / sqrt(k)))
+    width = max(1, round(pixels / (k * height)))
+    light_ratio = min(spec.transport.light_ratio * pixels / (width * height), MOST_LIGHT_PATHS)
+    film = spec.film.model_copy(update={"width": width, "height": height})  # sides need not be divisible by 8
+    transport = spec.transport.model_copy(update={"light_ratio": light_ratio})
+    return spec.model_copy(update={"film": film, "transport": transport})
+
+
+WARM_UPS = 2
+"""The untimed first frames: the first compiles kernels, the second is the first to replay recorded launches."""
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TimedFrame:
+    """The configuration and the view of a row of the store."""
+
+    row: int
+    modification: Modification
+    key: Key  # of the modification
+    view: View
+
+
+def write_frame_costs(
+    store: str | Path, scene: str, rows: Sequence[int], kept: Sequence[int], timed: int, points: int | None, out: Path
+) -> FrameCosts:
+    """Measure some rows of a scene into a file, with the first `points` of its base cloud, or all of them.
+
+    The backend must have been loaded, with one thread.
+    Raises StoreError for a scene or a row that the store does not hold, IncompleteError for a row that is not complete,
+    SceneNotHereError if the scene's files are not on this machine.
+    """
+    opened = Store(store)
+    reader = SceneReader(store, scene_named(opened, scene))
+    reader.refresh()
+    _check_complete(reader, rows)
+    frames = [_frame(reader, row) for row in rows]
+    used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
+    spec = locate(reader.spec)
+    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed)
+    costs.write(out)
+    return costs
+
+
+def _check_complete(reader: SceneReader, rows: Sequence[int]) -> None:
+    planned = max((plan["first_row"] + plan["samples"] for plan in reader.plan_requests), default=0)
+    if max(rows) >= planned:
+        raise StoreError(
+            f"there is no row {max(rows)}; scene {reader.spec.scene_id} has {planned} rows, and the first is 0"
+        )
+    if missing := sorted(set(rows) - set(reader.rows.tolist())):
+        raise IncompleteError(
+            f"row {missing[0]} of scene {reader.spec.scene_id} is not complete; {len(reader.rows)} of "
+            f"{reader.planned} planned rows are, which `photonfarm store find` shows"
+        )
+
+
+def _frame(reader: SceneReader, row: int) -> TimedFrame:
+    modification, view, _ = reader.inputs(row)
+    return TimedFrame(row, modification, reader.modification_key(row), view)
+
+
+def frame_costs(
+    scene: LoadedScene, cloud: BasePointCloud, frames: Sequence[TimedFrame], kept: Sequence[int], timed: int
+) -> FrameCosts:
+    """The surfaces of all frames, and the times of `timed` of them and of images of 1/k of the pixels, k of `kept`.
+
+    If there are fewer frames than are timed, they are repeated.
+    """
+    films = [PartialFilm(scene.spec, k) for k in kept]
+    surface = np.stack([_surfaces(scene, frame) for frame in frames])
+    parts, render_s = np.split(_seconds(scene, cloud, films, frames, timed), [len(PARTS)])
+    return FrameCosts(
+        scene.spec.scene_id,
+        np.array([frame.row for frame in frames], np.int64),
+        surface,
+        **dict(zip(PARTS, parts, strict=True)),
+        kept=np.array(kept, np.int64),
+        render_s=render_s,
+    )
+
+
+def take_turns(frames: Sequence[TimedFrame]) -> Iterator[TimedFrame]:
+    """The frames without end, one of each configuration in turn: neighbours differ in it, unless all have the same."""
+    of_configuration: dict[Key, list[TimedFrame]] = {}
+    for frame in frames:
+        of_configuration.setdefault(frame.key, []).append(frame)
+    for turn in cycle([cycle(alike) for alike in of_configuration.values()]):
+        yield next(turn)
+
+
+def _surfaces(scene: LoadedScene, frame: TimedFrame) -> NDArray[np.uint8]:
+    scene.apply(frame.modification)
+    return surface_kinds(scene.scene, frame.view, scene.spec)
+
+
+# ---------------------------------------------------------------------------------------------------------------- times
+
+
+def _seconds(
+    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frames: Sequence[TimedFrame], timed: int
+) -> NDArray[np.float64]:
+    """The times of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
+    stays = len({frame.key for frame in frames}) == 1
+    measured = []
+    for seed, frame in enumerate(islice(take_turns(frames), WARM_UPS + timed)):
+        if stays:  # else there would be nothing to edit
+            scene.apply(rest(scene.spec))
+        measured.append(_time_frame(scene, cloud, films, frame, seed))
+    return np.array(measured[WARM_UPS:]).T
+
+
+def _time_frame(
+    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frame: TimedFrame, seed: int
+) -> list[float]:
+    edit_s, _ = _wall_timed(partial(_edit, scene, frame.modification))
+    buffers_s, _ = _wall_timed(partial(scene.buffers, frame.view))
+    guides_s, _ = _wall_timed(partial(_guides, scene, cloud, frame))
+    points_s, _ = _wall_timed(partial(_points_seen, scene, cloud, frame))
+    photons = _time_photons(scene, frame)
+    render_s = [_wall_timed(partial(film.render, scene.scene, frame.view, seed))[0] for film in films]
+    return [edit_s, buffers_s, guides_s, points_s, *photons, *render_s]
+
+
+def _time_photons(scene: LoadedScene, frame: TimedFrame) -> tuple[float, float]:
+    """Seconds to trace the configuration's photons, and to find those that the view sees; zeros for a scene without."""
+    photons_s, (photons, _) = _wall_timed(partial(photons_of, scene, frame.key))
+    if photons is None:
+        return 0.0, 0.0
+    seen_s, _ = _wall_timed(partial(scene.sees, frame.view, photons.position))
+    return photons_s, seen_s
+
+
+def _edit(scene: LoadedScene, modification: Modification) -> None:
+    scene.apply(modification)
+    dr.sync_thread()
+
+
+def _guides(scene: LoadedScene, cloud: BasePointCloud, frame: TimedFrame) -> Guides:
+    key = view_key(frame.key, frame.view.vector)
+    return scene.guides(frame.view, key, scene.spec.guides, lit_points(cloud, frame.modification))
+
+
+def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: TimedFrame) -> NDArray[np.bool_]:
+    position, present = rebuild(cloud, frame.modification)
+    return scene.sees(frame.view, position) & present
+
+
+def _wall_timed(work: Callable[[], T]) -> tuple[float, T]:
+    begun = time.perf_counter()
+    result = work()
+    return time.perf_counter() - begun, result

@@ -72,9 +72,13 @@ def main() -> int:
     )
     outage_s = LONG_OUTAGE_S * min(1.0, options.share)
     wanted = soak.Toll(
-        kills=kills, supervisor_kills=supervisor_kills, races=races, redis_kills=redis_kills, flushes=flushes,
+        kills=kills,
+        supervisor_kills=supervisor_kills,
+        races=races,
+        redis_kills=redis_kills,
+        flushes=flushes,
         submitters=submitters,
-    )  # fmt: skip
+    )
     with tempfile.TemporaryDirectory() as folder:
         found = soak.Soak(Path(folder), jobs=jobs, workers=options.workers, pause_s=PAUSE_S, seed=options.seed).run(
             wanted, pace_s=PACE_S, long_outage_s=outage_s

@@ -112,9 +112,20 @@ def compare(name: str, plan: Plan, arguments: argparse.Namespace) -> tuple[PathC
     wall_s = time.perf_counter() - start
     test = block_z_test(a, b, blocks=BLOCKS)
     row = PathComparison(
-        name, plan.size, plan.seeds, plan.path_spp, plan.bdpt_spp, arguments.connections, arguments.light_ratio,
-        plan.max_depth, test.z_max, test.mean_ratio, test.mean_ratio_standard_error, wall_s, verdict(test),
-    )  # fmt: skip
+        name,
+        plan.size,
+        plan.seeds,
+        plan.path_spp,
+        plan.bdpt_spp,
+        arguments.connections,
+        arguments.light_ratio,
+        plan.max_depth,
+        test.z_max,
+        test.mean_ratio,
+        test.mean_ratio_standard_error,
+        wall_s,
+        verdict(test),
+    )
     return row, {"bdpt": a.mean(axis=0), "path": b.mean(axis=0), "z": test.z}
 
 
@@ -150,11 +161,17 @@ def page(rows: list[PathComparison], arguments: argparse.Namespace) -> str:
     header = ("scene", "size", "seeds", "spp path / bdpt", "max block z", "mean ratio", "wall s", "verdict")
     lines = (
         (
-            r.scene, f"{r.size}²", r.seeds, f"{r.path_spp} / {r.bdpt_spp}", f"{r.z_max:.2f}",
-            f"{r.mean_ratio:.4f} ± {r.mean_ratio_standard_error:.4f}", f"{r.wall_s:.0f}", r.verdict,
+            r.scene,
+            f"{r.size}²",
+            r.seeds,
+            f"{r.path_spp} / {r.bdpt_spp}",
+            f"{r.z_max:.2f}",
+            f"{r.mean_ratio:.4f} ± {r.mean_ratio_standard_error:.4f}",
+            f"{r.wall_s:.0f}",
+            r.verdict,
         )
         for r in rows
-    )  # fmt: skip
+    )
     explanation = EXPLANATION.format(
         connections=arguments.connections, light_ratio=arguments.light_ratio, blocks=BLOCKS, z=Z_LIMIT, mean=MEAN_LIMIT
     )

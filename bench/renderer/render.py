@@ -65,9 +65,16 @@ def parse() -> argparse.Namespace:
 def main() -> int:
     arguments = parse()
     settings = MeasureSettings(
-        tuple(arguments.methods), arguments.seconds, arguments.seeds, arguments.size, arguments.threads,
-        arguments.clock, arguments.reference, arguments.pilot_seconds, arguments.chosen,
-    )  # fmt: skip
+        tuple(arguments.methods),
+        arguments.seconds,
+        arguments.seeds,
+        arguments.size,
+        arguments.threads,
+        arguments.clock,
+        arguments.reference,
+        arguments.pilot_seconds,
+        arguments.chosen,
+    )
     folder = arguments.out / "render"
     folder.mkdir(parents=True, exist_ok=True)
     key = {**asdict(settings), "methods": list(settings.methods), "versions": versions(), "code": code()}

@@ -125,15 +125,24 @@ def whole_samples(scene: SceneStore, contents: Contents, folder: Path) -> Whole:
             shown = contents.buffers(modification, view), contents.visibility(modification, view)
             kept["buffers"].append(view_row(*shown))
             kept["cloud"].append(
-                {"position": position, "normal": base.normal, "albedo": base.albedo, "emission": base.emission,
-                 "visible": present}
-            )  # fmt: skip
+                {
+                    "position": position,
+                    "normal": base.normal,
+                    "albedo": base.albedo,
+                    "emission": base.emission,
+                    "visible": present,
+                }
+            )
             kept["photons"].append(
                 {f"photon_{name}": values for name, values in arrays_of(photons).items()} if photons else {}
             )
     folder.mkdir(parents=True)
-    return Whole(**{part: _bytes_per_row(folder / part, of, {**outputs, **(cloud if part == "cloud" else {})})
-                    for part, of in kept.items()})  # fmt: skip
+    return Whole(
+        **{
+            part: _bytes_per_row(folder / part, of, {**outputs, **(cloud if part == "cloud" else {})})
+            for part, of in kept.items()
+        }
+    )
 
 
 def _bytes_per_row(path: Path, rows: list[Mapping[str, Any]], arrays: Mapping[str, ArraySchema]) -> float:

@@ -135,9 +135,15 @@ def measure(where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer, 
         step, image = (timed(learner, batch, usable_device(settings.device), clock, gradients=g) for g in (True, False))
         parameters = sum(w.numel() for w in learner.network.parameters())
     return ArchitectureTimes(
-        settings.network.architecture, parameters, step.pop(WHOLE), image.pop(WHOLE), step, image,
-        fed_ms(where, settings) * settings.batch, wait_share(where, settings, steps),
-    )  # fmt: skip
+        settings.network.architecture,
+        parameters,
+        step.pop(WHOLE),
+        image.pop(WHOLE),
+        step,
+        image,
+        fed_ms(where, settings) * settings.batch,
+        wait_share(where, settings, steps),
+    )
 
 
 def timed(

@@ -22,9 +22,13 @@ def photonfarm_in() -> Callable[[Path], Command]:
         def run(*args: str | Path, timeout: float = 300, **environment: str) -> subprocess.CompletedProcess[str]:
             return subprocess.run(
                 [sys.executable, "-m", "photonfarm.cli", *map(str, args)],
-                cwd=folder, capture_output=True, text=True, timeout=timeout, check=False,
+                cwd=folder,
+                capture_output=True,
+                text=True,
+                timeout=timeout,
+                check=False,
                 env={**os.environ, "PHOTONFARM_REDIS_URL": "redis://127.0.0.1:1/0", **environment},
-            )  # fmt: skip
+            )
 
         return run
 

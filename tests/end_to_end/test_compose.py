@@ -26,9 +26,14 @@ pytestmark = pytest.mark.skipif(
 def compose(*args: str, data: Path, timeout: float = 1500, **environment: str) -> str:
     command = ["docker-compose"] if shutil.which("docker-compose") else ["docker", "compose"]
     return subprocess.run(
-        [*command, "-p", PROJECT, *args], cwd=ROOT, env={**os.environ, "PHOTONFARM_DATA": str(data), **environment},
-        check=True, text=True, timeout=timeout, stdout=subprocess.PIPE,
-    ).stdout  # fmt: skip
+        [*command, "-p", PROJECT, *args],
+        cwd=ROOT,
+        env={**os.environ, "PHOTONFARM_DATA": str(data), **environment},
+        check=True,
+        text=True,
+        timeout=timeout,
+        stdout=subprocess.PIPE,
+    ).stdout
 
 
 @pytest.fixture

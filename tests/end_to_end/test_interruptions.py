@@ -102,8 +102,12 @@ def started(folder: Path, *verb: str, **environment: str) -> subprocess.Popen[by
     with (folder / "said").open("wb") as said:
         return subprocess.Popen(
             [sys.executable, "-m", "photonfarm.cli", *verb],
-            cwd=folder, stderr=said, start_new_session=True, preexec_fn=interruptible, env=os.environ | environment,
-        )  # fmt: skip
+            cwd=folder,
+            stderr=said,
+            start_new_session=True,
+            preexec_fn=interruptible,
+            env=os.environ | environment,
+        )
 
 
 def wait_for_native_code(folder: Path) -> None:

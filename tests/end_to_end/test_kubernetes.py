@@ -32,11 +32,14 @@ VALUES: dict[str, dict[str, Any]] = {
     "GPUs": {"renderer": {"gpus": 1, **GPU}, "trainer": {"gpus": 4, **GPU, "spec": "room"}, "bucket": BUCKET},
     "metrics": {"metrics": {"enabled": True, "prometheusNamespace": "watch"}, "bucket": BUCKET},
     "all ours": {
-        "data": {"existingClaim": "disk"}, "scenes": {"existingClaim": "scenes"}, "redis": {"existingSecret": "mine"},
-        "image": {"registry": "registry.example:5000/team", "pullSecrets": ["pull"]}, "trainer": {"enabled": False},
+        "data": {"existingClaim": "disk"},
+        "scenes": {"existingClaim": "scenes"},
+        "redis": {"existingSecret": "mine"},
+        "image": {"registry": "registry.example:5000/team", "pullSecrets": ["pull"]},
+        "trainer": {"enabled": False},
         "networkPolicy": {"extraEgress": [{"to": [{"ipBlock": {"cidr": "169.254.20.10/32"}}]}]},
     },
-}  # fmt: skip
+}
 """Values that should be taken, by what they are about."""
 
 REFUSED: dict[str, dict[str, Any]] = {

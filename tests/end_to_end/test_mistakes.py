@@ -155,9 +155,12 @@ def test_submit_says_so_if_training_will_refuse_what_it_plans(here: Path) -> Non
 def test_a_full_disk_is_told(here: Path) -> None:
     command = [sys.executable, "-m", "photonfarm.cli", "submit", "room", "--no-queue"]
     full = subprocess.run(
-        command, capture_output=True, text=True, check=False,
+        command,
+        capture_output=True,
+        text=True,
+        check=False,
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)),
-    )  # fmt: skip
+    )
     assert (full.returncode, full.stderr) == (
         4,
         "photonfarm: store: cannot make a store here: File too large (store)\n",

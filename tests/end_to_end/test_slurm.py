@@ -153,8 +153,9 @@ def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
         wait_for(lambda: markers.look() >= 8)
         say(f"{markers.look()} jobs committed by {markers.workers()}; tasks on {nodes}")
 
-        high = cluster.run("sbatch", "--parsable", "--partition=high", "--nodelist=n1", "--output=/dev/null", "--wrap",
-                           "sleep 20")  # fmt: skip
+        high = cluster.run(
+            "sbatch", "--parsable", "--partition=high", "--nodelist=n1", "--output=/dev/null", "--wrap", "sleep 20"
+        )
         wait_for(lambda: [task for task, state in cluster.states(array).items() if state == "PD"], 60)
         (preempted,) = [task for task, state in cluster.states(array).items() if state == "PD"]
         say(f"job {high} of partition high preempted {preempted}: {cluster.about(preempted)['Reason']}")
@@ -164,8 +165,10 @@ def test_an_array_of_four_loses_a_task_and_a_node_and_completes_the_plan_once(
         say(f"slurmd of n2 killed; {markers.look()} jobs committed")
         lost = [task for task, node in nodes.items() if node == "n2"]
         wait_for(lambda: all(cluster.about(task)["JobState"] != "RUNNING" for task in lost), 120)
-        say(f"n2 is {cluster.run('sinfo', '--noheader', '--nodes', 'n2', '--format', '%T')}; {lost} requeued; "
-            f"{markers.look()} jobs committed")  # fmt: skip
+        say(
+            f"n2 is {cluster.run('sinfo', '--noheader', '--nodes', 'n2', '--format', '%T')}; {lost} requeued; "
+            f"{markers.look()} jobs committed"
+        )
         assert markers.look() < jobs, "the plan was complete before the node was lost"
         wait_for(lambda: markers.look() == jobs, 900)
         assert_complete(photonfarm_in, folder, markers, jobs)

@@ -35,10 +35,14 @@ def small_spec(**changes: Any) -> SceneSpec:
     unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
     movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit, "removal_probability": 0}
     described = {
-        "name": "analytic", "scene": {"builtin": "cornell"}, "objects": [movable], "points": 16,
-        "view": {"origin": unit, "look_at": unit}, "film": {"width": 8, "height": 8},
+        "name": "analytic",
+        "scene": {"builtin": "cornell"},
+        "objects": [movable],
+        "points": 16,
+        "view": {"origin": unit, "look_at": unit},
+        "film": {"width": 8, "height": 8},
         "photons": {"paths": 4, "depth": 2},
-    }  # fmt: skip
+    }
     return parse_spec({**described, **changes}, where="test")
 
 

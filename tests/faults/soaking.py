@@ -133,9 +133,14 @@ class Soak:
     def _start(self, server: EmbeddedRedis, worker: str) -> None:
         """Start a supervisor, and wait until it has its child: it wants a Redis to begin with."""
         process = analytic.start_worker(
-            self._store.root, server.url, self._command, name=worker, heartbeat_ttl_s=HEARTBEAT_TTL_S,
-            steady_s=STEADY_S, log=self._folder / f"{worker}.log",
-        )  # fmt: skip
+            self._store.root,
+            server.url,
+            self._command,
+            name=worker,
+            heartbeat_ttl_s=HEARTBEAT_TTL_S,
+            steady_s=STEADY_S,
+            log=self._folder / f"{worker}.log",
+        )
         self._stack.enter_context(process)
         self._stack.callback(process.kill)
         self._running[worker] = process

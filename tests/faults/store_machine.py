@@ -181,9 +181,13 @@ class WritingMachine(RuleBasedStateMachine):
 
     @precondition(lambda self: any(model.missing() for model in self.models))
     @rule(
-        number=scene_numbers, process=processes, which=any_index,
-        given=st.one_of(st.integers(0, 12), st.just(1000)), links=st.integers(1, 25), after=st.booleans(),
-    )  # fmt: skip
+        number=scene_numbers,
+        process=processes,
+        which=any_index,
+        given=st.one_of(st.integers(0, 12), st.just(1000)),
+        links=st.integers(1, 25),
+        after=st.booleans(),
+    )
     def die(self, number: int, process: int, which: int, given: int, links: int, after: bool) -> None:
         """A process of its own, which is killed: in the middle of its rows, or before or after a link of its commit."""
         if (job := self._some_job(number, which)) is None:

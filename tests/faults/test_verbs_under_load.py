@@ -103,9 +103,13 @@ def test_a_farm_whose_store_is_mended_undone_and_joined_under_load_has_everythin
         workers = []
         for number in range(3):
             worker = analytic.start_worker(
-                Path(load.store.root), server.url, analytic.command(0.1), name=f"w{number}", steady_s=0.5,
+                Path(load.store.root),
+                server.url,
+                analytic.command(0.1),
+                name=f"w{number}",
+                steady_s=0.5,
                 log=tmp_path / f"w{number}.log",
-            )  # fmt: skip
+            )
             stack.enter_context(worker)
             stack.callback(worker.kill)
             workers.append(worker)

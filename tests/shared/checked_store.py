@@ -63,9 +63,7 @@ def checked(store: Store, **options: Any) -> StoreReport:
 def found(report: StoreReport) -> dict[str, int]:
     """How many findings of each cause that is not only worth a look."""
     (scene,) = report.scenes
-    return {
-        group.cause.label: group.count for group in scene.groups if group.cause.remedy.name != "LOOK"
-    }  # fmt: skip
+    return {group.cause.label: group.count for group in scene.groups if group.cause.remedy.name != "LOOK"}
 
 
 def noted(report: StoreReport) -> dict[str, int]:

@@ -39,9 +39,23 @@ def with_tensorstore(folder: Path):
 
 
 READERS = {"zarr": with_zarr, "tensorstore": with_tensorstore}
-OF_VIEWS = ("depth", "albedo", "normal",
-            "emission", "direct", "gloss", "specular", "roughness", "mean_depth", "mean_normal", "throughput",
-            "beyond_albedo", "beyond_normal", "beyond_depth", "point_light")  # fmt: skip
+OF_VIEWS = (
+    "depth",
+    "albedo",
+    "normal",
+    "emission",
+    "direct",
+    "gloss",
+    "specular",
+    "roughness",
+    "mean_depth",
+    "mean_normal",
+    "throughput",
+    "beyond_albedo",
+    "beyond_normal",
+    "beyond_depth",
+    "point_light",
+)
 SEEN = ("point_seen", "photon_seen")
 PHOTONS = ("photon_position", "photon_direction", "photon_normal", "photon_power", "photon_bounce")
 
@@ -132,8 +146,11 @@ class Scene:
         read["densities"] = [self.stored(f"{kind}_density", row) for kind, row in kinds]
         about = self.plan_of(modification_row).attributes_of("modification")
         named = ((group, field) for group in about["groups"] for field in about["fields"])
-        read["changed"] = [f"{group} {field['name']}" for (group, field), value
-                           in zip(named, modification.reshape(-1), strict=True) if value != field["rest"]]  # fmt: skip
+        read["changed"] = [
+            f"{group} {field['name']}"
+            for (group, field), value in zip(named, modification.reshape(-1), strict=True)
+            if value != field["rest"]
+        ]
         read["rays"] = rays(view.astype("f8"), self.spec)
         seeds = [seed(key, "half A"), seed(key, "half B")]
         read["seeds"] = [*seeds, seed(make_key("modification", self.radiance_id, modification), "photons")]

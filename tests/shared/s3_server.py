@@ -23,8 +23,16 @@ import pytest
 from photonfarm.core.processes import tie
 
 KEYS = {"AWS_ACCESS_KEY_ID": "photonfarm", "AWS_SECRET_ACCESS_KEY": "not-a-secret", "AWS_REGION": "us-east-1"}
-PORTS = ("master.port", "master.port.grpc", "volume.port", "volume.port.grpc", "filer.port", "filer.port.grpc",
-         "s3.port", "s3.port.grpc")  # fmt: skip
+PORTS = (
+    "master.port",
+    "master.port.grpc",
+    "volume.port",
+    "volume.port.grpc",
+    "filer.port",
+    "filer.port.grpc",
+    "s3.port",
+    "s3.port.grpc",
+)
 START_S = 120.0
 
 
@@ -47,10 +55,19 @@ def running(folder: Path, bind: str = "127.0.0.1") -> Iterator[int]:
     (folder / "s3.json").write_text(json.dumps({"identities": [identity]}))
     ports = dict(zip(PORTS, free_ports(len(PORTS)), strict=True))
     options = {
-        **ports, "dir": folder, "ip": "127.0.0.1", "ip.bind": bind, "master.telemetry": "false",
-        "master.volumeSizeLimitMB": 64, "volume.max": 100, "s3.config": folder / "s3.json", "s3.port.iceberg": 0,
-        "s3.port.lance": 0, "filer.localSocket": folder / "filer", "s3.localSocket": folder / "s3",
-    }  # fmt: skip
+        **ports,
+        "dir": folder,
+        "ip": "127.0.0.1",
+        "ip.bind": bind,
+        "master.telemetry": "false",
+        "master.volumeSizeLimitMB": 64,
+        "volume.max": 100,
+        "s3.config": folder / "s3.json",
+        "s3.port.iceberg": 0,
+        "s3.port.lance": 0,
+        "filer.localSocket": folder / "filer",
+        "s3.localSocket": folder / "s3",
+    }
     command = [weed, "-logtostderr=true", "server", "-s3", *(f"-{name}={value}" for name, value in options.items())]
     with (folder / "log").open("wb") as log, subprocess.Popen(tie(command), stdout=log, stderr=log) as process:
         try:
@@ -66,8 +83,11 @@ def wait_until_up(port: int, process: subprocess.Popen[bytes], log: Path) -> Non
     from obstore.exceptions import BaseError
     from obstore.store import S3Store
 
-    config = {"endpoint": f"http://127.0.0.1:{port}", "access_key_id": KEYS["AWS_ACCESS_KEY_ID"],
-              "secret_access_key": KEYS["AWS_SECRET_ACCESS_KEY"]}  # fmt: skip
+    config = {
+        "endpoint": f"http://127.0.0.1:{port}",
+        "access_key_id": KEYS["AWS_ACCESS_KEY_ID"],
+        "secret_access_key": KEYS["AWS_SECRET_ACCESS_KEY"],
+    }
     store = S3Store("started", config=config, client_options={"allow_http": True}, retry_config={"max_retries": 0})
     deadline = time.monotonic() + START_S
     while True:

@@ -76,30 +76,55 @@ def checks(*, long: bool) -> Iterator[Invariance]:
     """All invariances; the long version renders more scenes, with tighter limits."""
     effort = LONG if long else QUICK
     for name, build in _scenes(long, ("plastics", "many_lights"), _MORE_COUNTS).items():
-        yield Invariance(f"counts-{name}", "every (connections, light_ratio) gives the same mean",
-                    partial(equal_means, build, effort), long)  # fmt: skip
+        yield Invariance(
+            f"counts-{name}",
+            "every (connections, light_ratio) gives the same mean",
+            partial(equal_means, build, effort),
+            long,
+        )
     for name, build in _scenes(long, ("many_lights",), ("hundred_lights",)).items():
-        yield Invariance(f"additive-{name}", "the image of all lights is the sum of the images of two halves of them",
-                    partial(additive, build, effort), long)  # fmt: skip
+        yield Invariance(
+            f"additive-{name}",
+            "the image of all lights is the sum of the images of two halves of them",
+            partial(additive, build, effort),
+            long,
+        )
     for name, build in _scenes(long, ("many_lights",), ("plastics", "rotated_envmap", "mirror_room")).items():
-        yield Invariance(f"linear-{name}", "radiances times a factor give the image times it",
-                    partial(linear, build, effort), long)  # fmt: skip
+        yield Invariance(
+            f"linear-{name}", "radiances times a factor give the image times it", partial(linear, build, effort), long
+        )
     for factor in _NEAR_SCALED:
         yield Invariance(
             f"scale-{factor:g}", "lengths times a factor give the same image", partial(scale, factor, effort), long
         )
     for name, build in _scenes(long, ("many_lights",), ("cove",)).items():
-        yield Invariance(f"update-{name}", "a scene edited in place gives the image of the same scene loaded anew",
-                    partial(update_equals_reload, build, effort), long)  # fmt: skip
+        yield Invariance(
+            f"update-{name}",
+            "a scene edited in place gives the image of the same scene loaded anew",
+            partial(update_equals_reload, build, effort),
+            long,
+        )
     for name, build in _scenes(long, ("many_lights",), ("cornell", "plastics", "glass_caustic", "cove")).items():
-        yield Invariance(f"seed-{name}", "one seed gives one image, alone or among others, bit by bit",
-                    partial(reproducible, build, effort), long)  # fmt: skip
+        yield Invariance(
+            f"seed-{name}",
+            "one seed gives one image, alone or among others, bit by bit",
+            partial(reproducible, build, effort),
+            long,
+        )
     for name, build in _scenes(long, ("many_lights",), ("cornell", "glass_caustic", "cove")).items():
-        yield Invariance(f"recorded-{name}", "launches that are recorded give the images of those that are traced anew",
-                    partial(recorded, build, effort), long)  # fmt: skip
+        yield Invariance(
+            f"recorded-{name}",
+            "launches that are recorded give the images of those that are traced anew",
+            partial(recorded, build, effort),
+            long,
+        )
     for name, build in (weight_check.LONG_SCENES if long else weight_check.SCENES).items():
-        yield Invariance(f"weights-{name}", "weights of one path sum to 1 and are the oracle's",
-                    partial(oracles_weights, build, _LANES[long]), long)  # fmt: skip
+        yield Invariance(
+            f"weights-{name}",
+            "weights of one path sum to 1 and are the oracle's",
+            partial(oracles_weights, build, _LANES[long]),
+            long,
+        )
 
 
 def chosen(names: Sequence[str], *, long: bool) -> list[Invariance]:
@@ -274,10 +299,16 @@ def recorded(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[st
     view = mi.Transform4f().look_at(origin=[0.2, -3.0, 1.1], target=[0, 0, 0.9], up=[0, 0, 1])
     dr.make_opaque(view)
     steps: list[tuple[str, tuple[int, ...], int, dict[str, Any]]] = [
-        ("first", (1,), 8, {}), ("another seed", (2,), 8, {}), ("several seeds", (3, 4, 5), 8, {}),
-        ("other samples", (3,), 5, {}), ("dimmed", (6,), 8, {key: lit * 0.3}), ("dead", (7,), 8, {key: lit * 0}),
-        ("lit again", (7,), 8, {key: lit}), ("moved", (8,), 8, {"sensor.to_world": view}), ("first again", (1,), 8, {}),
-    ]  # fmt: skip
+        ("first", (1,), 8, {}),
+        ("another seed", (2,), 8, {}),
+        ("several seeds", (3, 4, 5), 8, {}),
+        ("other samples", (3,), 5, {}),
+        ("dimmed", (6,), 8, {key: lit * 0.3}),
+        ("dead", (7,), 8, {key: lit * 0}),
+        ("lit again", (7,), 8, {key: lit}),
+        ("moved", (8,), 8, {"sensor.to_world": view}),
+        ("first again", (1,), 8, {}),
+    ]
     faults = []
     for name, seeds, spp, edits in steps:
         for edited, value in edits.items():
@@ -287,8 +318,10 @@ def recorded(build: Callable[[int], SceneDict], effort: Effort) -> tuple[list[st
             parameters.update()
         ours, anew = (np.array(plugin.render_seeds(scene, sensor, seeds, spp)) for plugin in plugins)
         if not np.array_equal(ours, anew):
-            faults.append(f"{name}: {np.mean(ours != anew):.1%} of the values differ, by up to "
-                          f"{_largest_difference(ours, anew):.2g}")  # fmt: skip
+            faults.append(
+                f"{name}: {np.mean(ours != anew):.1%} of the values differ, by up to "
+                f"{_largest_difference(ours, anew):.2g}"
+            )
     return faults, f"{len(steps)} renders"
 
 
@@ -298,8 +331,10 @@ def oracles_weights(build: Callable[[int], SceneDict], lanes: int) -> tuple[list
     for settings in ALL:
         found = weight_check.compare_weights(build, settings, lanes=lanes)
         faults += [f"{settings}: {fault}" for fault in found.faults]
-        figures.append(f"{settings}: {found.paths} paths ({found.with_delta} with a mirror or glass), "
-                       f"sums within {found.sum_error:.1g}, weights within {found.weight_error:.1g}")  # fmt: skip
+        figures.append(
+            f"{settings}: {found.paths} paths ({found.with_delta} with a mirror or glass), "
+            f"sums within {found.sum_error:.1g}, weights within {found.weight_error:.1g}"
+        )
     return faults, "; ".join(figures)
 
 

@@ -28,8 +28,20 @@ REFUSED_ON_IMPORT = (
     "loops are traced by Dr.Jit and its light paths carry neither wavelengths nor Mueller matrices”."
 )
 
-_COLUMNS = ("row", "scene", "truth", "settings", "z max (limit)", "mean ratio (bound)", "path ratio",
-            "would see: image, worst block", "max/mean (truth)", "NaN, inf", "CPU s", "verdict")  # fmt: skip
+_COLUMNS = (
+    "row",
+    "scene",
+    "truth",
+    "settings",
+    "z max (limit)",
+    "mean ratio (bound)",
+    "path ratio",
+    "would see: image, worst block",
+    "max/mean (truth)",
+    "NaN, inf",
+    "CPU s",
+    "verdict",
+)
 _HEAD = f"| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}"
 
 

@@ -90,8 +90,14 @@ def as_json(report: StabilityReport, command: str) -> str:
     results = [asdict(result) | {"label": result.label, "verdict": result.verdict} for result in report.results]
     rows, scenes = report.rows(), report.scenes()
     document = {
-        "command": command, "rows_passed": sum(rows.values()), "rows_run": len(rows), "rows": ROWS,
-        "scenes_passed": sum(scenes.values()), "scenes_run": len(scenes),
-        "significance": SIGNIFICANCE, "smallest_standard_error": ROUNDING, "results": results,
-    }  # fmt: skip
+        "command": command,
+        "rows_passed": sum(rows.values()),
+        "rows_run": len(rows),
+        "rows": ROWS,
+        "scenes_passed": sum(scenes.values()),
+        "scenes_run": len(scenes),
+        "significance": SIGNIFICANCE,
+        "smallest_standard_error": ROUNDING,
+        "results": results,
+    }
     return json.dumps(document, indent=1, ensure_ascii=False, allow_nan=False) + "\n"

@@ -137,12 +137,30 @@ def _judged(
     z_max = float(np.fmax(blocks.z_max, whole.z_max))
     faults = tuple(_faults(item, effort, bdpt, blocks, whole, brightest))
     result = SceneResult(
-        item.row, item.name, item.hard, item.truth.name, str(settings), effort.size, effort.seeds, effort.spp,
-        effort.truth_spp if len(truth) > 1 else None, _finite(z_max), blocks.z_limit, _finite(blocks.mean_ratio),
-        _finite(blocks.mean_ratio_standard_error), effort.resolution, _finite(seen_bias(bdpt, truth, 1)),
-        _finite(seen_bias(bdpt, truth, effort.blocks)), _finite(brightest), _finite(truth_brightest),
-        int(np.isnan(bdpt).sum()), int(np.isinf(bdpt).sum()), time.process_time() - start, faults, command,
-    )  # fmt: skip
+        item.row,
+        item.name,
+        item.hard,
+        item.truth.name,
+        str(settings),
+        effort.size,
+        effort.seeds,
+        effort.spp,
+        effort.truth_spp if len(truth) > 1 else None,
+        _finite(z_max),
+        blocks.z_limit,
+        _finite(blocks.mean_ratio),
+        _finite(blocks.mean_ratio_standard_error),
+        effort.resolution,
+        _finite(seen_bias(bdpt, truth, 1)),
+        _finite(seen_bias(bdpt, truth, effort.blocks)),
+        _finite(brightest),
+        _finite(truth_brightest),
+        int(np.isnan(bdpt).sum()),
+        int(np.isinf(bdpt).sum()),
+        time.process_time() - start,
+        faults,
+        command,
+    )
     return SceneOutcome(result, Renders(bdpt, truth, blocks.z))
 
 
@@ -232,8 +250,28 @@ def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
     if refusal.allowed is not None and (again := _refusal(load(refusal.build(8)), refusal.allowed)):
         faults.append(f"refused with connections,light_ratio = {refusal.allowed} too: {again}")
     result = SceneResult(
-        refusal.row, refusal.name, text, "refusal", str(refusal.settings), 8, 1, 1, None, None, None, None, None, None,
-        None, None, None, None, 0, 0, time.process_time() - start, tuple(faults),
+        refusal.row,
+        refusal.name,
+        text,
+        "refusal",
+        str(refusal.settings),
+        8,
+        1,
+        1,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        None,
+        0,
+        0,
+        time.process_time() - start,
+        tuple(faults),
         f"python -m tests.stability --only {refusal.label}" + " --quick" * quick,
-    )  # fmt: skip
+    )
     return SceneOutcome(result)

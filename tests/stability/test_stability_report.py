@@ -55,11 +55,24 @@ def rounding(mean_ratio: float, **changes: Any) -> SceneResult:
     """A result that differs by 60 standard errors of its noise, but by less than rounding may."""
     (refused,) = run(rows.REFUSALS[0], quick=True)
     return replace(
-        refused.result, row=1, name="sphere", hard="all of it", truth="1 − ½^3", z_max=3.1, z_limit=5.4,
-        mean_ratio=mean_ratio, mean_ratio_standard_error=4e-6, resolution=0.003, seen_bias=0.00046,
-        seen_block_bias=4.5, max_over_mean=1.01, truth_max_over_mean=1.0, path_ratio=1.00066,
-        path_ratio_standard_error=5e-6, **changes,
-    )  # fmt: skip
+        refused.result,
+        row=1,
+        name="sphere",
+        hard="all of it",
+        truth="1 − ½^3",
+        z_max=3.1,
+        z_limit=5.4,
+        mean_ratio=mean_ratio,
+        mean_ratio_standard_error=4e-6,
+        resolution=0.003,
+        seen_bias=0.00046,
+        seen_block_bias=4.5,
+        max_over_mean=1.01,
+        truth_max_over_mean=1.0,
+        path_ratio=1.00066,
+        path_ratio_standard_error=5e-6,
+        **changes,
+    )
 
 
 def test_what_passes_as_rounding_is_marked_and_stands_beside_path() -> None:

@@ -33,14 +33,20 @@ def settings(size: int, max_depth: int, threads: int) -> dict[str, Any]:
     `max_depth` edges or its light part more than `max_depth` − 1: longer paths that fit both stay in, in part.
     """
     return {
-        "renderengine.type": "BIDIRCPU", "native.threads.count": threads,
-        "path.maxdepth": max_depth, "light.maxdepth": max(1, max_depth - 1),
+        "renderengine.type": "BIDIRCPU",
+        "native.threads.count": threads,
+        "path.maxdepth": max_depth,
+        "light.maxdepth": max(1, max_depth - 1),
         "path.russianroulette.depth": 2 * max_depth + 1,
-        "sampler.type": "SOBOL", "sampler.sobol.adaptive.strength": 0.0,
-        "film.width": size, "film.height": size, "film.filter.type": "NONE",
+        "sampler.type": "SOBOL",
+        "sampler.sobol.adaptive.strength": 0.0,
+        "film.width": size,
+        "film.height": size,
+        "film.filter.type": "NONE",
         "film.imagepipelines.0.0.type": "NOP",
-        "film.outputs.0.type": "RGB", "film.outputs.0.filename": "unused.exr",
-    }  # fmt: skip
+        "film.outputs.0.type": "RGB",
+        "film.outputs.0.filename": "unused.exr",
+    }
 
 
 class LuxCoreMethod:
@@ -55,8 +61,11 @@ class LuxCoreMethod:
         self._log = (folder / "log").open("w+")
         self._child = subprocess.Popen(
             [sys.executable, str(Path(__file__).with_name("luxcore_child.py")), str(folder)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._log, text=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._log,
+            text=True,
+        )
 
     def render(self, seed: int, spp: int) -> Shot:
         """One image. Raises RuntimeError, with the end of its log, if LuxCore fails or answers too late."""

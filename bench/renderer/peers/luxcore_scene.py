@@ -108,8 +108,10 @@ def _add_material(result: LuxCoreScene, name: str, bsdf: Any, radiance: list[flo
             result.properties |= _material(result, back, sides[1])
         prefix = f"scene.materials.{name}"
         result.properties |= {
-            f"{prefix}.type": "twosided", f"{prefix}.frontmaterial": front, f"{prefix}.backmaterial": back
-        }  # fmt: skip
+            f"{prefix}.type": "twosided",
+            f"{prefix}.frontmaterial": front,
+            f"{prefix}.backmaterial": back,
+        }
     if radiance is not None and any(radiance):
         result.properties[f"scene.materials.{front}.emission"] = radiance
 
@@ -164,9 +166,12 @@ def _material(result: LuxCoreScene, name: str, bsdf: Any) -> Properties:
         eta = float(np.array(values["eta"]).ravel()[0])
         ones = [1.0, 1.0, 1.0]
         return {
-            f"{prefix}.type": "glass", f"{prefix}.kr": ones, f"{prefix}.kt": ones, f"{prefix}.interiorior": eta,
+            f"{prefix}.type": "glass",
+            f"{prefix}.kr": ones,
+            f"{prefix}.kt": ones,
+            f"{prefix}.interiorior": eta,
             f"{prefix}.exteriorior": 1.0,
-        }  # fmt: skip
+        }
     raise NotExpressibleError(f"material {kind}")
 
 
@@ -216,8 +221,13 @@ def _add_camera(result: LuxCoreScene, sensor: Any) -> None:
     # LuxCore's rasters count rows from H − 1 down to −1: the window is lowered by one row to see what Mitsuba sees
     window = [-1.0, 1.0, -1.0 - row, 1.0 - row]
     result.properties |= {
-        f"{prefix}.screenwindow": window, f"{prefix}.type": "perspective", f"{prefix}.autofocus.enable": 0,
-        f"{prefix}.lookat.orig": origin.tolist(), f"{prefix}.lookat.target": (origin + forward).tolist(),
-        f"{prefix}.up": up.tolist(), f"{prefix}.fieldofview": float(np.array(values["x_fov"]).ravel()[0]),
-        f"{prefix}.cliphither": float(values["near_clip"]), f"{prefix}.clipyon": float(values["far_clip"]),
-    }  # fmt: skip
+        f"{prefix}.screenwindow": window,
+        f"{prefix}.type": "perspective",
+        f"{prefix}.autofocus.enable": 0,
+        f"{prefix}.lookat.orig": origin.tolist(),
+        f"{prefix}.lookat.target": (origin + forward).tolist(),
+        f"{prefix}.up": up.tolist(),
+        f"{prefix}.fieldofview": float(np.array(values["x_fov"]).ravel()[0]),
+        f"{prefix}.cliphither": float(values["near_clip"]),
+        f"{prefix}.clipyon": float(values["far_clip"]),
+    }

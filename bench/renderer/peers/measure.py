@@ -78,14 +78,20 @@ def measure(name: str, plan: ScenePlan, settings: MeasureSettings, scene: Any) -
             method.close()
     rows = scoring.rows(measured, references, settings.clock)
     return {
-        "line": name, "scene": plan.scene, "max_depth": plan.max_depth, "note": plan.note, "reference": described,
-        "chosen": None if settled is None else {
-            **settled.parameters(), "pilot_wall_s": settled.pilot_wall_s, "why": settled.why
-        },
-        "absent": absent, "differences": sorted(differences),
-        "rows": rows, "gains": scoring.gains("chosen", measured, references, settings.clock),
+        "line": name,
+        "scene": plan.scene,
+        "max_depth": plan.max_depth,
+        "note": plan.note,
+        "reference": described,
+        "chosen": None
+        if settled is None
+        else {**settled.parameters(), "pilot_wall_s": settled.pilot_wall_s, "why": settled.why},
+        "absent": absent,
+        "differences": sorted(differences),
+        "rows": rows,
+        "gains": scoring.gains("chosen", measured, references, settings.clock),
         "curves": scoring.curves(measured, references, settings.clock),
-    }  # fmt: skip
+    }
 
 
 def say(line: str) -> None:

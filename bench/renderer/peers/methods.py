@@ -83,10 +83,16 @@ def multijittered(scene: Any, sampler: str = "multijitter") -> Any:
     offsets = {key: float(found[key][0]) for key in ("principal_point_offset_x", "principal_point_offset_y")}
     to_world = mi.ScalarTransform4f(np.array(found["to_world"].matrix).reshape(4, 4))
     description = {
-        "type": "perspective", "fov": float(found["x_fov"][0]), "fov_axis": "x", "to_world": to_world,
-        "near_clip": camera.near_clip(), "far_clip": camera.far_clip(),
-        "film": camera.film(), "sampler": {"type": sampler}, **offsets,
-    }  # fmt: skip
+        "type": "perspective",
+        "fov": float(found["x_fov"][0]),
+        "fov_axis": "x",
+        "to_world": to_world,
+        "near_clip": camera.near_clip(),
+        "far_clip": camera.far_clip(),
+        "film": camera.film(),
+        "sampler": {"type": sampler},
+        **offsets,
+    }
     return mi.load_dict(description)
 
 

@@ -54,10 +54,15 @@ def page(results: list[dict[str, Any]], settings: dict[str, Any], machine: str) 
         pilot = f"but given here: {settings['chosen']}"
     text = EXPLANATION.format(
         pilot=pilot,
-        clock=settings["clock"], seconds=settings["seconds"], threads=plural(settings["threads"], "thread"),
+        clock=settings["clock"],
+        seconds=settings["seconds"],
+        threads=plural(settings["threads"], "thread"),
         size=settings["size"],
-        seeds=settings["seeds"], luxcore=settings["versions"].get("pyluxcore", "(absent)"), z=Z_LIMIT, same=SAME_SCENE,
-    )  # fmt: skip
+        seeds=settings["seeds"],
+        luxcore=settings["versions"].get("pyluxcore", "(absent)"),
+        z=Z_LIMIT,
+        same=SAME_SCENE,
+    )
     versions = ", ".join(f"{name} {version}" for name, version in settings["versions"].items())
     commits = ", ".join(sorted({result["commit"] for result in results}))
     measured = f"Measured on {machine}; {versions}; made at commit {commits}.\n"

@@ -25,8 +25,10 @@ def verdict(results: list[dict[str, Any]]) -> list[str]:
     lines = []
     for result in compared:
         best = [best_peer(result, kind) for kind in ("full", "trimmed")]
-        cells = [f"{figure(result['gains'][peer][kind])} ({LABELS[peer]})" if peer else "–"
-                 for peer, kind in zip(best, ("full", "trimmed"), strict=True)]  # fmt: skip
+        cells = [
+            f"{figure(result['gains'][peer][kind])} ({LABELS[peer]})" if peer else "–"
+            for peer, kind in zip(best, ("full", "trimmed"), strict=True)
+        ]
         lines.append((result["line"], *cells))
     won = table(("scene", "all pixels", "trimmed"), lines)
     return ["## `bdpt`, chosen, over the best unbiased peer\n", won, "", PEERS_EXPLAINED, *losses(compared)]
@@ -37,9 +39,10 @@ def best_peer(result: dict[str, Any], kind: str) -> str | None:
     gains = {
         peer: gain["value"]
         for peer in PEERS
-        if (gain := result["gains"].get(peer, {}).get(kind)) and math.isfinite(gain["value"])
+        if (gain := result["gains"].get(peer, {}).get(kind))
+        and math.isfinite(gain["value"])
         and not mark(peer, result["rows"][peer])
-    }  # fmt: skip
+    }
     return min(gains, key=lambda peer: gains[peer], default=None)
 
 

@@ -52,10 +52,17 @@ def scene_show(spec: str, as_json: bool) -> None:
 @redis_option
 @click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
 @click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
-@click.option("--halves-from", metavar="ID", help="The scene whose halves jobs take over; it may differ in buffers, "
-              "guides, photons and points alone.  [default: the one that has most]")  # fmt: skip
-@click.option("--dry-run", is_flag=True, help="Say what would be planned, its size and cost, and what should teach "
-              "more at that cost; write nothing.")  # fmt: skip
+@click.option(
+    "--halves-from",
+    metavar="ID",
+    help="The scene whose halves jobs take over; it may differ in buffers, "
+    "guides, photons and points alone.  [default: the one that has most]",
+)
+@click.option(
+    "--dry-run",
+    is_flag=True,
+    help="Say what would be planned, its size and cost, and what should teach more at that cost; write nothing.",
+)
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
 @json_option
 def submit(
@@ -150,8 +157,13 @@ def top_up(
 @click.command()
 @store_option
 @redis_option
-@click.option("--run", "runs", type=click.Path(path_type=Path), multiple=True,
-              help="Folder of a training run; may be repeated.  [default: that of an `up` at work here]")  # fmt: skip
+@click.option(
+    "--run",
+    "runs",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    help="Folder of a training run; may be repeated.  [default: that of an `up` at work here]",
+)
 @click.option("--watch", is_flag=True, help="Keep showing it, with rates and time left, until Ctrl-C.")
 @json_option
 def status(
@@ -224,8 +236,11 @@ def redis_server(port: int) -> None:
 @click.argument("spec")
 @request_options
 @store_option
-@click.option("--workers", type=click.IntRange(1),
-              help="Render workers, a core each, or in turn on the cards.  [default: 2; one a card]")  # fmt: skip
+@click.option(
+    "--workers",
+    type=click.IntRange(1),
+    help="Render workers, a core each, or in turn on the cards.  [default: 2; one a card]",
+)
 @device_option
 @click.option(
     "--run",
@@ -242,12 +257,27 @@ def redis_server(port: int) -> None:
     help="Share of the configurations never trained on.  "
     f"[default: the run's; of a new one {HOLD_OUT}, or just enough for one configuration of a small plan]",
 )
-@click.option("--reference-views", type=click.IntRange(0), default=0, show_default=True,
-              help="Held-out views that get references, for the report; 0: none.")  # fmt: skip
-@click.option("--reference-spp", type=click.IntRange(1), default=256, show_default=True,
-              help="Samples per pixel of each reference.")  # fmt: skip
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True,
-              help="Preview and report.")  # fmt: skip
+@click.option(
+    "--reference-views",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Held-out views that get references, for the report; 0: none.",
+)
+@click.option(
+    "--reference-spp",
+    type=click.IntRange(1),
+    default=256,
+    show_default=True,
+    help="Samples per pixel of each reference.",
+)
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="out",
+    show_default=True,
+    help="Preview and report.",
+)
 @click.option("--web/--no-web", default=True, show_default=True, help="Serve pages that show it, on this machine.")
 def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     """Run the whole farm on this machine: an embedded Redis, render workers and the trainer, until all is done.

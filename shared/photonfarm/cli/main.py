@@ -120,8 +120,14 @@ CONFIG_VARIABLE = "PHOTONFARM_CONFIG"
 
 @click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="photonfarm", prog_name="photonfarm")
-@click.option("--config", type=click.Path(path_type=Path), envvar=CONFIG_VARIABLE, default="photonfarm.toml",
-              show_default=True, help="Defaults for options, a table per verb.")  # fmt: skip
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    envvar=CONFIG_VARIABLE,
+    default="photonfarm.toml",
+    show_default=True,
+    help="Defaults for options, a table per verb.",
+)
 @click.pass_context
 def umbrella(ctx: click.Context, config: Path) -> None:
     """Unbiased training data for neural light transport, and training on it while it grows.

@@ -60,19 +60,30 @@ class WholeNumber(click.IntRange):
 def store_option(command: Command) -> Command:
     """`--store`, the sample store."""
     return click.option(
-        "--store", type=StorePlace(), metavar="DIR|URL", envvar="PHOTONFARM_STORE", default="store", show_default=True,
+        "--store",
+        type=StorePlace(),
+        metavar="DIR|URL",
+        envvar="PHOTONFARM_STORE",
+        default="store",
+        show_default=True,
         help="The sample store: a folder, or s3://bucket/prefix (credentials: the AWS_… variables).",
-    )(command)  # fmt: skip
+    )(command)
 
 
 def redis_option(command: Command) -> Command:
     """`--redis URL`, the queue's server; its password may come from the file that a variable names."""
     return click.option(
-        "--redis", "redis_url", envvar="PHOTONFARM_REDIS_URL", default="redis://localhost:6379/0", show_default=True,
+        "--redis",
+        "redis_url",
+        envvar="PHOTONFARM_REDIS_URL",
+        default="redis://localhost:6379/0",
+        show_default=True,
         help="The queue's Redis. A password is refused here, as command lines can be read by all; it belongs into the "
         "file that PHOTONFARM_REDIS_PASSWORD_FILE names, and is the user photonfarm's unless the URL names another: "
-        "redis://default@host for a Redis with requirepass.", show_envvar=True, callback=_with_password,
-    )(command)  # fmt: skip
+        "redis://default@host for a Redis with requirepass.",
+        show_envvar=True,
+        callback=_with_password,
+    )(command)
 
 
 def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
@@ -88,9 +99,13 @@ def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
 def optional_redis_option(help_text: str) -> Callable[[Command], Command]:
     """`--redis URL` without a default, as `queue_url`; the file of its password is not read."""
     return click.option(
-        "--redis", "queue_url", envvar="PHOTONFARM_REDIS_URL", show_envvar=True, callback=_without_password,
+        "--redis",
+        "queue_url",
+        envvar="PHOTONFARM_REDIS_URL",
+        show_envvar=True,
+        callback=_without_password,
         help=help_text,
-    )  # fmt: skip
+    )
 
 
 def _without_password(ctx: click.Context, param: click.Parameter, url: str | None) -> str | None:
@@ -133,11 +148,16 @@ def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(*arguments, **options)
 
     return click.option(
-        "--device", envvar=DEVICE_VARIABLE, default=AUTO, show_default=True, show_envvar=True,
-        metavar="auto|cpu|cuda[:N]", callback=_device,
+        "--device",
+        envvar=DEVICE_VARIABLE,
+        default=AUTO,
+        show_default=True,
+        show_envvar=True,
+        metavar="auto|cpu|cuda[:N]",
+        callback=_device,
         help="What renders: the processor, the first NVIDIA card, card N as nvidia-smi numbers them; auto: a card, "
         "where there is one that can.",
-    )(on_device)  # fmt: skip
+    )(on_device)
 
 
 def _device(ctx: click.Context, param: click.Parameter, name: str) -> str:  # noqa: ARG001
@@ -164,15 +184,24 @@ def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
         return command(request=Request.of(**asked), **options)
 
     options = (
-        click.option("--modifications", type=WholeNumber(1), default=128, show_default=True,
-                     help="Random configurations; a static scene has one, of which modifications × views are planned."),
+        click.option(
+            "--modifications",
+            type=WholeNumber(1),
+            default=128,
+            show_default=True,
+            help="Random configurations; a static scene has one, of which modifications × views are planned.",
+        ),
         click.option("--views", type=WholeNumber(1), default=2, show_default=True, help="Views per configuration."),
         click.option("--passes", type=WholeNumber(1), default=1, show_default=True, help="Noisy passes per view."),
         click.option("--seed", type=WholeNumber(0), default=0, show_default=True, help="Master seed; 0 is a seed."),
-        click.option("--shard-rows", type=WholeNumber(1, 4096), default=None,
-                     help="Samples per job, fixed for a scene by its first plan.  [default: some seconds of work, at "
-                     "most 32, and several jobs for every worker]"),
-    )  # fmt: skip
+        click.option(
+            "--shard-rows",
+            type=WholeNumber(1, 4096),
+            default=None,
+            help="Samples per job, fixed for a scene by its first plan.  [default: some seconds of work, at "
+            "most 32, and several jobs for every worker]",
+        ),
+    )
     found: Callable[..., Any] = with_request
     for option in reversed(options):
         found = option(found)

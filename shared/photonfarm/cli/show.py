@@ -52,9 +52,12 @@ def scene(spec: SceneSpec, as_json: bool) -> None:
             ("source", source.file or f"built-in {source.builtin}"),
             ("kind", f"dynamic, {len(spec.groups)} movable groups" if spec.groups else "static"),
             ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.fov_deg:g}°"),
-            ("light transport", f"depth {t.max_depth}, {t.connections} connections, light ratio {t.light_ratio:g}"
-             + ", guided light" * t.guided_light
-             + (f", {t.light_samples} light samples" if t.light_samples > 1 else "")),
+            (
+                "light transport",
+                f"depth {t.max_depth}, {t.connections} connections, light ratio {t.light_ratio:g}"
+                + ", guided light" * t.guided_light
+                + (f", {t.light_samples} light samples" if t.light_samples > 1 else ""),
+            ),
             ("half-estimates", f"2 × {t.half_spp} samples per pixel"),
             ("views from", _box(spec.view.origin.min, spec.view.origin.max)),
             ("looking at", _box(spec.view.look_at.min, spec.view.look_at.max)),
@@ -63,7 +66,7 @@ def scene(spec: SceneSpec, as_json: bool) -> None:
             ("exposure", f"{spec.exposure:g}"),
             ("bytes per sample", f"≤ {bytes_per_sample(spec):,} with its own view and modification"),
         )
-    )  # fmt: skip
+    )
     if spec.groups:
         click.echo()
         print_table(
@@ -72,7 +75,7 @@ def scene(spec: SceneSpec, as_json: bool) -> None:
                 for g in spec.groups
             ),
             ("movable", "shapes", "removed", "positions"),
-        )  # fmt: skip
+        )
 
 
 def bytes_per_sample(spec: SceneSpec) -> int:

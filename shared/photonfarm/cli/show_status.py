@@ -47,15 +47,19 @@ def scenes(found: Sequence[SceneStatus]) -> None:
     print_table(
         (
             (
-                s.name, s.scene_id, f"{s.samples_complete}/{s.samples_planned}",
+                s.name,
+                s.scene_id,
+                f"{s.samples_complete}/{s.samples_planned}",
                 f"{s.jobs_committed}/{s.jobs_planned}",
-                f"{s.size_bytes / 1e6:.1f} MB", f"{s.core_s:.0f} s", str(s.redrawn),
+                f"{s.size_bytes / 1e6:.1f} MB",
+                f"{s.core_s:.0f} s",
+                str(s.redrawn),
             )
             for s in found
             if not s.error
         ),
         ("scene", "id", "samples", "jobs", "size", "core time", "redrawn"),
-    )  # fmt: skip
+    )
     for s in found:
         unread = f"cannot be read: {s.error}" if s.error else ""
         for message in filter(None, (unread, unread_markers(s), lost_plan(s))):

@@ -124,17 +124,20 @@ def _document(report: StoreReport) -> dict[str, Any]:
         "exit_code": report.exit_code,
         "quarantine": report.quarantine,
         "parts": report.parts,
-        "scenes": [
-            {**asdict(scene), "groups": [_group(group) for group in scene.groups]} for scene in report.scenes
-        ],
-    }  # fmt: skip
+        "scenes": [{**asdict(scene), "groups": [_group(group) for group in scene.groups]} for scene in report.scenes],
+    }
 
 
 def _group(group: FindingGroup) -> dict[str, Any]:
     first = [{"job": f.job, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first]
     cause = group.cause
-    return {"cause": cause.label, "means": cause.sentence, "remedy": cause.remedy.value, "count": group.count,
-            "first": first}  # fmt: skip
+    return {
+        "cause": cause.label,
+        "means": cause.sentence,
+        "remedy": cause.remedy.value,
+        "count": group.count,
+        "first": first,
+    }
 
 
 # ----------------------------------------------------------------------------------------------------------------- find

@@ -175,6 +175,11 @@ def progress_line(found: FarmProgress, left_s: float | None = None) -> str:
 
 
 def _bars() -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-               TimeRemainingColumn())  # fmt: skip
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
     return Progress(*columns, auto_refresh=False, speed_estimate_period=PACE_S, get_time=time.monotonic)

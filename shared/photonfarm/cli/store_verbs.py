@@ -21,8 +21,11 @@ def scene_option(command: click.decorators.FC) -> click.decorators.FC:
 @store_option
 @scene_option
 @click.option("--repair", is_flag=True, help="Set what is damaged aside, to be written again.")
-@click.option("--joined-from", metavar="OTHER", help="With --repair: the store, a folder or bucket, from which damaged "
-              "plans of a join are written again.")  # fmt: skip
+@click.option(
+    "--joined-from",
+    metavar="OTHER",
+    help="With --repair: the store, a folder or bucket, from which damaged plans of a join are written again.",
+)
 @json_option
 def check(store: str | Path, scene: str | None, repair: bool, joined_from: str | None, as_json: bool) -> None:
     """Read everything that is stored, and say what is wrong with it; without --repair nothing is written.
@@ -70,8 +73,13 @@ def check(store: str | Path, scene: str | None, repair: bool, joined_from: str |
 @click.option("--sample", metavar="KEY", help="The sample of a key: 32 hexadecimal digits.")
 @click.option("--row", type=click.IntRange(0), help="The sample in a row.")
 @click.option("--job", type=click.IntRange(0), help="The samples of a job.")
-@click.option("--tolerance", type=click.FloatRange(0), default=1e-3, show_default=True,
-              help="How far a position may be from the one given, in scene units; 0: bit by bit.")  # fmt: skip
+@click.option(
+    "--tolerance",
+    type=click.FloatRange(0),
+    default=1e-3,
+    show_default=True,
+    help="How far a position may be from the one given, in scene units; 0: bit by bit.",
+)
 @click.option("--limit", type=click.IntRange(1), default=20, show_default=True, help="Samples to print.")
 @json_option
 def find(
@@ -107,8 +115,13 @@ def find(
 @click.option("--modification", metavar="VECTOR|KEY", help="Views of this configuration, as `store find` takes it.")
 @click.option("--view", metavar="VECTOR|KEY", help="This view, as `store find` takes it.")
 @click.option("--row", type=click.IntRange(0), help="The view of the sample in a row.")
-@click.option("--least", type=click.IntRange(1), default=1, show_default=True,
-              help="Leave out views with fewer complete passes: only what was topped up is merged.")  # fmt: skip
+@click.option(
+    "--least",
+    type=click.IntRange(1),
+    default=1,
+    show_default=True,
+    help="Leave out views with fewer complete passes: only what was topped up is merged.",
+)
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True, help="A folder.")
 @json_option
 def merge(

@@ -87,9 +87,12 @@ HERE = Path(__file__).parent
 def render_page(template: Path, **values: Any) -> str:
     """The page of a template; `page.html.j2`, which it may extend, lies beside this module. Text is escaped."""
     environment = Environment(
-        loader=FileSystemLoader([template.parent, HERE]), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
+        loader=FileSystemLoader([template.parent, HERE]),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
     environment.filters |= {"uri": data_uri, "breakable": breakable, "base64": lambda data: b64encode(data).decode()}
     return environment.get_template(template.name).render(**values)
 

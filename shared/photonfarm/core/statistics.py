@@ -90,9 +90,7 @@ def mean_ratio(images_a: Array, images_b: Array) -> tuple[float, float]:
     if b.mean() == 0:
         return float("nan"), float("nan")
     ratio = a.mean() / b.mean()
-    relative = np.sqrt(
-        a.var(ddof=1) / len(a) / max(a.mean() ** 2, 1e-60) + b.var(ddof=1) / len(b) / b.mean() ** 2
-    )  # fmt: skip
+    relative = np.sqrt(a.var(ddof=1) / len(a) / max(a.mean() ** 2, 1e-60) + b.var(ddof=1) / len(b) / b.mean() ** 2)
     return float(ratio), float(abs(ratio) * relative)
 
 

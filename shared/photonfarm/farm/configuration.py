@@ -21,8 +21,10 @@ def find_configuration(store: Store, scene: SceneStore, text: str | None) -> Mod
     wanted, groups = query.modification, len(scene.spec.groups)
     if isinstance(wanted, np.ndarray):
         if wanted.size != 4 * groups:
-            raise SpecError(f"--modification: has {wanted.size} numbers; {4 * groups} are required, 4 for each of the "
-                            f"{groups} movable groups of {scene.spec.name}")  # fmt: skip
+            raise SpecError(
+                f"--modification: has {wanted.size} numbers; {4 * groups} are required, 4 for each of the "
+                f"{groups} movable groups of {scene.spec.name}"
+            )
         return Modification.from_vector(wanted.reshape(groups, 4))
     found = find_samples(store, [scene.scene_id], query, limit=1).samples
     if not found:

@@ -99,9 +99,15 @@ def _script(
     further: Sequence[tuple[str, str]] = (),
 ) -> str:
     asked = [
-        f"--job-name={name}", *options, "--open-mode=append", "--requeue", f"--signal=B:TERM@{SIGNAL_S}",
-        "--ntasks=1", "--cpus-per-task=1", f"--chdir={at.folder}",
-    ]  # fmt: skip
+        f"--job-name={name}",
+        *options,
+        "--open-mode=append",
+        "--requeue",
+        f"--signal=B:TERM@{SIGNAL_S}",
+        "--ntasks=1",
+        "--cpus-per-task=1",
+        f"--chdir={at.folder}",
+    ]
     asked += [f"--partition={resources.partition}"] if resources.partition else []
     asked += [f"--time={resources.time}"] if resources.time else []
     asked += ["--gres=gpu:1"] if resources.gpu else []

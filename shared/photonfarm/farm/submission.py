@@ -230,12 +230,16 @@ def submit(
     anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten
     queued = _queue(opened, redis_url, retry=retry or anew)
     return Submission(
-        planned.scene_id, planned.plan, planned.new, planned.known, queued,
+        planned.scene_id,
+        planned.plan,
+        planned.new,
+        planned.known,
+        queued,
         note=note_first_plan(opened, named.spec) if planned.plan == 0 else None,
         halves_from=other if planned.new else None,
         replaced=None if before is None else _describe_replaced(before, named.spec),
         scenes=named.scenes,
-    )  # fmt: skip
+    )
 
 
 def _describe_replaced(there: SceneSpec, here: SceneSpec) -> str | None:

@@ -222,10 +222,13 @@ def _processes(
 def _start(arguments: list[str], environment: Mapping[str, str], log: Path) -> Process:
     with log.open("ab") as output:
         return subprocess.Popen(
-            tie(command(*arguments)), env=environment, stdin=subprocess.DEVNULL, stdout=output,
+            tie(command(*arguments)),
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
             stderr=subprocess.STDOUT,
             start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, by us
-        )  # fmt: skip
+        )
 
 
 def _stop(processes: list[Process]) -> None:
@@ -288,11 +291,15 @@ class _Farm:
         missing = found.planned_samples - found.committed_samples
         activities = status.activities if status and missing else {}  # a report may be seconds old
         return FarmProgress(
-            samples, passes, trained.step, self.steps, trained.note,
+            samples,
+            passes,
+            trained.step,
+            self.steps,
+            trained.note,
             min(sum(each.done for each in activities.values()), found.planned_samples - found.committed_samples),
             tuple(f"{name} {each}" for name, each in sorted(activities.items())),
             tuple(map(str, waits(self._queue, named, 0))),
-        )  # fmt: skip
+        )
 
     def _status(self) -> QueueStatus | None:
         """The queue's status, at most `ASK_S` old; None while nothing is known of it."""

@@ -137,10 +137,17 @@ class FarmWatch:
         if left is None and workers and progress.committed_samples:
             left = missing * core_s / progress.committed_samples / workers
         return SceneView(
-            scene.scene_id, scene.spec.name,
-            (progress.committed_samples - further[0], progress.planned_samples - further[1]), further,
-            (len(committed), scene.jobs()), in_hand, seen.size_bytes, core_s, rate, left if missing > 0 else None,
-        )  # fmt: skip
+            scene.scene_id,
+            scene.spec.name,
+            (progress.committed_samples - further[0], progress.planned_samples - further[1]),
+            further,
+            (len(committed), scene.jobs()),
+            in_hand,
+            seen.size_bytes,
+            core_s,
+            rate,
+            left if missing > 0 else None,
+        )
 
     def _pace(self, seen: _Seen, done: int) -> float | None:
         """Samples per second, over the last looks; None while they are too few, or nothing has been rendered."""

@@ -38,7 +38,14 @@ def samples_to_join(other: PlannedContent, rows: NDArray[np.int64], known: Plann
     here = np.array([known.modifications.get(each, UNUSED) for each in contents(modification)], np.int64)
     seen = view_contents(here[of_modification[first]], view)
     return SamplesToPlan(
-        modification, here, view, np.array([known.views.get(each, UNUSED) for each in seen], np.int64),
-        of_modification, of_view, other.column("sample_pass")[rows], keys.reshape(-1, KEY_BYTES),
-        other.column("modification_density")[modification_row], other.column("view_density")[view_row],
-    )  # fmt: skip
+        modification,
+        here,
+        view,
+        np.array([known.views.get(each, UNUSED) for each in seen], np.int64),
+        of_modification,
+        of_view,
+        other.column("sample_pass")[rows],
+        keys.reshape(-1, KEY_BYTES),
+        other.column("modification_density")[modification_row],
+        other.column("view_density")[view_row],
+    )

@@ -257,9 +257,15 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
     distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
     new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
     found = SamplesToPlan(
-        modifications, modification_row, views, view_row, of_view[view[new]], view[new], pass_[new],
+        modifications,
+        modification_row,
+        views,
+        view_row,
+        of_view[view[new]],
+        view[new],
+        pass_[new],
         np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
-    )  # fmt: skip
+    )
     return found, len(distinct)
 
 

@@ -102,9 +102,15 @@ def _candidates(planned: PlannedViews, views: Rows, count: Rows) -> SamplesToPla
     pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
     keys = sample_keys(planned.spec.radiance_id, modification[of_view[of_sample]], view[of_sample], pass_)
     return SamplesToPlan(
-        modification, modification_row, view, planned.view_row[views], of_view[of_sample], of_sample, pass_,
+        modification,
+        modification_row,
+        view,
+        planned.view_row[views],
+        of_view[of_sample],
+        of_sample,
+        pass_,
         np.frombuffer(b"".join(keys), np.uint8).reshape(-1, KEY_BYTES),
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -98,9 +98,13 @@ def beat(pipeline: Pipeline, name: str, report: WorkerReport, *, ttl_s: float) -
     """Write that a worker is alive, and what it tells; all of it, as Redis may have lost it."""
     key, now = WORKER + name, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
     known = {
-        "last_heartbeat": now, "queues": QUEUE, "pid": report.process, "hostname": socket.gethostname(),
-        "state": "busy" if report.doing else "idle", REPORT: json.dumps(asdict(report)),
-    }  # fmt: skip
+        "last_heartbeat": now,
+        "queues": QUEUE,
+        "pid": report.process,
+        "hostname": socket.gethostname(),
+        "state": "busy" if report.doing else "idle",
+        REPORT: json.dumps(asdict(report)),
+    }
     pipeline.hsetnx(key, "birth", now)
     pipeline.hset(key, mapping=known)  # type: ignore[arg-type]
     pipeline.pexpire(key, int(1000 * ttl_s))

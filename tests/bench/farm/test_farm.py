@@ -99,8 +99,10 @@ def test_processor_time_is_compared_for_the_same_jobs() -> None:
 
 def test_the_page_has_the_figures_and_their_targets() -> None:
     options = argparse.Namespace(spec="room", rows=32, jobs=10, repetitions=4)
-    two = [pairs.Pair(what, 1.0, factor, factor, factor, factor, 1.95)
-           for what, factor in (("workers", 1.87), ("rendering", 1.91), ("computing", 1.99))]  # fmt: skip
+    two = [
+        pairs.Pair(what, 1.0, factor, factor, factor, factor, 1.95)
+        for what, factor in (("workers", 1.87), ("rendering", 1.91), ("computing", 1.99))
+    ]
     text = farm.page(account(), two, options)
     assert "**Queue overhead: 0.86 %**" in text
     assert "**Store overhead: 8.62 %**" in text

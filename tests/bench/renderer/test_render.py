@@ -44,9 +44,15 @@ class Clockwork:
 
 
 KEY = {
-    "clock": "wall", "seconds": 0.5, "threads": 1, "size": 16, "seeds": 8, "versions": {"mitsuba": "3.9.1"},
-    "pilot_seconds": 20.0, "chosen": "",
-}  # fmt: skip
+    "clock": "wall",
+    "seconds": 0.5,
+    "threads": 1,
+    "size": 16,
+    "seeds": 8,
+    "versions": {"mitsuba": "3.9.1"},
+    "pilot_seconds": 20.0,
+    "chosen": "",
+}
 
 
 def measured(method: Clockwork, base: int, seeds: int = 8) -> MeasuredMethod:
@@ -61,12 +67,19 @@ def result_of(name: str = "cornell", chosen_noise: float = 0.5) -> dict[str, Any
     reference = reference_of([np.stack([Clockwork().render(k, 100_000).image for k in range(8)])])
     references = dict.fromkeys([*sets, "common"], reference)
     return {
-        "line": name, "scene": name, "max_depth": 8, "note": "", "reference": "test",
-        "chosen": {"connections": 4, "light_ratio": 0.25, "pilot_wall_s": 20.0, "why": ""}, "commit": "0123abc",
-        "absent": {"pyluxcore": "not expressible: a test"}, "differences": [],
+        "line": name,
+        "scene": name,
+        "max_depth": 8,
+        "note": "",
+        "reference": "test",
+        "chosen": {"connections": 4, "light_ratio": 0.25, "pilot_wall_s": 20.0, "why": ""},
+        "commit": "0123abc",
+        "absent": {"pyluxcore": "not expressible: a test"},
+        "differences": [],
         "rows": scoring.rows(sets, references, "wall"),
-        "gains": scoring.gains("chosen", sets, references, "wall"), "curves": scoring.curves(sets, references, "wall"),
-    }  # fmt: skip
+        "gains": scoring.gains("chosen", sets, references, "wall"),
+        "curves": scoring.curves(sets, references, "wall"),
+    }
 
 
 def test_calibration_meets_the_time_budget_and_tells_compilation_apart() -> None:
@@ -141,9 +154,14 @@ def test_without_the_method_chosen_there_is_no_verdict() -> None:
 
 @pytest.mark.parametrize(
     ("method", "ratio", "z", "expected"),
-    [("ptracer", 0.9, -20.0, " ‡"), ("ptracer", 0.9, -2.0, ""), ("path", 1.0005, 5.0, ""),
-     ("pyluxcore", 1.14, 9.0, " §"), ("pyluxcore", 1.03, 9.0, "")],
-)  # fmt: skip
+    [
+        ("ptracer", 0.9, -20.0, " ‡"),
+        ("ptracer", 0.9, -2.0, ""),
+        ("path", 1.0005, 5.0, ""),
+        ("pyluxcore", 1.14, 9.0, " §"),
+        ("pyluxcore", 1.03, 9.0, ""),
+    ],
+)
 def test_a_doubtful_mean_is_marked(method: str, ratio: float, z: float, expected: str) -> None:
     row = {"finite": True, "mean_ratio": {"value": ratio, "standard_error": 0.01, "z": z}}
     assert wording.mark(method, row) == expected

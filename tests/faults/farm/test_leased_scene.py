@@ -15,9 +15,12 @@ from photonfarm.store.model.lease import hold_lease
 
 @pytest.mark.parametrize("share", [None, "0/1"])
 def test_a_worker_leaves_a_scene_that_somebody_has_for_itself_until_it_is_free(
-    analytic: ModuleType, planned: Callable[..., SceneStore], redis_server: EmbeddedRedis, tmp_path: Path,
+    analytic: ModuleType,
+    planned: Callable[..., SceneStore],
+    redis_server: EmbeddedRedis,
+    tmp_path: Path,
     share: str | None,
-) -> None:  # fmt: skip
+) -> None:
     scene, connection, log = planned(4), connect(redis_server.url), tmp_path / "log"
     store, url = Store(scene.folder.parent.parent), None if share else redis_server.url
     with analytic.start_worker(

@@ -241,9 +241,13 @@ def test_a_job_that_ends_its_worker_again_and_again_is_set_aside(
 ) -> None:
     scene = planned(1)
     running = start(
-        scene.folder.parent.parent, redis_server.url, analytic.command(60), deadline_s=0.5, until_complete=True,
+        scene.folder.parent.parent,
+        redis_server.url,
+        analytic.command(60),
+        deadline_s=0.5,
+        until_complete=True,
         steady_s=0.1,
-    )  # fmt: skip
+    )
     assert running.wait(120) == 7
     failed = queue_status(connect(redis_server.url)).failed
     assert len(failed) == scene.jobs()

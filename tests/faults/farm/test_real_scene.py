@@ -26,11 +26,19 @@ def room_of_16_pixels(root: Path) -> SceneStore:
         "box": {"min": [-0.2, 0, -0.2], "max": [0.2, 0, 0.2]},
     }
     described = {
-        "name": "box", "scene": {"builtin": "cornell"}, "objects": [block], "points": 64, "exposure": 3.0,
-        "view": {"origin": {"min": [-0.5, 0.5, 0.8], "max": [0.5, 1.5, 1.5]},
-                 "look_at": {"min": [-0.5, 0.5, -0.5], "max": [0.5, 1.0, 0.0]}},
-        "film": {"width": 16, "height": 16}, "transport": {"half_spp": 2}, "photons": {"paths": 32, "depth": 2},
-    }  # fmt: skip
+        "name": "box",
+        "scene": {"builtin": "cornell"},
+        "objects": [block],
+        "points": 64,
+        "exposure": 3.0,
+        "view": {
+            "origin": {"min": [-0.5, 0.5, 0.8], "max": [0.5, 1.5, 1.5]},
+            "look_at": {"min": [-0.5, 0.5, -0.5], "max": [0.5, 1.0, 0.0]},
+        },
+        "film": {"width": 16, "height": 16},
+        "transport": {"half_spp": 2},
+        "photons": {"paths": 32, "depth": 2},
+    }
     store = Store(root, create=True)
     request = Request(modifications=4, views_per_modification=3)
     return store.scene(store.plan(parse_spec(described, where="test"), request, shard_rows=3).scene_id)

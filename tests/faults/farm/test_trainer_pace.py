@@ -123,9 +123,14 @@ def test_a_ratio_below_one_is_refused_as_it_would_stop_for_good() -> None:
 
 
 def test_a_worker_leaves_a_scene_that_is_ahead_says_so_and_renders_the_others(
-    analytic: ModuleType, store: Store, add: Callable[..., SceneStore], redis_server: EmbeddedRedis,
-    connection: redis.Redis, tmp_path: Path, capsys: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    analytic: ModuleType,
+    store: Store,
+    add: Callable[..., SceneStore],
+    redis_server: EmbeddedRedis,
+    connection: redis.Redis,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     """One scene with 6 samples that nobody has used, and a new one; 2 of each may be committed in any case."""
     code = """
 import runpy, sys

@@ -85,9 +85,13 @@ class StoreMachine(WritingMachine):
 
     @precondition(lambda self: any(model.committed for model in self.models))
     @rule(
-        number=scene_numbers, process=processes, which=any_index, file=any_index, at=st.floats(0, 1),
+        number=scene_numbers,
+        process=processes,
+        which=any_index,
+        file=any_index,
+        at=st.floats(0, 1),
         harm=st.sampled_from(["flip", "flip", "cut", "cut", "delete", "cut marker", "delete marker"]),
-    )  # fmt: skip
+    )
     def damage_and_repair(self, number: int, process: int, which: int, file: int, at: float, harm: str) -> None:
         """One file of a committed job; the repair takes back this job alone, and loses nothing that is left.
 

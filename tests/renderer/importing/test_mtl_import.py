@@ -131,8 +131,10 @@ def test_colours_in_each_form_are_read(
         ("d 1\nTf 0 0 0", {}),
         ("map_Kd -mm 0 2 four.png", {"map_Kd -mm": "colour"}),
         ("map_Ke -o .5 0 four.png\nmap_d four.png", {"map_Ke": "light"}),
-        ("map_Ks x.png\nmap_Ns x.png\ndecal x.png\nrefl -type sphere x.png",
-         {"map_Ks": "colour", "map_Ns": "colour", "decal": "colour", "refl": "colour"}),
+        (
+            "map_Ks x.png\nmap_Ns x.png\ndecal x.png\nrefl -type sphere x.png",
+            {"map_Ks": "colour", "map_Ns": "colour", "decal": "colour", "refl": "colour"},
+        ),
         ("disp x.png", {"disp": "geometry"}),
         ("illum 10", {"illum 10": "colour"}),
         ("map_Bump four.png", {"map_Bump": "colour"}),
@@ -143,7 +145,7 @@ def test_colours_in_each_form_are_read(
         ("map_d -imfchan m four.png", {"map_d -imfchan": "colour"}),
         ("map_Ka x.png\nKs .5 .1 .1\nPr .3\nPm 1\nPs 1\nPc 1\nPcr .1\nmap_aat on\nsharpness 60\nmap_Kd", {}),
     ],
-)  # fmt: skip
+)
 def test_statements_of_materials_are_carried_over_or_said(
     write_obj: Write, loaded: Loaded, lines: str, expected: dict[str, str]
 ) -> None:
@@ -219,8 +221,13 @@ def test_material_files_are_found_by_all_their_names(
 @pytest.mark.parametrize("name", ["mtl-texture-scale", "mtl-texture-scale-two-values"])
 def test_images_are_scaled(case: Callable[[str], Path], loaded: Loaded, name: str) -> None:
     _, made = loaded(case(f"{name}/it.obj"))
-    expected = {(0.125, 0.875): "red", (0.375, 0.875): "green", (0.375, 0.625): "white", (0.875, 0.375): "green",
-                (0.125, 0.625): "blue"}  # fmt: skip
+    expected = {
+        (0.125, 0.875): "red",
+        (0.375, 0.875): "green",
+        (0.375, 0.625): "white",
+        (0.875, 0.375): "green",
+        (0.125, 0.625): "blue",
+    }
     for at, colour in expected.items():
         assert reflectance(made, *at) == pytest.approx(FOUR[colour], abs=0.01)
 
@@ -296,11 +303,16 @@ def test_images_of_all_formats_are_read_by_what_they_hold(
     [
         (b"P6 1 1 100\n" + bytes([50, 100, 0]), (0.216, 1, 0)),
         (b"P3\n# grey\n1 1\n255\n128 128 128\n", (0.216, 0.216, 0.216)),
-        (b"BM" + struct.pack("<IHHI", 58, 0, 0, 54) + struct.pack("<IiiHHIIiiII", 40, 1, 1, 1, 16, 0, 4, 0, 0, 0, 0)
-         + struct.pack("<HH", 31 << 10, 0), (1, 0, 0)),
+        (
+            b"BM"
+            + struct.pack("<IHHI", 58, 0, 0, 54)
+            + struct.pack("<IiiHHIIiiII", 40, 1, 1, 1, 16, 0, 4, 0, 0, 0, 0)
+            + struct.pack("<HH", 31 << 10, 0),
+            (1, 0, 0),
+        ),
         (struct.pack("<BBBHHBHHHHBB", 0, 0, 2, 0, 0, 0, 0, 0, 1, 1, 24, 0x20) + bytes([255, 0, 0]), (0, 0, 1)),
     ],
-)  # fmt: skip
+)
 def test_images_of_old_forms_have_their_colours(
     tmp_path: Path, write_obj: Write, loaded: Loaded, data: bytes, expected: tuple[float, ...]
 ) -> None:

@@ -48,7 +48,9 @@ main(["status", "--store", "s3://bucket/store"])
 
 
 def test_a_folders_store_does_not_load_the_library(tmp_path: Path) -> None:
-    code = "import sys; from photonfarm.store import Store; Store(sys.argv[1], create=True); " \
-        "assert 'obstore' not in sys.modules"  # fmt: skip
+    code = (
+        "import sys; from photonfarm.store import Store; Store(sys.argv[1], create=True); "
+        "assert 'obstore' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", code, str(tmp_path / "store")], check=True)
     assert open_storage(tmp_path / "store").exists("photonfarm.json")

@@ -139,9 +139,10 @@ def test_near_its_limit_a_task_asks_for_itself_alone_and_puts_itself_alone_back(
     """
     workers, trainer = slurm("cornell", "--train", "--dry-run").stdout.split("#!/usr/bin/env bash\n")[1:]
     script, replaced = re.subn(
-        r"(?m)^.*photonfarm.* &$", "(trap 'exit 0' TERM; while :; do sleep 0.05; done) &",
+        r"(?m)^.*photonfarm.* &$",
+        "(trap 'exit 0' TERM; while :; do sleep 0.05; done) &",
         workers if is_array else trainer,
-    )  # fmt: skip
+    )
     assert replaced == 1
     asked = f"""
 squeue() {{ echo "squeue $*" >> {tmp_path}/asked; echo RUNNING; }}
@@ -156,8 +157,9 @@ scontrol() {{ echo "scontrol $*" >> {tmp_path}/asked; }}
     assert "the task is back in the queue" in done.stderr
     task = "7_3" if is_array else "7"
     assert (tmp_path / "asked").read_text().splitlines() == [
-        f"squeue --noheader --jobs {task} --format %T", f"scontrol requeue {task}",
-    ]  # fmt: skip
+        f"squeue --noheader --jobs {task} --format %T",
+        f"scontrol requeue {task}",
+    ]
 
 
 def test_the_launcher_needs_neither_mitsuba_nor_torch(tmp_path: Path) -> None:

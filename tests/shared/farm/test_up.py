@@ -114,8 +114,16 @@ def test_a_spec_that_is_not_there_is_refused_before_anything_is_made(tmp_path: P
     talk: Any = None  # nothing is said
     made = {"run": tmp_path / "run", "out": tmp_path / "out"}
     with pytest.raises(SpecError):
-        up.run_farm(str(tmp_path / "none.toml"), tmp_path / "store", Request(modifications=3), talk, workers=1,
-                    train_steps=train_steps, hold_out=0.5, **made)  # fmt: skip
+        up.run_farm(
+            str(tmp_path / "none.toml"),
+            tmp_path / "store",
+            Request(modifications=3),
+            talk,
+            workers=1,
+            train_steps=train_steps,
+            hold_out=0.5,
+            **made,
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -126,8 +134,17 @@ def test_references_that_cannot_be_planned_are_refused_before_anything_is_made(
     talk: Any = None  # nothing is said
     made = {"run": tmp_path / "run", "out": tmp_path / "out"}
     with pytest.raises(SpecError):
-        up.run_farm("cornell", tmp_path / "store", Request(modifications=30), talk, workers=1, train_steps=10,
-                    hold_out=1 / 3, **{"reference_views": 1, **wrong}, **made)  # fmt: skip
+        up.run_farm(
+            "cornell",
+            tmp_path / "store",
+            Request(modifications=30),
+            talk,
+            workers=1,
+            train_steps=10,
+            hold_out=1 / 3,
+            **{"reference_views": 1, **wrong},
+            **made,
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -148,8 +165,17 @@ def test_a_refusal_does_not_promise_that_the_same_command_goes_on(
     code = SpecError.exit_code
     monkeypatch.setattr(up, "command", lambda *_: [sys.executable, "-c", f"import sys; sys.exit({code})"])
     with pytest.raises(IncompleteError) as caught:
-        up.run_farm("cornell", tmp_path / "store", Request(modifications=2), Quiet(), workers=1, train_steps=0,
-                    hold_out=0.5, run=tmp_path / "run", out=tmp_path / "out")  # fmt: skip
+        up.run_farm(
+            "cornell",
+            tmp_path / "store",
+            Request(modifications=2),
+            Quiet(),
+            workers=1,
+            train_steps=0,
+            hold_out=0.5,
+            run=tmp_path / "run",
+            out=tmp_path / "out",
+        )
     assert str(caught.value).startswith(f"worker-1 ended with exit code {code}; ")
     assert "same command" not in str(caught.value)
 
@@ -162,8 +188,17 @@ def test_what_failed_first_is_told_also_if_the_preview_fails_after_it(
 
     monkeypatch.setattr(up, "command", command)
     with pytest.raises(IncompleteError) as caught:
-        up.run_farm("cornell", tmp_path / "store", Request(modifications=2), Quiet(), workers=1, train_steps=0,
-                    hold_out=0.5, run=tmp_path / "run", out=tmp_path / "out")  # fmt: skip
+        up.run_farm(
+            "cornell",
+            tmp_path / "store",
+            Request(modifications=2),
+            Quiet(),
+            workers=1,
+            train_steps=0,
+            hold_out=0.5,
+            run=tmp_path / "run",
+            out=tmp_path / "out",
+        )
     said = str(caught.value)
     assert said.startswith("worker-1 ended with exit code 6; ")
     assert "says: no work. What is rendered" in said

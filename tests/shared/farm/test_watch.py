@@ -175,9 +175,13 @@ def test_a_redis_that_fails_on_the_way_ends_no_watch(
 
 
 def test_status_finds_the_redis_of_an_up_that_is_at_work_here(
-    scene: SceneStore, store: Store, common_redis: EmbeddedRedis, connection: redis.Redis, tmp_path: Path,
+    scene: SceneStore,
+    store: Store,
+    common_redis: EmbeddedRedis,
+    connection: redis.Redis,
+    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+) -> None:
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
     queue_samples.told(connection, "ada", queue.WorkerReport(host="elsewhere", process=1))

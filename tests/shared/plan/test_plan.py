@@ -91,8 +91,11 @@ def test_a_grown_request_plans_only_what_is_new_and_refers_to_the_rest(store: St
     assert after[:24] == before
     assert len(set(after)) == larger.samples
     rows = [scene.job_rows(job) for job in range(scene.jobs())]
-    views = {(r.modifications[s.modification_row].vector.tobytes(), r.views[s.view_row].vector.tobytes()): s.view_row
-             for r in rows for s in r.samples}  # fmt: skip
+    views = {
+        (r.modifications[s.modification_row].vector.tobytes(), r.views[s.view_row].vector.tobytes()): s.view_row
+        for r in rows
+        for s in r.samples
+    }
     assert sum(len(r.new_views) for r in rows) == len(views)
     assert set(views.values()) == {row for r in rows for row in r.new_views}
 

@@ -49,9 +49,13 @@ def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[int, Pat
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     environment = {
-        **os.environ, "REDIS_SERVER": str(server_binary()), "REDIS_DATA": str(folder), "REDIS_PORT": str(port),
-        "REDIS_BIND": "127.0.0.1", "PHOTONFARM_REDIS_PASSWORD_FILE": str(folder / "password"),
-    }  # fmt: skip
+        **os.environ,
+        "REDIS_SERVER": str(server_binary()),
+        "REDIS_DATA": str(folder),
+        "REDIS_PORT": str(port),
+        "REDIS_BIND": "127.0.0.1",
+        "PHOTONFARM_REDIS_PASSWORD_FILE": str(folder / "password"),
+    }
     with (
         (folder / "log").open("wb") as log,
         subprocess.Popen(["sh", str(START)], env=environment, stdout=log) as process,
@@ -126,9 +130,16 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
             queue.bury(limited, name)
         queue.release(limited, store)
         forbidden = (
-            ("FLUSHALL",), ("CONFIG", "GET", "dir"), ("KEYS", "*"), ("SHUTDOWN",), ("ACL", "LIST"),
-            ("SET", "other", "1"), ("PUBLISH", "rq:pubsub:x", "{}"), ("MODULE", "LIST"), ("REPLICAOF", "h", "1"),
-        )  # fmt: skip
+            ("FLUSHALL",),
+            ("CONFIG", "GET", "dir"),
+            ("KEYS", "*"),
+            ("SHUTDOWN",),
+            ("ACL", "LIST"),
+            ("SET", "other", "1"),
+            ("PUBLISH", "rq:pubsub:x", "{}"),
+            ("MODULE", "LIST"),
+            ("REPLICAOF", "h", "1"),
+        )
         for command in forbidden:
             with pytest.raises(redis.exceptions.NoPermissionError):
                 limited.execute_command(*command)

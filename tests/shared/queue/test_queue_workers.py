@@ -77,8 +77,10 @@ def test_workers_are_told_of_as_rq_does_for_a_time_and_again_after_redis_lost_th
         assert (worker.name, worker.pid, worker.queue_names()) == ("a:b", os.getpid(), [queue.QUEUE])
         status = queue_status(connection)
         assert (status.workers, status.paused, status.left) == (
-            1, {"a:b": "the disk is full"}, {SCENE_ID: {"a:b": "no file"}},
-        )  # fmt: skip
+            1,
+            {"a:b": "the disk is full"},
+            {SCENE_ID: {"a:b": "no file"}},
+        )
         assert status.activities == {"a:b": report.doing}
         assert str(report.doing) == "renders samples 3/8"
         connection.flushall()

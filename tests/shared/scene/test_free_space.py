@@ -30,9 +30,18 @@ TAKES = ((-0.5, -0.1, -0.5), (0.5, 2.0, 0.5))  # around the `at` of the only gro
 
 
 def with_space(free: np.ndarray = FREE, **view: Any) -> SceneSpec:
-    spec = samples.small_spec(view={"origin": BOX, "look_at": BOX}, objects=[
-        {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "removal_probability": 0.3,
-         "box": {"min": [0, 0, 0], "max": [4, 0, 2]}}])  # fmt: skip
+    spec = samples.small_spec(
+        view={"origin": BOX, "look_at": BOX},
+        objects=[
+            {
+                "name": "object",
+                "shapes": ["tall-block"],
+                "at": [0, 0, 0],
+                "removal_probability": 0.3,
+                "box": {"min": [0, 0, 0], "max": [4, 0, 2]},
+            }
+        ],
+    )
     shape = free.shape
     space = FreeSpace(of=spec.free_space_digest, cells=shape, free=pack(free), groups={"object": TAKES})
     return spec.model_copy(update={"view": spec.view.model_copy(update={"free_space": space, **view})})
@@ -123,9 +132,16 @@ def test_free_space_of_another_scene_is_refused() -> None:
 
 
 @pytest.mark.parametrize(
-    "changed", [{"free": "no base64!"}, {"free": "aGVsbG8="}, {"cells": [8, 2, 5]}, {"cells": [8, 2, 900]},
-                {"free": pack(np.zeros((8, 2, 4), np.bool_))}], ids=str,
-)  # fmt: skip
+    "changed",
+    [
+        {"free": "no base64!"},
+        {"free": "aGVsbG8="},
+        {"cells": [8, 2, 5]},
+        {"cells": [8, 2, 900]},
+        {"free": pack(np.zeros((8, 2, 4), np.bool_))},
+    ],
+    ids=str,
+)
 def test_cells_that_cannot_be_read_are_refused(changed: dict[str, Any]) -> None:
     described = with_space().model_dump(mode="json")
     described["view"]["free_space"] |= changed
@@ -160,8 +176,10 @@ def test_an_orbit_goes_around_what_stands_there_and_a_path_through_it_is_refused
     with pytest.raises(SpecError):
         orbit(filled(spec), 24, rest(spec))
 
-    through = {"frames": 5, "views": [{"origin": [3, 0.5, 0.5], "look_at": [0, 0, 0]},
-                                      {"origin": [0.5, 0.5, 1.5], "look_at": [4, 0, 0]}]}  # fmt: skip
+    through = {
+        "frames": 5,
+        "views": [{"origin": [3, 0.5, 0.5], "look_at": [0, 0, 0]}, {"origin": [0.5, 0.5, 1.5], "look_at": [4, 0, 0]}],
+    }
     path = CameraPath.model_validate(through).sample()
     with pytest.raises(SpecError, match=r"frame 3.*solid"):
         check_clear(spec, path, gone)

@@ -83,10 +83,22 @@ def test_a_key_is_found_on_the_line_where_it_stands() -> None:
         "size = [1, 1]\n[view]\n"
     )
     assert lines == {
-        "name": 1, "scene": 2, "scene.file": 2, "objects.0": 4, "objects.0.name": 5, "objects.0.shapes": 6,
-        "objects.0.at": 10, "lights.0": 11, "lights.1": 12, "lights.1.box": 13, "lights.1.box.min": 13,
-        "lights.1.box.max": 13, "lights.1.rectangle": 14, "lights.1.rectangle.size": 15, "view": 16,
-    }  # fmt: skip
+        "name": 1,
+        "scene": 2,
+        "scene.file": 2,
+        "objects.0": 4,
+        "objects.0.name": 5,
+        "objects.0.shapes": 6,
+        "objects.0.at": 10,
+        "lights.0": 11,
+        "lights.1": 12,
+        "lights.1.box": 13,
+        "lights.1.box.min": 13,
+        "lights.1.box.max": 13,
+        "lights.1.rectangle": 14,
+        "lights.1.rectangle.size": 15,
+        "view": 16,
+    }
 
 
 def test_submit_says_what_is_doubted_with_its_line_and_plans_nevertheless(tmp_path: Path) -> None:

@@ -110,10 +110,15 @@ def _fog(size: int) -> SceneDict:
 
 REFUSALS = (
     Refusal(30, "gaussian-filter", seen_by(film={"rfilter": {"type": "gaussian"}}), "only the box filter is allowed"),
-    Refusal(None, "orthographic-camera", orthographic, "light paths can be joined to 'perspective' and 'thinlens'",
-            allowed=EYE_ALONE[0]),
+    Refusal(
+        None,
+        "orthographic-camera",
+        orthographic,
+        "light paths can be joined to 'perspective' and 'thinlens'",
+        allowed=EYE_ALONE[0],
+    ),
     Refusal(None, "medium", _fog, "bounds a participating medium"),
-)  # fmt: skip
+)
 """Row 30, and the other scenes that `bdpt` refuses."""
 
 # ------------------------------------------------ Rows ------------------------------------------------
@@ -123,31 +128,70 @@ def _depth(max_depth: int, rr_depth: int) -> HardScene:
     name = f"depth-{'unbounded' if max_depth < 0 else max_depth}-roulette-{rr_depth}"
     shown = (max_depth, rr_depth) in ((1, 1000), (2, 1), (3, 1000), (-1, 1))
     quick = replace(QUICK, truth_spp=256)
-    return HardScene(35, name, "depth and roulette mean what they mean for `path`", light_on_wall, PATH,
-                     max_depth=max_depth, rr_depth=rr_depth, quick=quick if shown else None,
-                     long=replace(LONG, size=16, blocks=4))  # fmt: skip
+    return HardScene(
+        35,
+        name,
+        "depth and roulette mean what they mean for `path`",
+        light_on_wall,
+        PATH,
+        max_depth=max_depth,
+        rr_depth=rr_depth,
+        quick=quick if shown else None,
+        long=replace(LONG, size=16, blocks=4),
+    )
 
 
 SCENES = (
-    HardScene(27, "camera-in-light", "the camera lies in a light: connections of length 0", camera_in_light, PATH,
-              max_over_mean=None),
-    HardScene(27, "camera-at-wall", "the camera touches a wall: splats of huge weight", camera_at_wall, PATH,
-              quick=replace(QUICK, resolution=0.02)),
-    HardScene(27, "blocker-before-near-plane", "a blocker that the near plane cuts away", blocked_before_near_plane,
-              PATH),
+    HardScene(
+        27,
+        "camera-in-light",
+        "the camera lies in a light: connections of length 0",
+        camera_in_light,
+        PATH,
+        max_over_mean=None,
+    ),
+    HardScene(
+        27,
+        "camera-at-wall",
+        "the camera touches a wall: splats of huge weight",
+        camera_at_wall,
+        PATH,
+        quick=replace(QUICK, resolution=0.02),
+    ),
+    HardScene(
+        27, "blocker-before-near-plane", "a blocker that the near plane cuts away", blocked_before_near_plane, PATH
+    ),
     HardScene(28, "thin-lens", "a lens with an area", seen_by(**LENS), PATH),
     HardScene(28, "clipped-thin-lens", "the same with clipping planes in the room", seen_by(**CLIPPED_LENS), PATH),
-    HardScene(28, "orthographic", "a camera that light cannot be joined to", orthographic, PATH,
-              settings=EYE_ALONE, quick_settings=EYE_ALONE),
-    HardScene(29, "crop", "a crop window with the principal point moved", cropped,
-              crop_of_full_image(seen_by(**OFFSET), slice(2, 14), slice(4, 12))),
+    HardScene(
+        28,
+        "orthographic",
+        "a camera that light cannot be joined to",
+        orthographic,
+        PATH,
+        settings=EYE_ALONE,
+        quick_settings=EYE_ALONE,
+    ),
+    HardScene(
+        29,
+        "crop",
+        "a crop window with the principal point moved",
+        cropped,
+        crop_of_full_image(seen_by(**OFFSET), slice(2, 14), slice(4, 12)),
+    ),
     *(
-        HardScene(32, f"scale-{factor:g}", "lengths that ray offsets and clamps do not expect", scaled(factor),
-                  same_by_bdpt(scaled(1.0), "the same image at scale 1"), max_depth=5,
-                  quick=replace(QUICK, spp=96) if factor > 1 else None)
+        HardScene(
+            32,
+            f"scale-{factor:g}",
+            "lengths that ray offsets and clamps do not expect",
+            scaled(factor),
+            same_by_bdpt(scaled(1.0), "the same image at scale 1"),
+            max_depth=5,
+            quick=replace(QUICK, spp=96) if factor > 1 else None,
+        )
         for factor in (1e3, 1e-3)
     ),
     # Unbounded paths without any roulette end by themselves in a room that loses light, but late
     *(_depth(max_depth, rr) for max_depth in (1, 2, 3, -1) for rr in (1, 1000 if max_depth > 0 else 50)),
-)  # fmt: skip
+)
 """The scenes of rows 27–29, 32 and 35."""

@@ -121,29 +121,65 @@ def sheets(size: int) -> SceneDict:
 _DISAGREE = "shading and geometric normals disagree; `ptracer` is off by up to 23 %"
 
 SCENES = (
-    HardScene(17, "glass-plate", "a dielectric before the camera: light paths cannot be joined to it", glass_plate,
-              PATH, max_depth=8),
-    HardScene(18, "mask-veils", "half-transparent sheets before light and camera", hard_scenes.mask, PATH,
-              quick=replace(QUICK, spp=256, truth_spp=1024), long=replace(LONG, resolution=0.008)),
-    HardScene(18, "null-veils", "null surfaces before light and camera", null_veils, PATH,
-              quick=replace(QUICK, spp=128, truth_spp=512), long=replace(LONG, resolution=0.006)),
+    HardScene(
+        17,
+        "glass-plate",
+        "a dielectric before the camera: light paths cannot be joined to it",
+        glass_plate,
+        PATH,
+        max_depth=8,
+    ),
+    HardScene(
+        18,
+        "mask-veils",
+        "half-transparent sheets before light and camera",
+        hard_scenes.mask,
+        PATH,
+        quick=replace(QUICK, spp=256, truth_spp=1024),
+        long=replace(LONG, resolution=0.008),
+    ),
+    HardScene(
+        18,
+        "null-veils",
+        "null surfaces before light and camera",
+        null_veils,
+        PATH,
+        quick=replace(QUICK, spp=128, truth_spp=512),
+        long=replace(LONG, resolution=0.006),
+    ),
     HardScene(19, "normal-floor", _DISAGREE, hard_scenes.normal_floor, PATH),
     HardScene(19, "bump-floor", _DISAGREE, hard_scenes.bump_floor, PATH),
     HardScene(20, "smooth-balls", "coarse balls with smooth normals, one- and two-sided", smooth_balls, PATH),
     HardScene(20, "twosided-sheets", "thin sheets with two different sides", hard_scenes.twosided, PATH, quick=None),
-    HardScene(21, "bumped-sphere", "a closed, bump-mapped sphere: weights of long paths must not spike", bumped_sphere,
-              PATH, max_depth=12, max_over_mean=3.0),
+    HardScene(
+        21,
+        "bumped-sphere",
+        "a closed, bump-mapped sphere: weights of long paths must not spike",
+        bumped_sphere,
+        PATH,
+        max_depth=12,
+        max_over_mean=3.0,
+    ),
     HardScene(31, "touching", "surfaces that touch, coincide and share corners: distances of 0", touching, PATH),
     *(
-        HardScene(33, f"rough-glass-{alpha:g}", "lobes from almost a point to almost diffuse, both ways through",
-                  rough_glass(alpha), PATH, max_depth=8, long=replace(LONG, resolution=0.005),
-                  quick=replace(QUICK, resolution=0.02) if alpha != 0.05 else None)
+        HardScene(
+            33,
+            f"rough-glass-{alpha:g}",
+            "lobes from almost a point to almost diffuse, both ways through",
+            rough_glass(alpha),
+            PATH,
+            max_depth=8,
+            long=replace(LONG, resolution=0.005),
+            quick=replace(QUICK, resolution=0.02) if alpha != 0.05 else None,
+        )
         for alpha in (0.001, 0.05, 0.5)
     ),
-    HardScene(34, "plastics", "lobes chosen at random, one a mirror: plastic, principled, blend", hard_scenes.plastics,
-              PATH),
-    HardScene(34, "rough-surfaces", "rough plastic, anisotropic metal, gold, normal-mapped metal", rough_surfaces,
-              PATH),
+    HardScene(
+        34, "plastics", "lobes chosen at random, one a mirror: plastic, principled, blend", hard_scenes.plastics, PATH
+    ),
+    HardScene(
+        34, "rough-surfaces", "rough plastic, anisotropic metal, gold, normal-mapped metal", rough_surfaces, PATH
+    ),
     HardScene(34, "sheets", "a pane, thin principled, a cut-out mask, a blend", sheets, PATH),
-)  # fmt: skip
+)
 """The scenes of rows 17–21, 31, 33 and 34."""

@@ -239,9 +239,16 @@ class _SceneChecking:
         totals = self._totals
         share = totals.back_facing_pixels / totals.hit_pixels if totals.hit_pixels else None
         return SceneReport(
-            self._scene_id, name, totals.jobs, totals.samples, totals.size_bytes, share,
-            totals.halves.result(), self._findings.groups(), tuple(set_aside),
-        )  # fmt: skip
+            self._scene_id,
+            name,
+            totals.jobs,
+            totals.samples,
+            totals.size_bytes,
+            share,
+            totals.halves.result(),
+            self._findings.groups(),
+            tuple(set_aside),
+        )
 
     # ----------------------------------------------------------------------------------------------------------- repair
 

@@ -175,9 +175,12 @@ class Claim:
     def place(self) -> bool:
         """Place the file; False if there is one."""
         document = {
-            "what": self._what, "space": process_space(), "process": os.getpid(), "token": self._token,
+            "what": self._what,
+            "space": process_space(),
+            "process": os.getpid(),
+            "token": self._token,
             "beat": self._beat,
-        }  # fmt: skip
+        }
         return put_json(self._storage, document, self._name, replace=self._beat > 0)
 
     def is_own(self) -> bool:

@@ -66,9 +66,15 @@ def _withdraw(scene: SceneStore, number: int | None) -> Withdrawal:
     rendered = sum(count for job, count in samples.items() if job in committed)
     forgotten = sum(samples[job] for job in jobs)
     return Withdrawal(
-        scene.scene_id, scene.spec.name, plan.number, len(jobs), forgotten, rendered,
-        sum(samples.values()) - rendered - forgotten, _left(found, committed | jobs),
-    )  # fmt: skip
+        scene.scene_id,
+        scene.spec.name,
+        plan.number,
+        len(jobs),
+        forgotten,
+        rendered,
+        sum(samples.values()) - rendered - forgotten,
+        _left(found, committed | jobs),
+    )
 
 
 def _left(found: list[StoredPlan], done: set[int]) -> str:

@@ -62,8 +62,10 @@ class Query:
             _vector_or_key("--modification", modification, 4),
             _vector_or_key("--view", view, 6),
             None if sample is None else bytes.fromhex(sample),
-            row, job, tolerance,
-        )  # fmt: skip
+            row,
+            job,
+            tolerance,
+        )
 
 
 def _vector_or_key(option: str, text: str | None, multiple: int) -> F32 | Key | None:
@@ -141,10 +143,13 @@ def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit:
     """
     found = [(index, SceneMatch(store.scene(scene_id), query)) for index, scene_id in enumerate(scene_ids)]
     order = sorted(
-        ((float(d), index, int(row), match) for index, match in found
-         for row, d in zip(match.rows[:limit], match.distance[:limit], strict=True)),
+        (
+            (float(d), index, int(row), match)
+            for index, match in found
+            for row, d in zip(match.rows[:limit], match.distance[:limit], strict=True)
+        ),
         key=lambda entry: entry[:3],
-    )  # fmt: skip
+    )
     nearest = [match.nearest for _, match in found if match.nearest is not None]
     described = tuple(match.describe(row, distance) for distance, _, row, match in order[:limit])
     return Matches(sum(len(match.rows) for _, match in found), described, min(nearest, default=None))

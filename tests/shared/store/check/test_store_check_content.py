@@ -231,6 +231,7 @@ def test_views_of_nothing_and_views_from_behind_are_noted_and_are_no_error(store
     report = checked(store)
     assert report.exit_code == 0
     assert {name: count for name, count in noted(report).items() if name != "no-marker"} == {
-        "empty-view": 1, "back-facing": 1,
-    }  # fmt: skip
+        "empty-view": 1,
+        "back-facing": 1,
+    }
     assert report.scenes[0].back_facing_share == pytest.approx(1 / 3)

@@ -202,9 +202,7 @@ def test_a_damaged_job_stays_where_it_is_until_its_plan_is_whole(store: Store, s
     flip(shard(scene, "depth", 1), 20)
     before = data(scene)
     report = checked(store, repair=True)
-    assert (found(report), report.exit_code) == (
-        {"plan-inputs": 4, "checksum": 1, "plan": 1, "left-in-place": 1}, 4
-    )  # fmt: skip
+    assert (found(report), report.exit_code) == ({"plan-inputs": 4, "checksum": 1, "plan": 1, "left-in-place": 1}, 4)
     assert (report.scenes[0].set_aside, report.quarantine, data(scene) == before) == ((), None, True)
     assert marker(scene, 1).exists()
     for path, whole in inputs.items():

@@ -39,8 +39,18 @@ def shard(scene: SceneStore, name: str) -> Path:
     return path
 
 
-OUTPUTS = ("radiance", "radiance_wide", "depth", "albedo", "normal", "direct", "point_light", "photon_position",
-           "photon_power", "photon_bounce")  # fmt: skip
+OUTPUTS = (
+    "radiance",
+    "radiance_wide",
+    "depth",
+    "albedo",
+    "normal",
+    "direct",
+    "point_light",
+    "photon_position",
+    "photon_power",
+    "photon_bounce",
+)
 
 
 @pytest.mark.parametrize("name", OUTPUTS)

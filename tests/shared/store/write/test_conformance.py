@@ -164,8 +164,11 @@ def test_the_example_of_the_page_reads_the_store(store: Store) -> None:
     code = section.split("```")[1].removeprefix("python\n")
     done = subprocess.run(
         [sys.executable, "-I", "-W", "error", "-c", code],
-        cwd=Path(store.root).parent, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        cwd=Path(store.root).parent,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
     assert len(lines) == 28 + 3 + 2

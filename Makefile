@@ -62,7 +62,7 @@ check: $(DEV)
 # The documentation as a site; a link to nothing is an error.
 docs: $(VENV)/.docs-ready
 	$(BIN)/python scripts/cli_page.py
-	$(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 $(VENV)/.docs-ready: $(DEV)
 	$(PIP) --group docs

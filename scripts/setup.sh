@@ -35,6 +35,7 @@ need libllvm19 has_llvm # Dr.Jit compiles its kernels with it; 15 and 16 crash o
 [ -x "$venv/bin/python" ] || "$python" -m venv "$venv"
 # Without bytecode, of which most would never be read: Python makes what it needs when it first needs it.
 install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt "$@"; }
+"$venv/bin/python" -m pip uninstall --quiet --yes photonfarm-shared photonfarm-renderer photonfarm-trainer >/dev/null 2>&1 || true # of before they were one
 say "installing packages into $venv: minutes, and with their dependencies gigabytes of disk; pip is silent meanwhile"
 if [ "${2:-}" = dev ]; then
   install 'pip>=25.1' # the first that knows dependency groups

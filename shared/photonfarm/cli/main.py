@@ -1,8 +1,7 @@
 """The command `photonfarm`: its verbs, its configuration file, and its exit codes.
 
 Verbs are entry points of the group `photonfarm.commands`, each imported only when it is used. The entry point "scene"
-is the verb `photonfarm scene`, a group, and "scene.plan" is a subcommand of it, even if another distribution provides
-the verb.
+is the verb `photonfarm scene`, a group, and "scene.plan" is a subcommand of it.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Suggesting(click.Group):
 
 
 class Umbrella(Suggesting):
-    """A group whose verbs are those of the services that are installed."""
+    """A group whose verbs are the entry points."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
         """The installed verbs."""
@@ -84,7 +83,7 @@ class Extended(Suggesting):
         return sorted({*super().list_commands(ctx), *self._below})
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The subcommand; that of another distribution is imported only now."""
+        """The subcommand; one with an entry point of its own is imported only now."""
         entry = self._below.get(cmd_name)
         return super().get_command(ctx, cmd_name) if entry is None else entry.load()
 
@@ -186,7 +185,9 @@ def _extra_of(package: str) -> str | None:
     """The extra of photonfarm that brings a package; None if none does."""
     for requirement in requires("photonfarm") or ():
         name, _, marker = requirement.partition(";")
-        if re.match(rf"{re.escape(package)}\b", name) and (extra := re.search(r"extra == .(\w+)", marker)):
+        if re.match(package.replace("_", "[-_.]") + r"\b", name, re.IGNORECASE) and (
+            extra := re.search(r"extra == .(\w+)", marker)
+        ):
             return extra[1]
     return None
 

@@ -1,6 +1,6 @@
 """Child processes that end with their parent, requests to stop, and the scope of process numbers.
 
-Verbs of `photonfarm` run as child processes, whichever distribution provides them.
+Verbs of `photonfarm` run as child processes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
-from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 
 _LAUNCH = """
@@ -156,9 +156,9 @@ GROUP = "photonfarm.commands"
 """The group of entry points that holds all verbs."""
 
 
-def is_installed(name: str) -> bool:
-    """Whether a verb such as "buffers" or "scene.cost" is installed, by any service."""
-    return bool(entry_points(group=GROUP, name=name))
+def can_render() -> bool:
+    """Whether Mitsuba is installed here, which all verbs of the renderer need."""
+    return find_spec("mitsuba") is not None
 
 
 def command(*arguments: str | Path) -> list[str]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from photonfarm.core.errors import BackendError, StoreError
-from photonfarm.core.processes import command, is_installed, usable_cores
+from photonfarm.core.processes import command, can_render, usable_cores
 from photonfarm.farm.submission import Submission
 from photonfarm.plan.allocation import Allocation, CostModel
 from photonfarm.plan.request import Extent, Request
@@ -99,8 +99,8 @@ def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
     The renderer's own messages go to stderr.
     """
     name = " ".join(VERB)
-    if not is_installed(".".join(VERB)):
-        raise BackendError("the renderer, which measures them, is not installed here")
+    if not can_render():
+        raise BackendError("the renderer, which measures them, is not installed here: pip install 'photonfarm[render]'")
     done = subprocess.run(
         command(*VERB, "--json", "--seconds", f"{seconds:g}", "--", spec), stdout=subprocess.PIPE, check=False
     )

@@ -47,7 +47,7 @@ def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Verb:
         script.write_text(f'#!/bin/sh\necho "$@" > "{asked}"\ncat "{tmp_path}/says"\nexit {code}\n')
         script.chmod(script.stat().st_mode | stat.S_IXUSR)
         monkeypatch.setattr(sys, "executable", str(script))
-        monkeypatch.setattr(dry_run, "is_installed", lambda name: name == "scene.cost")
+        monkeypatch.setattr(dry_run, "can_render", lambda: True)
         monkeypatch.setattr(dry_run, "usable_cores", lambda: 4)
         return asked
 
@@ -185,7 +185,7 @@ def test_of_a_static_scene_only_samples_per_pixel_are_suggested_and_its_configur
 
 
 def test_without_the_renderer_the_size_is_said_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dry_run, "is_installed", lambda _: False)
+    monkeypatch.setattr(dry_run, "can_render", lambda: False)
     result = run(spec_file(tmp_path), tmp_path / "none", "--modifications", "1", "--views", "12")
     assert result.exit_code == 0
     assert "12 samples would be planned, 0 are already\nat most 0.1 MB before compression\n" in result.stdout

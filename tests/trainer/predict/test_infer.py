@@ -188,7 +188,7 @@ def test_what_cannot_be_shown_is_refused(
     for named, network, buffers in refused:
         with pytest.raises(SpecError, match=named):
             infer.show_frames(store, network, buffers, tmp_path / "out")
-    monkeypatch.setattr(infer, "is_installed", lambda _: False)
+    monkeypatch.setattr(infer, "can_render", lambda: False)
     with pytest.raises(SpecError, match=r"buffers --scene .* --orbit 3"):
         infer.render_frames(store, run, ["--orbit", "3"])
     monkeypatch.undo()

@@ -67,7 +67,7 @@ def test_two_writers_of_which_one_replaces_what_the_other_kept_announce_what_is_
 
     monkeypatch.setattr(scene.storage, "adopt", meanwhile)
     if theirs == "after":
-        before(monkeypatch, markers, "place", lambda: samples.commit(another, 0, other))
+        before(monkeypatch, markers, "place_marker", lambda: samples.commit(another, 0, other))
     samples.commit(scene, 0, ours, clock=lambda: datetime(2031, 1, 1, tzinfo=UTC))
     told = [json.loads(path.read_text())["when"] for path in scene.storage.root.glob("quarantine/*/job-*.json")]
     assert told == (["2031-01-01T00:00:00+00:00"] if theirs == "before" else [])  # of the other's marker, wrong now
@@ -109,7 +109,7 @@ def test_a_writer_whose_files_are_all_its_own_compares_them_with_a_marker_that_c
         figures = scene.marker(0)["figures"]
         assert markers.place_marker(another.storage, another.name, 1, {file: about}, figures)
 
-    before(monkeypatch, markers, "place", meanwhile)
+    before(monkeypatch, markers, "place_marker", meanwhile)
     assert samples.commit(scene, 1, samples.outputs(scene, 1))
     whole(scene)
 

@@ -100,6 +100,9 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 def scene_shapes(spec: str, as_json: bool) -> None:
     """List the shapes of SPEC, or of a Mitsuba scene file (.xml): ids, groups, materials, triangles, lights, boxes."""
     from photonfarm.cli import show
+    from photonfarm.renderer.scene import backend
+
+    backend.load(threads=1)
     from photonfarm.renderer.tools.check import shapes
 
     with tell_waiting(partial(click.echo, err=True), f"loading the shapes of {spec}"):

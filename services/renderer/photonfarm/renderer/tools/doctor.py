@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -37,16 +37,24 @@ def examine(store: str | Path, redis_url: str, log: Log = lambda _: None) -> Ite
     """Every check in turn; optional parts that are absent are reported and give exit code 0."""
     yield _packages()
     yield _optional(_cards(cards_here()), "needed by `--device cuda` only")
-    yield _try("renderer", lambda: _renders(log))
+    renderer = _try("renderer", lambda: _renders(log))
+    yield renderer if can_render() else _optional(renderer, "needed by workers and by verbs that look into a scene")
     yield _try("store", lambda: _writes(store))
-    yield _try("embedded Redis", _starts_redis)
+    yield _optional(_try("embedded Redis", _starts_redis), "needed by `up` and `photonfarm redis` only")
     yield _optional(_try("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
     yield _optional(_scenes(), "needed by the ready specs under scenes/ only")
 
 
 def _packages() -> MachineCheck:
-    names = ("photonfarm", "mitsuba", "drjit", "zarr", "rq", "redis")
-    return MachineCheck("packages", True, ", ".join(f"{name} {version(name)}" for name in names))
+    names = ("photonfarm", "mitsuba", "drjit", "torch", "zarr", "rq", "redis")
+    return MachineCheck("packages", True, ", ".join(f"{name} {_version(name)}" for name in names))
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "absent"
 
 
 def _try(name: str, check: Callable[[], str]) -> MachineCheck:

@@ -89,7 +89,7 @@ def choose_kept_pixels(key: Key, spec: SceneSpec, of: int) -> NDArray[np.bool_]:
     """One of `of` pixels, (H, W), H·W / `of` in all: a random choice derived from a sample's content key.
 
     So each pass of a view keeps pixels of its own, and a resumed run gets the same pixels. A smaller share of the
-    pixels is a subset of a larger one. Raises SpecError as `kept_count` does.
+    pixels is a subset of a larger one. Raises SpecError as `count_kept` does.
     """
     film = spec.film.height, spec.film.width
     chance = Stream(key, "kept pixels").uniform(*film)

@@ -248,7 +248,7 @@ def measure_images(
     With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE, also for
     predictions that depend on a part of the first; it remains in all other metrics, which have no such estimate.
     Intervals are over images, or over `groups` of them such as configurations, if one is named per image.
-    `wanted_features` are those of the references, if they are known (`reference_features`). Raises ValueError for
+    `wanted_features` are those of the references, if they are known (`compute_features`). Raises ValueError for
     shapes that do not match, SpecError for values that are not numbers.
     """
     shown, wanted = metric_space(predictions), metric_space(references)

@@ -71,7 +71,7 @@ def find_kind(architecture: str) -> NetworkKind:
 def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:
     """A freshly initialised network; the same weights for the same seed on one version of torch.
 
-    Raises SpecError if the scene lacks what the architecture needs, and as `kind_of` does.
+    Raises SpecError if the scene lacks what the architecture needs, and as `find_kind` does.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)

@@ -159,7 +159,7 @@ class Network(nn.Module):
     def coordinates(self, position: Tensor) -> Tensor:
         """World positions about the scene's centre, over half its diagonal, and their sines and cosines.
 
-        (…, 3) → (…, 3 + 6 · octaves); see `with_octaves`.
+        (…, 3) → (…, 3 + 6 · octaves); see `add_octaves`.
         """
         return add_octaves((position - self.centre) / self.scale, self.octaves)
 

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.core.processes import command, is_installed
+from photonfarm.core.processes import command, can_render
 from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.plan.hold_out import rows_held_out
@@ -109,11 +109,11 @@ def _judge(image: F32, batch: TrainingBatch) -> str:
 def render_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
     """The frames that `photonfarm buffers` makes for the arguments, such as --orbit 24, and the scene of the run.
 
-    Raises SpecError if the verb is not installed, PhotonfarmError with its exit code if it failed.
+    Raises SpecError without the renderer, PhotonfarmError with its exit code if it failed.
     """
-    if not is_installed(VERB):
+    if not can_render():
         raise SpecError(
-            "the buffers of a camera path come from the renderer, which is not installed here; where it is, run "
+            "the buffers of a camera path come from the renderer, which is not installed here (pip install 'photonfarm[render]'); where it is, run "
             f"`photonfarm {VERB} --scene {run.scene_id} {' '.join(arguments)}`, and give its file as --buffers FILE"
         )
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:

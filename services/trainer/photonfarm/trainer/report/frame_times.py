@@ -17,7 +17,7 @@ from typing import Any
 
 from photonfarm.core.archives import FrameCosts, Seconds
 from photonfarm.core.errors import BackendError
-from photonfarm.core.processes import command, is_installed
+from photonfarm.core.processes import command, can_render
 from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.run_folder import make_environment
 
@@ -100,8 +100,10 @@ def measure_frame_costs(
 
     The renderer's own messages go to stderr. Raises BackendError with the reason if there is no measurement.
     """
-    if not is_installed(VERB):
-        raise BackendError("the renderer, which makes buffers and photons, is not installed here")
+    if not can_render():
+        raise BackendError(
+            "the renderer, which makes buffers and photons, is not installed here: pip install 'photonfarm[render]'"
+        )
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]

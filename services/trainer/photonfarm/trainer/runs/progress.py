@@ -90,7 +90,7 @@ def share_waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE
 
 
 def find_bottleneck(shares: Mapping[str, float]) -> Bottleneck:
-    """The part that takes most of the time, by `wait_shares`; the rest of the time counts as training."""
+    """The part that takes most of the time, by `share_waits`; the rest of the time counts as training."""
     spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
     spent["training"] = 1 - sum(spent.values())
     return max(spent, key=lambda name: spent[name])
@@ -106,7 +106,7 @@ def divide_by_used(samples: int, draws: int) -> float:
 
 
 def format_waits(shares: Mapping[str, float], ahead: float) -> str:
-    """The shares of `wait_shares`, the arrived samples for each used one, and the bottleneck, as part of a line."""
+    """The shares of `share_waits`, the arrived samples for each used one, and the bottleneck, as part of a line."""
     return (
         f"waited {shares['samples']:.1%} of the time for samples and {shares['reading']:.1%} for reading, "
         f"{ahead:.2f} samples there for each used (--ahead): {find_bottleneck(shares)} is the bottleneck"

@@ -49,7 +49,7 @@ def lock_run(folder: Path) -> Iterator[None]:
 
 
 def note_scene_folder(folder: Path, scenes: Path | None) -> None:
-    """Note where the run's scene file lies on this machine, for `with_scenes`; None leaves what was noted."""
+    """Note where the run's scene file lies on this machine, for `make_environment`; None leaves what was noted."""
     if scenes is not None:
         with store_errors("note where the scene lies", folder):
             (folder / SCENE_FOLDER).write_text(f"{scenes}\n")

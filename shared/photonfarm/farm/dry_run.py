@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from photonfarm.core.errors import BackendError, StoreError
-from photonfarm.core.processes import command, can_render, usable_cores
+from photonfarm.core.processes import can_render, command, usable_cores
 from photonfarm.farm.submission import Submission
 from photonfarm.plan.allocation import Allocation, CostModel
 from photonfarm.plan.request import Extent, Request

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from photonfarm.core.errors import PhotonfarmError, QueueError, StoreError, store_errors
-from photonfarm.core.processes import end_on_ctrl_c
+from photonfarm.core.processes import can_render, end_on_ctrl_c
 from photonfarm.core.waiting import Log, tell_waiting
 from photonfarm.farm.devices import Cards, cards_here
 from photonfarm.renderer.worker.settings import WorkerSettings

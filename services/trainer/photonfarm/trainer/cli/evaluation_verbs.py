@@ -78,7 +78,7 @@ inception_option = click.option(
 
 
 def add_measuring_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The options for what is measured, against what and on which device; `_collect_arguments` takes all but the runs."""
+    """The options for what is measured, against what and where; `_collect_arguments` takes all but the runs."""
     options = (
         store_option,
         runs_option,

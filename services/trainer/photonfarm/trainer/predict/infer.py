@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.core.processes import command, can_render
+from photonfarm.core.processes import can_render, command
 from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.plan.hold_out import rows_held_out
@@ -113,7 +113,8 @@ def render_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) 
     """
     if not can_render():
         raise SpecError(
-            "the buffers of a camera path come from the renderer, which is not installed here (pip install 'photonfarm[render]'); where it is, run "
+            "the buffers of a camera path come from the renderer, which is not installed here (pip install "
+            "'photonfarm[render]'); where it is, run "
             f"`photonfarm {VERB} --scene {run.scene_id} {' '.join(arguments)}`, and give its file as --buffers FILE"
         )
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:

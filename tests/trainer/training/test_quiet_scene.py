@@ -1,5 +1,6 @@
 """A trainer leaves its scene to whoever takes its lease, waits for what was set aside, and trains as if nothing was."""
 
+import contextlib
 import multiprocessing
 import os
 import signal
@@ -14,7 +15,7 @@ from typing import Any
 import pytest
 import torch
 
-from photonfarm.core.errors import IncompleteError
+from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.model.lease import hold_lease
@@ -81,7 +82,10 @@ class Trainer:
 
     @property
     def step(self) -> int:
-        return int(checkpoint.load(self._run / CHECKPOINT)["step"]) if (self._run / CHECKPOINT).exists() else 0
+        """Of the checkpoint; 0 without one, and while it is replaced by the next."""
+        with contextlib.suppress(StoreError):
+            return int(checkpoint.load(self._run / CHECKPOINT)["step"])
+        return 0
 
     def codes(self) -> list[int | None]:
         for process in self.processes:

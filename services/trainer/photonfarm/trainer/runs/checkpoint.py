@@ -99,6 +99,21 @@ def _find_remedy(path: Path) -> str:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """What `_read_once` gives, of one file, also while a trainer replaces it by the next."""
+    before = _identify(path)
+    try:
+        return _read_once(path)
+    except _DamagedError:
+        if _identify(path) == before:
+            raise
+        return _read(path)
+
+
+def _identify(path: Path) -> tuple[int, int] | None:
+    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
+
+
+def _read_once(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """The JSON document, and the tensors by their names; _DamagedError for bytes that were not written so."""
     try:
         with safe_open(path, framework="pt") as file:

@@ -17,6 +17,7 @@ from photonfarm.cli.options import (
     names_redis,
     redis_option,
     request_options,
+    run_option,
     store_option,
 )
 from photonfarm.plan.hold_out import HOLD_OUT
@@ -242,13 +243,7 @@ def redis_server(port: int) -> None:
     help="Render workers, a core each, or in turn on the cards.  [default: 2; one a card]",
 )
 @device_option
-@click.option(
-    "--run",
-    type=click.Path(path_type=Path, file_okay=False),
-    default="run",
-    show_default=True,
-    help="The trainer's folder.",
-)
+@run_option
 @click.option("--train-steps", type=click.IntRange(0), default=3000, show_default=True, help="0: render only.")
 @click.option(
     "--hold-out",

@@ -70,6 +70,17 @@ def store_option(command: Command) -> Command:
     )(command)
 
 
+def run_option(command: Command) -> Command:
+    """The option --run of verbs that start a trainer."""
+    return click.option(
+        "--run",
+        type=click.Path(path_type=Path, file_okay=False),
+        default="run",
+        show_default=True,
+        help="The trainer's folder.",
+    )(command)
+
+
 def redis_option(command: Command) -> Command:
     """`--redis URL`, the queue's server; its password may come from the file that a variable names."""
     return click.option(

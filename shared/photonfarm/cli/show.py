@@ -12,6 +12,7 @@ from rich import markup
 from rich.console import Console
 from rich.table import Table
 
+from photonfarm.core.formatting import format_count
 from photonfarm.core.waiting import format_span
 from photonfarm.scene.spec import SceneSpec, shape_ids
 
@@ -106,7 +107,7 @@ def submission(result: Submission, as_json: bool) -> None:
         if isinstance(result, DryRun) and result.planned:
             _cost(result)
         return
-    queued = "not queued" if result.queued is None else f"{result.queued} jobs queued"
+    queued = "not queued" if result.queued is None else f"{format_count(result.queued, 'job')} queued"
     click.echo(
         f"scene {result.scene_id}: {result.planned} samples planned, {result.planned_before} planned before, {queued}"
     )
@@ -127,7 +128,7 @@ def print_queued(jobs: int, as_json: bool) -> None:
     if as_json:
         print_json({"queued": jobs})
     else:
-        click.echo("1 job queued" if jobs == 1 else f"{jobs} jobs queued")
+        click.echo(f"{format_count(jobs, 'job')} queued")
 
 
 def _cost(result: DryRun) -> None:

@@ -100,7 +100,10 @@ def _without_redis(missing: int, since_commit_s: float | None) -> str:
             f"none is known here, but a job was committed {format_span(since_commit_s)} ago, so workers without Redis "
             f"may be at work (`work --share`, `slurm`); {missing} samples are missing"
         )
-    return f"no farm is at work here; `photonfarm up` goes on with the {missing} samples that are missing"
+    return (
+        f"no farm is at work here; `photonfarm up` goes on with the {missing} samples that are missing, given their "
+        "spec, and `photonfarm work --share 0/1` renders just these"
+    )
 
 
 def _known_queue(found: StoreQueue, scenes: Sequence[SceneStatus], store: str | Path, missing: int) -> None:

@@ -16,6 +16,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.cli.show import print_json
 from photonfarm.core.errors import StoreError
+from photonfarm.core.formatting import format_count
 from photonfarm.core.waiting import SILENCE_S
 from photonfarm.farm.join import JoinedScene, OnProgress
 from photonfarm.store import Store
@@ -224,7 +225,7 @@ def print_joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
         return
     for scene in scenes:
         known = scene.there - scene.planned
-        jobs = "1 job" if scene.jobs == 1 else f"{scene.jobs} jobs"
+        jobs = format_count(scene.jobs, "job")
         said = f"{scene.there} samples there, {scene.planned} planned here now, {known} before; {jobs} copied"
         left = f"; {scene.left} are left to workers, as their jobs here are not whole there" if scene.left else ""
         click.echo(f"{scene.name} {scene.scene_id}: {said}{left}")

@@ -13,6 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+from photonfarm.core.formatting import format_count
 from photonfarm.core.waiting import format_span
 from photonfarm.farm.status import NoQueue, describe_failed
 from photonfarm.farm.training import count_steps
@@ -82,7 +83,7 @@ def _below(view: FarmView) -> Iterator[str]:
         yield f"  {view.queue.reason if view.named_redis else _without_redis(view)}"
     else:
         status = view.queue.status
-        yield f"  {status.queued} jobs queued, {status.running} running, {status.workers} workers"
+        yield f"  {format_count(status.queued, 'job')} queued, {status.running} running, {status.workers} workers"
     for name, activity in sorted(view.activities.items()):
         yield f"  worker {name} {activity}"
     yield from (f"  {training.line}" for training in view.trainings)

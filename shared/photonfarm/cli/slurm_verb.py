@@ -14,6 +14,7 @@ from photonfarm.cli.options import (
     optional_redis_option,
     password_file,
     request_options,
+    run_option,
     store_option,
 )
 
@@ -79,13 +80,7 @@ def _limit(ctx: click.Context, param: click.Parameter, text: str | None) -> str 
     help="Folder of the scripts and of a log for each task.",
 )
 @click.option("--train", is_flag=True, help="Also start the trainer, as a job of its own, once the first worker runs.")
-@click.option(
-    "--run",
-    type=click.Path(path_type=Path, file_okay=False),
-    default="run",
-    show_default=True,
-    help="The trainer's folder.",
-)
+@run_option
 @click.option("--train-steps", type=click.IntRange(1), help="Steps to train for.  [default: the preset's]")
 @click.option("--train-gpus", is_flag=True, help="Train on a GPU.")
 @click.option(

@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import json
 import tarfile
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from importlib import import_module
 from itertools import islice
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-class Format:
+class Format(ABC):
     """A format."""
 
     SUFFIX: str  # of its files
@@ -40,11 +41,11 @@ class Format:
     ONE_PER_FILE: bool | None  # True, False: always one sample, always several in a file; None: as is asked, or one
 
     @staticmethod
+    @abstractmethod
     def write(file: Path, samples: Iterator[Values], contents: Contents) -> None:
         """Write samples into a file, which appears whole. Raises StoreError if the disk refuses."""
-        raise NotImplementedError
 
-    @staticmethod
+    @staticmethod  # noqa: B027 - most formats have no more to write
     def finish(exported: Exported) -> None:
         """Write what describes all files of the folder; nothing, unless a format says otherwise."""
 

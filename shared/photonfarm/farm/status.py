@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
 
 from photonfarm.core.errors import CorruptError, QueueError, StoreError, store_errors
+from photonfarm.core.formatting import format_count
 from photonfarm.store import SceneStatus, Store
 from photonfarm.store.format.markers import COMMITTED
 from photonfarm.store.io.local import LocalStorage
@@ -228,4 +229,4 @@ def idle(found: QueueStatus, names: Mapping[str, str], missing: int) -> Iterator
 def describe_failed(cause: FailureCause) -> str:
     """How many jobs failed, and why."""
     aside = f", {cause.set_aside} of them set aside until `photonfarm submit --retry`" if cause.set_aside else ""
-    return f"{len(cause.jobs)} job{'s' * (len(cause.jobs) != 1)} failed{aside}: {cause.cause}"
+    return f"{format_count(len(cause.jobs), 'job')} failed{aside}: {cause.cause}"

@@ -17,6 +17,7 @@ import numpy as np
 
 from photonfarm import queue
 from photonfarm.core.errors import QueueError, SpecError, StoreError, store_errors
+from photonfarm.core.formatting import format_count
 from photonfarm.core.keys import Key
 from photonfarm.core.models import differing
 from photonfarm.plan.hold_out import HOLD_OUT, are_held_out, enough, units_of
@@ -91,7 +92,7 @@ def _fault(spec: SceneSpec, plans: list[StoredPlan], share: float, request: Requ
     if more := _least(request, lambda wanted: _splits(are_held_out(_units(spec, plans, wanted), share))):
         found.append(f"--modifications {more} plans enough")
     which = "all are held out, and none is left to train on" if any(held_out) else "none is held out, and one is needed"
-    of = f"of the {len(keys)} {'configuration' if spec.groups else 'view'}{'s' * (len(keys) != 1)} planned"
+    of = f"of the {format_count(len(keys), 'configuration' if spec.groups else 'view')} planned"
     return f"hold_out = {share:g}: {of} {which}; {', and '.join(found) or 'plan more, or use another --hold-out'}"
 
 

@@ -41,7 +41,10 @@ def examine(store: str | Path, redis_url: str, log: Log = lambda _: None) -> Ite
     yield renderer if can_render() else _optional(renderer, "needed by workers and by verbs that look into a scene")
     yield _try("store", lambda: _writes(store))
     yield _optional(_try("embedded Redis", _starts_redis), "needed by `up` and `photonfarm redis` only")
-    yield _optional(_try("Redis", lambda: _reaches(redis_url)), "needed by `submit` and `work`, not by `up`")
+    yield _optional(
+        _try("Redis", lambda: _reaches(redis_url)),
+        "needed by `submit` without --no-queue and `work` without --share, not by `up`",
+    )
     yield _optional(_scenes(), "needed by the ready specs under scenes/ only")
 
 

@@ -21,6 +21,7 @@ from photonfarm.core.errors import (
     SceneNotHereError,
     StoreError,
 )
+from photonfarm.core.formatting import format_count
 from photonfarm.queue import RenderArguments
 from photonfarm.renderer.worker.backpressure import DiskReserve, is_full
 from photonfarm.renderer.worker.settings import JOBS_SO_FAR, RECYCLED, WorkerSettings
@@ -61,12 +62,7 @@ class JobCounts:
     def __str__(self) -> str:
         """The counts in words."""
         failed = f", {self.failed} failed" if self.failed else ""
-        return f"{jobs_in_words(self.jobs)} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
-
-
-def jobs_in_words(jobs: int) -> str:
-    """A number of jobs, in words."""
-    return f"{jobs} job{'s' * (jobs != 1)}"
+        return f"{format_count(self.jobs, 'job')} done{failed}, {self.samples} samples, {self.seconds:.0f} s"
 
 
 class WorkerLog:
@@ -96,7 +92,7 @@ class WorkerLog:
             log.info(
                 "worker %s: %s in %.0f s, %.2f s each; the last was %s",
                 self._name,
-                jobs_in_words(self._jobs),
+                format_count(self._jobs, "job"),
                 self._seconds,
                 self._seconds / self._jobs,
                 name,

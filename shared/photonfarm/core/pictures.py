@@ -1,4 +1,4 @@
-"""Arrays as pictures that a person can look at, and HTML pages from Jinja2 templates, each a file that needs no other.
+"""Arrays as pictures that a person can look at, and pictures side by side.
 
 For display only: nothing here is on the way to the store. Shape letters: H W image.
 """
@@ -7,13 +7,11 @@ from __future__ import annotations
 
 import base64
 import io
-from base64 import b64encode
-from pathlib import Path
-from typing import Any, TypeVar
+import re
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
-from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from photonfarm.core.records import F32
@@ -81,22 +79,41 @@ def _bytes(unit: NDArray[np.floating]) -> Picture:
     return np.round(255 * unit).astype(np.uint8)
 
 
-HERE = Path(__file__).parent
+GAP = 8  # px between the pictures of a sheet
+LEADING = 4  # px from a line of text to the next, beside the height of its letters
 
 
-def render_page(template: Path, **values: Any) -> str:
-    """The page of a template; `page.html.j2`, which it may extend, lies beside this module. Text is escaped."""
-    environment = Environment(
-        loader=FileSystemLoader([template.parent, HERE]),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"uri": data_uri, "breakable": breakable, "base64": lambda data: b64encode(data).decode()}
-    return environment.get_template(template.name).render(**values)
+def draw_sheet(
+    heads: Sequence[str], rows: Sequence[Sequence[Picture]], captions: Sequence[str], text: int = 14
+) -> Picture:
+    """Pictures of one size in rows, a head above each column and a caption above each row; letters of `text` px.
+
+    Heads are broken into lines after blanks and underscores; a row with an empty caption has no line for it.
+    """
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = rows[0][0].shape[:2]
+    font, line = ImageFont.load_default(text), text + LEADING
+    wrapped = [_wrap(head, int(width // font.getlength("n"))) for head in heads]
+    top = max(map(len, wrapped)) * line + GAP
+    steps = [height + GAP + (line if caption else 0) for caption in captions]
+    sheet = Image.new("RGB", (len(heads) * (width + GAP) - GAP, top + sum(steps) - GAP), "white")
+    draw = ImageDraw.Draw(sheet)
+    for column, lines in enumerate(wrapped):
+        draw.multiline_text((column * (width + GAP), 0), "\n".join(lines), "black", font, spacing=LEADING)
+    for row, caption, step in zip(rows, captions, steps, strict=True):
+        draw.text((0, top), caption, "black", font)
+        for column, picture in enumerate(row):
+            sheet.paste(Image.fromarray(picture), (column * (width + GAP), top + step - height - GAP))
+        top += step
+    return np.asarray(sheet)
 
 
-def breakable(text: str) -> Markup:
-    """A text whose names may break after an underscore."""
-    return Markup(str(escape(text)).replace("_", "_<wbr>"))  # noqa: S704 - it is escaped
+def _wrap(head: str, letters: int) -> list[str]:
+    """The lines of a head, of at most so many letters each where its parts allow."""
+    lines = [""]
+    for part in re.findall("[^_ ]+[_ ]?", head):
+        if lines[-1] and len(lines[-1] + part.rstrip()) > letters:
+            lines.append("")
+        lines[-1] += part
+    return lines

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from photonfarm.core import pictures
 from photonfarm.core.errors import store_errors
-from photonfarm.core.pictures import Picture, render_page
+from photonfarm.core.page import render_page
+from photonfarm.core.pictures import Picture
 from photonfarm.core.records import Geometry, Photons
 from photonfarm.renderer.tools.plan_view import PlanView, hue
 from photonfarm.scene.modification import Modification

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.formatting import format_count, format_markdown_table
-from photonfarm.core.pictures import reduce_image, render_page
+from photonfarm.core.page import render_page
+from photonfarm.core.pictures import reduce_image
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page

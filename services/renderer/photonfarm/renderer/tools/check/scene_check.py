@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import store_errors
-from photonfarm.core.pictures import Picture, display_values, render_page
+from photonfarm.core.page import render_page
+from photonfarm.core.pictures import Picture, display_values
 from photonfarm.core.records import F32
 from photonfarm.core.waiting import Log, WorkLog
 from photonfarm.renderer.scene.loaded_scene import LoadedScene

@@ -23,6 +23,7 @@ need() {
 }
 
 has_library() { PATH="$PATH:/sbin:/usr/sbin" ldconfig -p | grep "$1" >/dev/null; }  # -q would end ldconfig by SIGPIPE
+has_browser() { command -v chromium || command -v chromium-browser || command -v google-chrome; }
 has_llvm() { [ -e "${DRJIT_LIBLLVM_PATH:-/nonexistent}" ] || has_library 'libLLVM[.-]\(so\.\)\?\(19\|22\)'; }
 
 command -v "$python" >/dev/null || need python3 false
@@ -38,6 +39,7 @@ install() { "$venv/bin/python" -m pip install --quiet --disable-pip-version-chec
 "$venv/bin/python" -m pip uninstall --quiet --yes photonfarm-shared photonfarm-renderer photonfarm-trainer >/dev/null 2>&1 || true # of before they were one
 say "installing packages into $venv: minutes, and with their dependencies gigabytes of disk; pip is silent meanwhile"
 if [ "${2:-}" = dev ]; then
+  [ "$(id -u)" != 0 ] || need chromium has_browser # tests open the pages in it, and are skipped without it
   install 'pip>=25.1' # the first that knows dependency groups
   install -e '.[render,train,redis,export,oidn,tensorboard,video]' --group test --group check
 else

@@ -364,8 +364,8 @@ def test_a_browser_shows_the_farm_and_a_sample_without_errors_at_a_desks_and_a_p
             page.open(f"{address}#/sample/{scene.scene_id}/3", width)
             page.wait_for("document.querySelectorAll('.pictures img').length >= 7")
             page.wait_for(pictures_there)
-            drawn = "getContext('2d').getImageData(0, 0, 300, 150).data.some((value) => value > 60 && value < 255)"
-            page.wait_for(f"document.querySelector('canvas').{drawn}")
+            drawn = ".getContext('2d').getImageData(0, 0, c.width, c.height).data.some((v) => v > 60 && v < 255)"
+            page.wait_for(f"(c => c{drawn})(document.querySelector('canvas'))")
             assert page.value("document.documentElement.scrollWidth") <= width
         assert page.errors == []
 

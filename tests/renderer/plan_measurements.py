@@ -7,9 +7,15 @@ from photonfarm.renderer.scene import backend
 
 backend.load(threads=1)
 
-from photonfarm.renderer.strategy.budget import ImageCost  # noqa: E402
-from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, RelativeErrors  # noqa: E402 - after the variant is set
-from photonfarm.renderer.strategy.measurement import CandidateRow, Measurement  # noqa: E402
+from photonfarm.renderer.strategy.candidates import (  # noqa: E402 - after the variant is set
+    PLAIN,
+    Candidate,
+    ImageCost,
+    MeasuredCandidate,
+    RelativeErrors,
+)
+from photonfarm.renderer.strategy.content import LightReach  # noqa: E402
+from photonfarm.renderer.strategy.measurement import Measurement  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
 from photonfarm.scene.spec import Film, SceneSpec  # noqa: E402
 from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
@@ -41,10 +47,10 @@ def spec_with(**transport: Any) -> SceneSpec:
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)
 
 
-def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, scatter: float = 0.1) -> CandidateRow:
+def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, scatter: float = 0.1) -> MeasuredCandidate:
     """`scatter`: how far the errors of three views differ from their mean; √3 times the standard error of a ratio."""
     own = tuple(error * (1 + scatter * d) for d in (-1, 0, 1)) if candidate != PLAIN else (error,) * 3
-    return CandidateRow(
+    return MeasuredCandidate(
         candidate=candidate,
         missed=0.0,
         cost=ImageCost(fixed_s, sample_s),
@@ -52,7 +58,7 @@ def row(candidate: Candidate, error: float, fixed_s: float, sample_s: float, sca
     )
 
 
-def measurement(*rows: CandidateRow) -> Measurement:
+def measurement(*rows: MeasuredCandidate) -> Measurement:
     """The measurement of a spec with (1, 1) and 2 samples per pixel."""
     default = (row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.05, 0.02, 0.02), row(JOINED, 0.05, 0.02, 0.04))
     return Measurement(
@@ -65,8 +71,7 @@ def measurement(*rows: CandidateRow) -> Measurement:
         left_out=(),
         rows=rows or default,
         shared=0.0,
-        near=((1.0, 0.9, 0.8),),
-        power=((0.7, 0.295, 0.005),),
+        reach=LightReach(configurations=1, hit=1.0, near=1.0, beyond=(0.3, 0.005, 0.0)),
         asked_s=60.0,
         spent_s=5.0,
     )

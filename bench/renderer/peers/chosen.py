@@ -70,8 +70,11 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
 
     import mitsuba as mi
 
-    from photonfarm.renderer.strategy import content, pilot
-    from photonfarm.renderer.strategy.candidates import GRID
+    from photonfarm.renderer.scene.backend import work_s
+    from photonfarm.renderer.strategy.budget import time_images
+    from photonfarm.renderer.strategy.candidates import GRID, PLAIN, best, compare_at_cost
+    from photonfarm.renderer.strategy.content import SceneContent
+    from photonfarm.renderer.strategy.pilot import measure_errors
     from photonfarm.renderer.strategy.plan_text import BLACK, reasons_for
 
     plugins: dict[Any, Any] = {}
@@ -84,12 +87,17 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
         return np.ascontiguousarray(image[..., :3], np.float32)
 
     start = time.perf_counter()
-    found = content.read(scene, scene.sensors()[0])
-    candidates, _ = content.restrict(found, max_depth, 1.0, GRID)
-    choice = pilot.choose(render, candidates, seconds=seconds, spp=spp, seed=PILOT_SEED)
-    best = choice.candidate
-    reasons = reasons_for(choice.row(best), choice.measured, choice.shared) if choice.measured else (BLACK,)
+    pointless = SceneContent.of(scene, scene.sensors()[0]).why_no_light_paths(max_depth, 1.0)
+    candidates = [PLAIN] if pointless else GRID
+    costs = time_images([render], candidates, spp, 0.2 * seconds, work_s)
+    image_s = costs[PLAIN].time_s(spp)
+    found = measure_errors([render], costs, later_s=image_s, seconds=0.8 * seconds, spp=spp, seed=PILOT_SEED)
+    chosen, reasons = PLAIN, [BLACK]
+    if found.measured:
+        compared = compare_at_cost(found.measured, spp, image_s)
+        chosen = best(compared.values()).candidate
+        reasons = reasons_for(compared[chosen], list(compared.values()), found.shared)
     spent_s = time.perf_counter() - start
     return Chosen(
-        best.connections, best.light_ratio, spent_s, "; ".join(reasons), best.guided_light, best.light_samples
+        chosen.connections, chosen.light_ratio, spent_s, "; ".join(reasons), chosen.guided_light, chosen.light_samples
     )

@@ -13,8 +13,6 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.statistics import block_z_test
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.strategy import content
-from photonfarm.renderer.strategy.measurement import PilotScene
 from photonfarm.scene.files import BUILTIN_EMITTING
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
@@ -207,19 +205,21 @@ def test_the_power_of_photons_is_dimmed(file_scene: Loader, folder: Path) -> Non
 
 
 def test_a_plan_and_photons_see_only_what_shines(file_scene: Loader, folder: Path) -> None:
+    from photonfarm.renderer.scene.loading import AimedSensor
+    from photonfarm.renderer.strategy.content import SceneContent, light_reach
+
     own = SKY + window(RGB.format("radiance"))
     lit = file_scene(folder, BLOCK + own, lights=[lamp()])
     night = file_scene(folder, BLOCK + own, lights=[lamp()], emitters={"all": 0})
-    found = [content.read(scene.scene, PilotScene(scene.spec, folder).camera()) for scene in (lit, night)]
-    assert found[0].lights == {"area": 2, "environment map": 1}
-    assert found[1].lights == {"area": 1}
-    assert "lights: 1 area" in content.sentences(found[1], 4)
-    reaches = [content.light_reach([scene.scene], scene.spec.view, 0) for scene in (lit, night)]
+    found = [SceneContent.of(scene.scene, AimedSensor(scene.spec).sensor) for scene in (lit, night)]
+    assert found[0].lights == {"AreaLight": 2, "EnvironmentMapEmitter": 1}
+    assert found[1].lights == {"AreaLight": 1}
+    assert "lights: 1 AreaLight" in found[1].sentences(4)
+    reaches = [light_reach([scene.scene], scene.spec.view, 0) for scene in (lit, night)]
     assert reaches[0].hit < 0.5 < reaches[1].hit  # the sky's paths miss
     dark = file_scene(folder, BLOCK + own, emitters={"all": 0})
-    read = content.read(dark.scene, PilotScene(dark.spec, folder).camera())
-    _, left_out = content.restrict(read, 4, 0.0, [])
-    assert "there is no light that shines" in str(left_out[0])
+    content = SceneContent.of(dark.scene, AimedSensor(dark.spec).sensor)
+    assert content.why_no_light_paths(4, 0.0) == "there is no light that shines"
 
 
 @pytest.mark.parametrize("factor", [0.0, 0.1])

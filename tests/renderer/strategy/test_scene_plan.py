@@ -12,10 +12,9 @@ from photonfarm.renderer.scene import backend
 backend.load(threads=1)
 
 from photonfarm.renderer.strategy import measurement as measuring  # noqa: E402 - after the variant is set
-from photonfarm.renderer.strategy.budget import ImageCost  # noqa: E402
 from photonfarm.renderer.strategy.candidates import GRID, PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
-from photonfarm.renderer.strategy.plan import TransportPlan, _knows, plan_of  # noqa: E402
+from photonfarm.renderer.strategy.plan import TransportPlan, knows, plan_of  # noqa: E402
 from photonfarm.renderer.strategy.plan_text import lines, plus_minus  # noqa: E402
 from photonfarm.scene.spec import SceneSpec  # noqa: E402
 from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
@@ -47,7 +46,7 @@ def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -
     rows = tuple(r.model_copy(update={"errors": r.errors.model_copy(update={"plain": (0.1,) * 3})}) for r in rows)
     found = plan_of(spec_with(), measurement(*rows), cached=False)
     assert (found.candidate, found.half_spp) == (PLAIN, 10)
-    assert found.at_equal_cost[PLAIN].half_error == pytest.approx(0.1 * 2 / 10)
+    assert found.at_equal_cost[PLAIN].error == pytest.approx(0.1 * 2 / 10)
     assert found.at_equal_cost[LIGHT].relative_cost == pytest.approx(0.08 * 0.1 / 2 / (0.1 * 0.1 / 10))
 
 
@@ -58,11 +57,6 @@ def test_a_plan_for_training_says_so_and_what_its_figures_are() -> None:
     assert "half_spp    loss  " in text
     assert "relMSE" not in text
     assert found.document()["for"] == "training"
-
-
-def test_half_estimates_for_training_share_the_fixed_part_of_a_launch() -> None:
-    """Two images of 3 samples take 0.5 + 6·0.25 s in one launch."""
-    assert 2 * ImageCost(0.5, 0.25).halve().time_s(3) == 2.0
 
 
 def test_no_measurement_for_one_purpose_is_taken_for_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -102,7 +96,7 @@ def test_a_plan_writes_later_settings_only_where_they_are_or_were_set(unusual: C
     assert key not in plan_of(spec_with(), measurement(), cached=False).settings["transport"]
 
 
-@pytest.mark.parametrize("seed", range(200))
+@pytest.mark.parametrize("seed", range(60))
 def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rows = [row(c, *np.exp(rng.normal(-3, 1, 3)), scatter=rng.uniform(0, 0.1)) for c in GRID]
@@ -117,7 +111,7 @@ def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int
     again = plan_of(written, found, cached=True)
     assert (again.candidate, again.half_spp) == (first.candidate, first.half_spp)
     assert "transport" not in again.changes
-    assert _knows(found, written)
+    assert knows(found, written)
     assert digest(written) == digest(first.spec)
 
 
@@ -158,7 +152,6 @@ def test_settings_of_which_no_sample_fits_into_the_present_cost_are_not_taken() 
     spec = spec_with(half_spp=1, connections=0, light_ratio=0.0)
     found = plan_of(spec, measurement(row(PLAIN, 0.2, 0.01, 0.01), row(LIGHT, 0.02, 0.02, 0.02)), cached=False)
     assert (found.candidate, found.half_spp) == (PLAIN, 1)
-    assert "one sample of light ratio 1 without connections costs more than a half-estimate does now" in text_of(found)
     assert any(line.endswith("too costly") for line in lines(found))
     richer = spec_with(half_spp=3, connections=0, light_ratio=0.0)
     found = plan_of(richer, measurement(), cached=False)
@@ -168,25 +161,24 @@ def test_settings_of_which_no_sample_fits_into_the_present_cost_are_not_taken() 
 @pytest.mark.parametrize(("half_spp", "known"), [(1, True), (2, True), (9, True), (10, False), (256, False)])
 def test_a_measurement_holds_for_about_the_time_that_it_was_made_for(half_spp: int, known: bool) -> None:
     """It was made for 0.1 s: 9 samples of (1, 1) take 0.38 s."""
-    assert _knows(measurement(), spec_with(half_spp=half_spp)) == known
+    assert knows(measurement(), spec_with(half_spp=half_spp)) == known
 
 
 def test_the_same_time_is_many_samples_of_cheap_settings() -> None:
-    assert _knows(measurement(), spec_with(half_spp=39, connections=0, light_ratio=0.0))
-    assert not _knows(measurement(), spec_with(half_spp=1, connections=0, light_ratio=0.0))
+    assert knows(measurement(), spec_with(half_spp=39, connections=0, light_ratio=0.0))
+    assert not knows(measurement(), spec_with(half_spp=1, connections=0, light_ratio=0.0))
 
 
-def test_savings_are_ratios_of_time_to_equal_error() -> None:
+def test_a_saving_is_a_ratio_of_times_to_equal_error() -> None:
     """Plain path tracing has 9 samples in 0.1 s, (0, 1) has 4 and (1, 1) has 2: 0.2/9, 0.05/4, 0.05/2."""
     found = plan_of(spec_with(), measurement(), cached=False)
-    assert [(s.over, s.factor) for s in found.savings] == [
-        (PLAIN, pytest.approx(0.2 / 9 / (0.05 / 4))),
-        (JOINED, pytest.approx(2)),
-    ]
-    assert found.savings[0].spread == pytest.approx(0.2 / 9 / (0.05 / 4) * 0.1 / 3**0.5)
+    assert found.saving is not None
+    assert found.saving.factor == pytest.approx(2)
+    assert found.document()["saving"]["factor"] == found.saving.factor
+    assert found.at_equal_cost[LIGHT].relative_cost == pytest.approx(0.05 / 4 / (0.2 / 9))
     text = text_of(found)
     for sentence in (
-        "1.8 ± 0.1 times as fast to the same error as plain path tracing\n",
+        "light ratio 1 without connections reaches the error of plain path tracing in 0.56 ± 0.03 of the time\n",
         "half_spp 4 costs about what 2 does with the spec's settings, light ratio 1 with 1 connection\n",
         "lights: 1 area\n",
     ):
@@ -214,20 +206,12 @@ def test_the_table_is_aligned_and_says_what_its_columns_are() -> None:
     first = next(i for i, line in enumerate(text) if line.startswith("connections  light ratio"))
     assert text[first : first + 4] == [
         "connections  light ratio  light samples  guided  images  half_spp  relMSE     ms  error × time",
-        "          0            0              1      no      12         9  0.0444  100.0   1",
-        "          0            1              1      no      12         4  0.0250  100.0   0.56 ± 0.03  chosen",
-        "          1            1              1      no      12         2  0.0500  100.0   1.13 ± 0.06",
+        "          0            0              1      no      12         9  0.0444  100.0             1",
+        "          0            1              1      no      12         4   0.025  100.0   0.56 ± 0.03  chosen",
+        "          1            1              1      no      12         2    0.05  100.0   1.13 ± 0.06",
     ]
     legend = "\n".join(text[first + 4 :])
-    for column in (
-        "connections:",
-        "light ratio:",
-        "light samples:",
-        "guided:",
-        "half_spp:",
-        "relMSE and ms:",
-        "error × time:",
-    ):
+    for column in ("images:", "half_spp:", "relMSE and ms:", "error × time:"):
         assert column in legend
     assert all(line == line.rstrip() for line in text)
 
@@ -236,7 +220,6 @@ def test_where_nothing_was_measured_nothing_is_said_of_time() -> None:
     black = measurement().model_copy(update={"rows": ()})
     text = text_of(plan_of(spec_with(), black, cached=False))
     assert "nothing was measured: every view is black" in text
-    assert "none: nothing to compare with" in text
     for claim in ("error × time", "costs about"):
         assert claim not in text
 

@@ -1,14 +1,13 @@
-"""The settings of `bdpt` that compete, and how much sooner one reaches the error of another."""
+"""The settings of `bdpt` that compete, what was measured of them, and how much sooner one reaches another's error."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
 from photonfarm.core.models import Frozen
 from photonfarm.core.records import F32
@@ -19,6 +18,12 @@ CLEAR = 2.0
 
 WORTHWHILE = 0.05
 """The least gain that changes settings."""
+
+LEAST_SAMPLES = 0.7
+"""The least samples per pixel that a time must pay for: rounded to 1 they cost 1.4 times as much at most."""
+
+MOST_SAMPLES = 65536
+"""The largest number of samples per pixel in a spec."""
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -80,6 +85,40 @@ def present(spec: SceneSpec) -> Candidate:
     return Candidate(t.connections, t.light_ratio, t.guided_light, t.light_samples)
 
 
+# ------------------------------------------------------------------------------------------------------- measurements
+
+
+@dataclass(frozen=True, slots=True)
+class ImageCost:
+    """The CPU time of an image: a fixed part, and a part for each sample per pixel."""
+
+    fixed_s: float
+    sample_s: float
+
+    @classmethod
+    def through(cls, few: int, few_s: float, many: int, many_s: float) -> ImageCost:
+        """The cost as a line through the times at two numbers of samples per pixel."""
+        sample_s = max((many_s - few_s) / (many - few), 0.02 * few_s / few)  # if noise hides it
+        return cls(max(few_s - few * sample_s, 0.0), sample_s)
+
+    def time_s(self, spp: float) -> float:
+        """The time of an image with `spp` samples per pixel."""
+        return self.fixed_s + spp * self.sample_s
+
+    def pays(self, seconds: float) -> bool:
+        """Whether a time pays for about one sample per pixel: for LEAST_SAMPLES."""
+        return seconds >= self.time_s(LEAST_SAMPLES)
+
+    def bought(self, seconds: float) -> int:
+        """The samples per pixel that a time pays for, as a whole number of at least 1."""
+        return int(np.clip(round((seconds - self.fixed_s) / self.sample_s), 1, MOST_SAMPLES))
+
+    def per_sample_s(self, seconds: float) -> float:
+        """The time of each of the samples per pixel that a time pays for."""
+        samples = self.bought(seconds)
+        return self.time_s(samples) / samples
+
+
 class RelativeErrors(Frozen):
     """A candidate's error of one image, with the charge for missed light, by views, or by pairs of a single view.
 
@@ -93,13 +132,13 @@ class RelativeErrors(Frozen):
 
     @property
     def mean(self) -> float:
-        """The error of one image."""
-        return _mean(self.own)
+        """The error of one image: relMSE, or relative loss (see `noise`)."""
+        return max(float(np.mean(self.own)), 1e-30)
 
     @property
     def ratio(self) -> float:
         """The error of one image over that of plain path tracing."""
-        return self.mean / _mean(self.plain)
+        return self.mean / max(float(np.mean(self.plain)), 1e-30)
 
     def relative_spread(self, other: RelativeErrors) -> float | None:
         """The relative standard error of one candidate's `ratio` over another's; None from a single value each.
@@ -109,56 +148,91 @@ class RelativeErrors(Frozen):
         the same number of images, the errors of plain path tracing cancel. Otherwise the two ratios are taken as
         independent, which overstates the result.
         """
-        if self.images == other.images:
-            return _standard_error(_scale(self.own) - _scale(other.own))
-        parts = [_standard_error(_scale(errors.own) - _scale(errors.plain)) for errors in (self, other)]
-        return None if parts[0] is None or parts[1] is None else math.hypot(parts[0], parts[1])
+        n = len(self.own)
+        if n < 2 or len(other.own) < 2:
+            return None
+        own, plain, others, others_plain = (
+            np.array(errors) / max(float(np.mean(errors)), 1e-30)
+            for errors in (self.own, self.plain, other.own, other.plain)
+        )
+        parts = [own - others] if self.images == other.images else [own - plain, others - others_plain]
+        return math.sqrt(sum(float(np.sum(part**2)) / (len(part) * (len(part) - 1)) for part in parts))
 
 
-def _mean(errors: Sequence[float]) -> float:
-    return max(float(np.mean(errors)), 1e-30)
+class MeasuredCandidate(Frozen):
+    """One candidate, as a pilot measured it."""
+
+    candidate: Candidate
+    errors: RelativeErrors  # of images of the pilot's samples per pixel
+    missed: float  # the part of the error inferred from light that other candidates found (see `noise`)
+    cost: ImageCost  # of an image as it is used later
 
 
-def _scale(errors: Sequence[float]) -> NDArray[np.float64]:
-    return np.array(errors, np.float64) / _mean(errors)
-
-
-def _standard_error(residuals: NDArray[np.float64]) -> float | None:
-    n = len(residuals)
-    return float(np.sqrt(np.sum(residuals**2) / (n * (n - 1)))) if n > 1 else None
+# --------------------------------------------------------------------------------------------------------- comparison
 
 
 @dataclass(frozen=True, slots=True)
-class MeasuredCandidate:
-    """The measurement of one candidate."""
+class CandidateAtCost:
+    """A measured candidate with the samples per pixel that fit a time."""
 
     candidate: Candidate
     errors: RelativeErrors
-    missed: float  # the part of the error inferred from light that other candidates found (see `noise.missed`)
-    time_s: float  # CPU time of one image
+    missed: float
+    samples: int
+    error: float  # of an image of so many samples: relMSE, or relative loss (see `noise`)
+    time_s: float  # of such an image
+    fits: bool  # whether at least about one sample per pixel fits the time
     relative_cost: float  # error × time over that of plain path tracing: the time to the same error
     spread: float | None  # standard error of relative_cost; None from a single pair of images
 
-    @property
-    def error(self) -> float:
-        """The error of one image of the pilot: relMSE, or relative loss (see `noise`)."""
-        return self.errors.mean
+
+AtEqualCost: TypeAlias = dict[Candidate, CandidateAtCost]
+
+
+def compare_at_cost(measured: Iterable[MeasuredCandidate], spp: int, seconds: float) -> AtEqualCost:
+    """The candidates, measured with `spp` samples per pixel, at those samples that fit a time for each of them.
+
+    The variance of an image is that of one sample over the number of samples n. So error × time is the error of one
+    sample × time / n.
+    """
+    by_candidate = {one.candidate: one for one in measured}
+    plain, found = by_candidate[PLAIN], {}
+    for one in by_candidate.values():
+        samples = one.cost.bought(seconds)
+        relative_cost = one.errors.ratio * one.cost.per_sample_s(seconds) / plain.cost.per_sample_s(seconds)
+        relative = one.errors.relative_spread(plain.errors)
+        found[one.candidate] = CandidateAtCost(
+            candidate=one.candidate,
+            errors=one.errors,
+            missed=one.missed,
+            samples=samples,
+            error=one.errors.mean * spp / samples,
+            time_s=one.cost.time_s(samples),
+            fits=one.cost.pays(seconds),
+            relative_cost=relative_cost,
+            spread=None if relative is None else relative_cost * relative,
+        )
+    return found
+
+
+def best(candidates: Iterable[CandidateAtCost]) -> CandidateAtCost:
+    """The candidate with the least error × time; those with few images are not asked, who may be the best by chance."""
+    compared = list(candidates)
+    most = max(one.errors.images for one in compared)
+    return min((one for one in compared if one.errors.images == most), key=lambda one: one.relative_cost)
 
 
 @dataclass(frozen=True, slots=True)
 class Saving:
     """How much sooner one candidate reaches the error of another."""
 
-    over: Candidate
     factor: float  # the other's time over this one's, to equal error
     spread: float | None  # its standard error
 
     @property
     def deviations(self) -> float:
         """log(factor) in standard errors, so that a factor and its inverse differ only in sign; 0 if unknown."""
-        if self.spread is None:
-            return 0.0
-        return math.log(self.factor) / max(self.spread / self.factor, 1e-9)
+        return 0.0 if self.spread is None else math.log(self.factor) / max(self.spread / self.factor, 1e-9)
 
     @property
     def significant(self) -> bool:
@@ -166,13 +240,8 @@ class Saving:
         return self.factor >= 1 + WORTHWHILE and self.deviations >= CLEAR
 
 
-def saving(one: MeasuredCandidate, over: MeasuredCandidate) -> Saving:
+def saving(one: CandidateAtCost, over: CandidateAtCost) -> Saving:
     """The saving of one candidate over another, from the errors and times of both."""
     factor = over.relative_cost / one.relative_cost
     relative = over.errors.relative_spread(one.errors)
-    return Saving(over.candidate, factor, None if relative is None else factor * relative)
-
-
-def is_alike(one: MeasuredCandidate, other: MeasuredCandidate) -> bool:
-    """Whether the difference of two candidates is not significant."""
-    return abs(saving(one, other).deviations) < CLEAR
+    return Saving(factor, None if relative is None else factor * relative)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -23,11 +23,20 @@ from photonfarm.renderer.jobs.render import versions
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
-from photonfarm.renderer.strategy import content, pilot
-from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, RANGE, Budget, ImageCost, affordable, time_images
-from photonfarm.renderer.strategy.candidates import DEFAULT, GRID, PLAIN, Candidate, RelativeErrors, Render, present
+from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, Budget, affordable, time_images
+from photonfarm.renderer.strategy.candidates import (
+    DEFAULT,
+    GRID,
+    PLAIN,
+    Candidate,
+    ImageCost,
+    MeasuredCandidate,
+    Render,
+    present,
+)
+from photonfarm.renderer.strategy.content import LightReach, SceneContent, light_reach
 from photonfarm.renderer.strategy.noise import Purpose
-from photonfarm.renderer.strategy.pilot import SCOUTS
+from photonfarm.renderer.strategy.pilot import SCOUTS, measure_errors
 from photonfarm.scene.modification import Modification, rest, sample_modification
 from photonfarm.scene.spec import Film, SceneSpec, Transport
 from photonfarm.scene.view import View, sample_view
@@ -54,55 +63,46 @@ _DECIDED = ("connections", "light_ratio", "half_spp", "guided_light", "light_sam
 """The settings that a plan decides."""
 
 
-class CandidateRow(Frozen):
-    """One candidate, as the pilot measured it."""
-
-    candidate: Candidate
-    errors: RelativeErrors  # of images of `Measurement.spp`
-    missed: float  # as in `MeasuredCandidate`
-    cost: ImageCost  # of a half-estimate on the spec's film
-
-
 class Measurement(Frozen):
     """One pilot of one scene: all that a plan depends on besides the settings that it decides."""
 
     purpose: Purpose
     film: Film  # of the pilot
-    spp: int
+    spp: int  # of the pilot
     half_s: float  # CPU time of a half-estimate that the spec accepted, at which the pilot compared
     views: int
     modelled: tuple[str, ...]
     left_out: tuple[str, ...]
-    rows: tuple[CandidateRow, ...]  # empty if every view is black
-    shared: float  # as in `Choice`
-    near: tuple[tuple[float, ...], ...]  # this and the next one as in `LightReach`
-    power: tuple[tuple[float, ...], ...]
+    rows: tuple[MeasuredCandidate, ...]  # with costs of half-estimates on the spec's film; empty if all is black
+    shared: float  # as in `PilotResult`
+    reach: LightReach
     asked_s: float  # CPU time that the pilot was given
     spent_s: float  # CPU time in all
 
-    def row(self, candidate: Candidate) -> CandidateRow:
-        """The measurement of a candidate."""
-        return next(row for row in self.rows if row.candidate == candidate)
+    @property
+    def costs(self) -> dict[Candidate, ImageCost]:
+        """The costs of the measured candidates."""
+        return {row.candidate: row.cost for row in self.rows}
 
 
 class PilotScene:
     """A loaded scene that renders any candidate in any of its configurations. Not thread-safe, like `LoadedScene`."""
 
-    def __init__(self, spec: SceneSpec, beside: Path | None, loaded: LoadedScene | None = None) -> None:
-        """Load the scene of a spec, on a film as small as the pilot requires, or take the loaded one."""
+    def __init__(self, spec: SceneSpec, beside: Path | None) -> None:
+        """Load the scene of a spec."""
         self.spec = spec
-        self.loaded = loaded or LoadedScene.load(spec, beside)
+        self.loaded = LoadedScene.load(spec, beside)
         self._integrators: dict[Candidate, Any] = {}
         self._applied: Modification | None = None
         self._editing_s = 0.0
 
-    def on_film(self, film: Film) -> PilotScene:
-        """The same scene on another film, without loading it again; after that, only the new one may be used."""
-        if film == self.spec.film:
-            return self
+    def use_film(self, film: Film) -> None:
+        """Render on another film from now on."""
         self.loaded.apply(rest(self.spec))
-        spec = self.spec.model_copy(update={"film": film})
-        return PilotScene(spec, None, LoadedScene(spec, self.loaded.scene))
+        self._integrators.clear()
+        self._applied = None
+        self.spec = self.spec.model_copy(update={"film": film})
+        self.loaded = LoadedScene(self.spec, self.loaded.scene)
 
     def clock(self) -> float:
         """The seconds of `backend.work_s` without those of edits, which cost all candidates the same."""
@@ -123,10 +123,6 @@ class PilotScene:
         for modification, _ in self._draw(count):
             self._apply(modification)
             yield self.loaded.scene
-
-    def camera(self) -> Any:
-        """Mitsuba's sensor, in any direction."""
-        return AimedSensor(self.spec).sensor
 
     def _render(self, modification: Modification, view: View, candidate: Candidate, seed: int, spp: int) -> F32:
         self._apply(modification)
@@ -152,113 +148,78 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
     The spec's settings are always among the measured ones. Raises SpecError and BackendError as loading does,
     IncompleteError, with the time that it takes, if the time is too short.
     """
-    budget = Budget(seconds)
+    budget, now, half_spp = Budget(seconds), present(spec), spec.transport.half_spp
     with WorkLog(log) as work_log:
         work_log.begin(f"loading {spec.name}", budget.words)
         scene = PilotScene(spec, beside)
-        budget.require(f"{spec.name}: loading it", 0.0, budget.spent_s)
+        budget.require(f"{spec.name}: loading it", 0.0)
         work_log.begin(f"following the light of {spec.name}", budget.words)
-        scene_content, depth = content.read(scene.loaded.scene, scene.camera()), spec.transport.max_depth
+        content, depth = SceneContent.of(scene.loaded.scene, AimedSensor(spec).sensor), spec.transport.max_depth
         loaded_s = budget.spent_s
-        reach = content.light_reach(budget.take_within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
-        edit_s = (budget.spent_s - loaded_s) / len(reach.near)
-        useful, left_out = content.restrict(scene_content, depth, reach.hit, GRID)
+        reach = light_reach(budget.take_within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
+        edit_s = (budget.spent_s - loaded_s) / reach.configurations
+        pointless = content.why_no_light_paths(depth, reach.hit)
 
-        now, half_spp = present(spec), spec.transport.half_spp
-        every = list(dict.fromkeys([*useful, now]))
+        every = list(dict.fromkeys([*([PLAIN] if pointless else GRID), now]))
         work_log.begin("compiling and timing images", budget.words)
-        scene = _shrink_film(scene, budget)
-        render, first = scene.renders(1)[0], {PLAIN, now} & set(every)
-        candidates = affordable(render, every, first, budget, edit_s, f"{spec.name}: comparing settings")
-        pixels, quick = spec.film.width * spec.film.height, scene.spec.film
-        timed = time_images(render, candidates, half_spp, TIMING * budget.left_s, scene.clock)
-        scale = pixels / (quick.width * quick.height)
-        costs = {c: ImageCost(cost.fixed_s, scale * cost.sample_s) for c, cost in timed.items()}
-        halves = {c: cost.halve() if purpose is Purpose.TRAINING else cost for c, cost in costs.items()}
-        half_s = halves[now].time_s(half_spp)
+        _shrink_film(scene, budget.left_s / IMAGES)
+        film, renders = scene.spec.film, scene.renders(MOST_VIEWS)
+        what = f"{spec.name}: comparing settings"
+        candidates = affordable(renders[0], every, {PLAIN, now} & set(every), budget, edit_s, what)
+        timed = time_images(renders[:LEAST_VIEWS], candidates, half_spp, TIMING * budget.left_s, scene.clock)
+        shared_by = 2 if purpose is Purpose.TRAINING else 1  # the half-estimates of a launch share its fixed part
+        scale = spec.film.width * spec.film.height / (film.width * film.height)
+        costs = {c: ImageCost(cost.fixed_s / shared_by, scale * cost.sample_s) for c, cost in timed.items()}
+        half_s = costs[now].time_s(half_spp)
 
         left_s = max(budget.left_s - EDITS * LEAST_VIEWS * edit_s, 0.0)
-        film, spp, views = _pilot_film(spec, costs, left_s)
-        scene = scene.on_film(film)
+        image_s = FIRST_ROUND * left_s / (2 + max(1.0, SCOUTS / len(timed)))  # for one of each candidate in each view
+        fixed_s, sample_s = sum(cost.fixed_s for cost in timed.values()), sum(cost.sample_s for cost in timed.values())
+        spp = int(np.clip((image_s / LEAST_VIEWS - fixed_s) / sample_s, 1, half_spp))
+        views = int(np.clip(image_s / (fixed_s + spp * sample_s), LEAST_VIEWS, MOST_VIEWS))
         what = f"{len(candidates)} settings in {views} views of {film.width} × {film.height}, {spp} spp"
         work_log.begin(f"measuring {what}", budget.words)
-        pilot_spp = spp * film.width * film.height / pixels  # of the spec's film
-        choice = pilot.choose(
-            scene.renders(views),
-            candidates,
+        found = measure_errors(
+            renders[:views],
+            costs,
+            later_s=half_s,
             seconds=left_s,
             spp=spp,
             seed=SEED,
             keep=[c for c in (DEFAULT, now) if c in candidates],
-            later={c: spp * halves[c].per_sample_s(half_s) / cost.time_s(pilot_spp) for c, cost in costs.items()},
             weigh=purpose.weigh(spec.exposure),
             clock=scene.clock,
         )
     fewer = f"settings compared: {len(candidates)} of {len(every)}, as --seconds {seconds:g} allows no more"
-    similar = RANGE * pilot_spp >= half_spp  # where an image's fixed part does not hide the time of its samples
-    corrections = {
-        m.candidate: m.time_s / costs[m.candidate].time_s(pilot_spp) if similar else 1.0 for m in choice.measured
-    }
     return Measurement(
         purpose=purpose,
         film=film,
         spp=spp,
         half_s=half_s,
-        views=choice.views,
-        modelled=(*content.sentences(scene_content, depth), *[fewer] * (len(candidates) < len(every))),
-        left_out=tuple(left_out),
-        rows=tuple(
-            CandidateRow(
-                candidate=measured.candidate,
-                errors=measured.errors,
-                missed=measured.missed,
-                cost=halves[measured.candidate].times(corrections[measured.candidate]),
-            )
-            for measured in choice.measured
-        ),
-        shared=choice.shared,
-        near=reach.near,
-        power=reach.power,
+        views=found.views,
+        modelled=(*content.sentences(depth), *[fewer] * (len(candidates) < len(every))),
+        left_out=(f"light paths, and with them connections: {pointless}",) if pointless else (),
+        rows=found.measured,
+        shared=found.shared,
+        reach=reach,
         asked_s=seconds,
         spent_s=budget.spent_s,
     )
 
 
-def _shrink_film(pilot_scene: PilotScene, budget: Budget) -> PilotScene:
-    """The scene on a film whose images are quick to render, halved as often as it helps; not below 32 pixels."""
-    target_s = budget.left_s / IMAGES
+def _shrink_film(scene: PilotScene, target_s: float) -> None:
+    """Have a film whose images are quick to render, halved as often as it helps; not below 32 pixels."""
     before = np.inf
     while True:
-        render, film = pilot_scene.renders(1)[0], pilot_scene.spec.film
+        render, film = scene.renders(1)[0], scene.spec.film
         render(PLAIN, 0, 1)  # compiles
-        begun = pilot_scene.clock()
+        begun = scene.clock()
         render(PLAIN, 1, 1)
-        image_s = pilot_scene.clock() - begun
+        image_s = scene.clock() - begun
         if image_s <= target_s or min(film.width, film.height) < 64 or image_s > 0.7 * before:
-            return pilot_scene
+            return
         before = image_s
-        pilot_scene = pilot_scene.on_film(_halve(film))
-
-
-def _halve(film: Film) -> Film:
-    return Film(width=film.width // 16 * 8, height=film.height // 16 * 8)
-
-
-def _pilot_film(spec: SceneSpec, costs: Mapping[Candidate, ImageCost], seconds: float) -> tuple[Film, int, int]:
-    """The film, samples per pixel and number of views whose first round takes no more than its share of the time.
-
-    Film and samples are those of the spec if there is time for them, and there are as many views as there is time for.
-    Otherwise samples are reduced first; then the film is halved, as long as the samples dominate the time.
-    """
-    fixed, sample = sum(cost.fixed_s for cost in costs.values()), sum(cost.sample_s for cost in costs.values())
-    images = 2 + max(1.0, SCOUTS / len(costs))
-    budget = FIRST_ROUND * seconds / images  # for one image of each candidate in each view
-    spp = int(np.clip((budget / LEAST_VIEWS - fixed) / sample, 1, spec.transport.half_spp))
-    film = spec.film
-    while LEAST_VIEWS * (fixed + spp * sample) > budget and spp * sample > fixed and min(film.width, film.height) >= 64:
-        film = _halve(film)
-        sample /= 4
-    return film, spp, int(np.clip(budget / (fixed + spp * sample), LEAST_VIEWS, MOST_VIEWS))
+        scene.use_film(Film(width=film.width // 16 * 8, height=film.height // 16 * 8))
 
 
 # -------------------------------------------------------------------------------------- kept measurements

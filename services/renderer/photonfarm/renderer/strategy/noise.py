@@ -18,7 +18,7 @@ chance explains (`missed`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from typing import TypeAlias
@@ -114,17 +114,6 @@ def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[fl
     return [float(square.mean()) - rare for square in squares], rare
 
 
-@dataclass(slots=True)
-class _Grid:
-    """Sums over the images of one view for one size of blocks."""
-
-    pixels: float  # per block
-    pairs: int = 0
-    mean: Blocks | float = 0.0  # sum over images of the block means of y
-    pixel_variance: Blocks | float = 0.0  # sum over pairs, mean over a block's pixels
-    block_variance: Blocks | float = 0.0  # sum over pairs, of the block means
-
-
 @dataclass(frozen=True, slots=True)
 class _Evidence:
     """The statistics of the block means of y for one size of blocks, in V views."""
@@ -135,28 +124,26 @@ class _Evidence:
     freedom: Blocks  # (V, B, B), degrees of freedom of the variance
 
 
-@dataclass(slots=True)
 class BlockSums:
-    """Sums over one candidate's images of all views, from which `missed` is computed."""
+    """The block means of one candidate's images of all views, from which `charge_for_missed` is computed."""
 
-    _grids: dict[int, dict[int, _Grid]] = field(default_factory=dict)  # by size and view
-    _ratios: dict[int, list[float]] = field(default_factory=dict)  # by size: the ratio that ρ is the mean of, by pairs
+    def __init__(self) -> None:
+        """Have no images yet."""
+        self._views: list[int] = []  # of each pair of images
+        self._pairs: dict[int, list[tuple[Blocks, Blocks, Blocks]]] = {blocks: [] for blocks in BLOCKS}
+        """By size of blocks, for each pair: mean of y, variance of y in a block's pixels, variance of its mean."""
+        self._pixels = 0
+        self._found: dict[int, _Evidence] = {}
 
     def add(self, a: F32, b: F32, weights: F32, view: int = 0) -> None:
         """Add two independent images of a view, (H, W, 3)."""
         grey = (np.stack([a, b]).astype(np.float64) * weights).mean(axis=-1, keepdims=True)
-        variance = (grey[:1] - grey[1:]) ** 2 / 2
-        for blocks in BLOCKS:
-            means = block_means(grey, blocks)
-            grid = self._grids.setdefault(blocks, {}).setdefault(view, _Grid(grey[0].size / means[0].size))
-            grid.pairs += 1
-            of_pixels, of_block = block_means(variance, blocks)[0], (means[0] - means[1]) ** 2 / 2
-            grid.mean = grid.mean + means.sum(axis=0)
-            grid.pixel_variance = grid.pixel_variance + of_pixels
-            grid.block_variance = grid.block_variance + of_block
-            noisy = of_pixels > 0
-            ratio = grid.pixels * float(np.mean(of_block[noisy] / of_pixels[noisy])) if noisy.any() else 1.0
-            self._ratios.setdefault(blocks, []).append(ratio)
+        self._found.clear()
+        self._views.append(view)
+        self._pixels = grey[0].size
+        for blocks, pairs in self._pairs.items():
+            means, of_pixels = block_means(grey, blocks), block_means((grey[:1] - grey[1:]) ** 2 / 2, blocks)[0]
+            pairs.append((means.mean(axis=0), of_pixels, (means[0] - means[1]) ** 2 / 2))
 
     def evidence(self, blocks: int) -> _Evidence:
         """The means of blocks of n pixels, their squared standard errors s², samples N and degrees of freedom.
@@ -172,19 +159,32 @@ class BlockSums:
         2·mean(R)²/var(R) degrees of freedom, between 1 and M; s² has that times the number of pairs. Where the variance
         between the images is the larger one, as near a light, a block has one for each pair of its own view.
         """
-        grids, ratios = list(self._grids[blocks].values()), np.array(self._ratios[blocks])
-        pairs = np.array([[[float(grid.pairs)]] for grid in grids])
-        independent = np.stack([np.asarray(grid.pixel_variance) for grid in grids]) / (grids[0].pixels * pairs)
-        between = np.stack([np.asarray(grid.block_variance) for grid in grids]) / pairs
-        dependence = max(1.0, float(ratios.mean()))
-        scatter = ratios.var(ddof=1) if len(ratios) > 1 else np.inf
-        pooled = len(ratios) * np.clip(2 * ratios.mean() ** 2 / max(scatter, 1e-30), 1, between[0].size)
-        return _Evidence(
-            mean=np.stack([np.asarray(grid.mean) for grid in grids]) / (2 * pairs),
-            variance=np.maximum(dependence * independent, between) / (2 * pairs),
-            samples=2 * pairs * grids[0].pixels / dependence,
-            freedom=np.where(between > dependence * independent, pairs, pooled),
+        if blocks in self._found:
+            return self._found[blocks]
+        mean, of_pixels, of_block = (np.stack(column) for column in zip(*self._pairs[blocks], strict=True))
+        n = self._pixels / mean[0].size
+        noisy = of_pixels > 0
+        ratios = np.array(
+            [
+                n * float(np.mean(block[some] / pixels[some])) if some.any() else 1.0
+                for block, pixels, some in zip(of_block, of_pixels, noisy, strict=True)
+            ]
         )
+        views = np.array(self._views)
+        of_view = [views == view for view in dict.fromkeys(self._views)]
+        pairs = np.array([[[float(chosen.sum())]] for chosen in of_view])
+        dependence = max(1.0, float(ratios.mean()))
+        independent = dependence * np.stack([of_pixels[chosen].mean(axis=0) for chosen in of_view]) / n
+        between = np.stack([of_block[chosen].mean(axis=0) for chosen in of_view])
+        scatter = ratios.var(ddof=1) if len(ratios) > 1 else np.inf
+        pooled = len(ratios) * np.clip(2 * ratios.mean() ** 2 / max(scatter, 1e-30), 1, mean[0].size)
+        self._found[blocks] = _Evidence(
+            mean=np.stack([mean[chosen].mean(axis=0) for chosen in of_view]),
+            variance=np.maximum(independent, between) / (2 * pairs),
+            samples=2 * pairs * n / dependence,
+            freedom=np.where(between > independent, pairs, pooled),
+        )
+        return self._found[blocks]
 
 
 def charge_for_missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:
@@ -202,18 +202,16 @@ def charge_for_missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:
 
     All sums are over the same views, in the same order.
     """
-    return float(np.max([_charge_in_blocks(sums, others, blocks) for blocks in BLOCKS], axis=0).mean())
-
-
-def _charge_in_blocks(sums: BlockSums, others: Sequence[BlockSums], blocks: int) -> NDArray[np.float64]:
-    """The charge of each view, (V,), for one size of blocks."""
-    own = sums.evidence(blocks)
-    charge = np.zeros_like(own.mean)
-    for more in (other.evidence(blocks) for other in others):
-        deficit = np.maximum(more.mean - own.mean, 0)
-        unlikely = np.maximum(deficit**2 - _limit(own, more), 0)
-        charge = np.maximum(charge, np.minimum(own.samples, more.samples) * unlikely)
-    return np.asarray(charge.mean(axis=(1, 2)))
+    charges = []
+    for blocks in BLOCKS:
+        own = sums.evidence(blocks)
+        charge = np.zeros_like(own.mean)
+        for more in (other.evidence(blocks) for other in others):
+            deficit = np.maximum(more.mean - own.mean, 0)
+            unlikely = np.maximum(deficit**2 - _limit(own, more), 0)
+            charge = np.maximum(charge, np.minimum(own.samples, more.samples) * unlikely)
+        charges.append(charge.mean(axis=(1, 2)))
+    return float(np.max(charges, axis=0).mean())
 
 
 def _limit(a: _Evidence, b: _Evidence) -> Blocks:

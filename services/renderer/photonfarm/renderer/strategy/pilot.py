@@ -1,4 +1,4 @@
-"""The pilot: a short measurement of variance × time that decides between settings of the integrator.
+"""The pilot: a short measurement of error × time that decides between settings of the integrator.
 
 Successive halving (Karnin, Koren and Somekh, ICML 2013): all candidates render a few images, the better half renders
 twice as many more, until one is left or the time is up. All candidates use the same seeds, so that their eye paths and
@@ -8,7 +8,7 @@ most rare bright samples are the same, and differences between candidates are du
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import count
 
 import numpy as np
@@ -16,7 +16,14 @@ from numpy.typing import NDArray
 
 from photonfarm.core.records import F32
 from photonfarm.renderer.scene import backend
-from photonfarm.renderer.strategy.candidates import PLAIN, Candidate, MeasuredCandidate, RelativeErrors, Render
+from photonfarm.renderer.strategy.candidates import (
+    PLAIN,
+    Candidate,
+    ImageCost,
+    MeasuredCandidate,
+    RelativeErrors,
+    Render,
+)
 from photonfarm.renderer.strategy.noise import BlockSums, Weigh, charge_for_missed, pair_errors, view_weights
 
 LEAST_PAIRS = 4
@@ -33,213 +40,136 @@ SUSPICIOUS = 0.05
 
 
 @dataclass(frozen=True, slots=True)
-class Choice:
-    """The chosen candidate, and its evidence."""
+class PilotResult:
+    """What a pilot measured."""
 
-    candidate: Candidate
     measured: tuple[MeasuredCandidate, ...]  # in the order of the candidates given; empty if every view is black
-    shared: float  # error of the rare bright samples that all candidates share, which `error` leaves out (see `noise`)
+    shared: float  # error of the rare bright samples that all candidates share, which `errors` leave out (see `noise`)
     views: int  # the views that were not black
 
-    def row(self, candidate: Candidate) -> MeasuredCandidate:
-        """The measurement of a candidate."""
-        return next(row for row in self.measured if row.candidate == candidate)
 
-
-def choose(
-    renders: Render | Sequence[Render],
-    candidates: Sequence[Candidate],
+def measure_errors(
+    renders: Sequence[Render],
+    costs: Mapping[Candidate, ImageCost],
     *,
+    later_s: float,
     seconds: float = 60.0,
     spp: int = 4,
     seed: int = 0,
     keep: Sequence[Candidate] = (),
-    later: Mapping[Candidate, float] | None = None,
     weigh: Weigh = view_weights,
     clock: Callable[[], float] = backend.work_s,
-) -> Choice:
-    """The candidate with the least error × time over some views; each of `renders` renders one view.
+) -> PilotResult:
+    """The errors of candidates whose `costs` are known, over some views; each of `renders` renders one of them.
 
-    The pilot takes `seconds` of `clock` (CPU time) at most, but always completes its first round. It ends earlier when
-    a single candidate is left that does not seem to miss light. Candidates in `keep` are measured to the end for
-    comparison, and so is plain path tracing, which is added if it is missing.
-
-    Images are compared at `spp` samples per pixel, and their time includes the fixed part of an image. So `spp` should
-    be that of later use. Otherwise `later` gives a factor for each candidate: the time that later use takes to the
-    error of one image of the pilot, over the time of that image. `weigh` says how the noise of pixels counts. Raises
-    ValueError without views, or for images that are not finite.
+    Candidates are compared by error × time where an image takes `later_s`. The pilot takes `seconds` of `clock` (CPU
+    time) at most, but always completes its first round. It ends earlier when a single candidate is left that does not
+    seem to miss light. Plain path tracing, which must be one of them, and those in `keep` are measured to the end for
+    comparison. `weigh` says how the noise of pixels counts. Raises ValueError without views, and for images that are
+    not finite.
     """
-    views = [renders] if callable(renders) else list(renders)
-    if not views:
-        raise ValueError("choose: renders is empty; a pilot needs a view at least")
-    every = list(dict.fromkeys([PLAIN, *candidates]))
-    rounds = Rounds(views, every, spp, seed, later or {}, weigh, clock)
-    rounds.scout()
-    pairs = max(1, -(-LEAST_PAIRS // len(views)))
-    rounds.round(every, pairs)
+    if not renders:
+        raise ValueError("measure_errors: renders is empty; a pilot needs a view at least")
+    begun, every, kept = clock(), list(costs), {PLAIN, *keep}
+    rounds = _Rounds(renders, costs, later_s, spp, seed, weigh, clock)
+    pairs = max(1, -(-LEAST_PAIRS // len(renders)))
+    rounds.render(every, pairs)
     if not rounds.weights:
-        return Choice(PLAIN, (), 0.0, 0)
-    _halve(rounds, every, pairs, {PLAIN, *keep}, seconds)
-    best = min(longest(every, rounds.images), key=rounds.cost)
-    return Choice(best, tuple(map(rounds.describe, every)), rounds.shared_error(), len(rounds.weights))
-
-
-def _halve(rounds: Rounds, every: Sequence[Candidate], pairs: int, kept: set[Candidate], seconds: float) -> None:
-    """Drop the worse half and measure the others twice as long, repeatedly; each has `pairs` of each view before."""
-    active = list(every)
+        return PilotResult((), 0.0, 0)
+    active = every
     while len(active) > 1:
         ranked = sorted(active, key=rounds.cost)
         best = ranked[: (len(ranked) + 1) // 2]
         if rounds.is_suspect(best[0]):  # missing light shows only with more images: keep a candidate that finds it
             best += [c for c in ranked if not rounds.is_suspect(c)][:1]
         active = [c for c in every if c in best]
-        pairs = rounds.affordable([*active, *(kept - set(active))], 2 * pairs, seconds)
+        going_on = [c for c in every if c in best or c in kept]
+        pairs = rounds.affordable(going_on, 2 * pairs, begun + seconds - clock())
         if not pairs:
             break
-        rounds.round([c for c in every if c in best or c in kept], pairs)
+        rounds.render(going_on, pairs)
+    shared = float(np.mean([np.mean(of_view) for of_view in rounds.shared.values()]))
+    return PilotResult(tuple(map(rounds.describe, every)), shared, len(rounds.weights))
 
 
-def longest(candidates: Sequence[Candidate], images: Callable[[Candidate], int]) -> list[Candidate]:
-    """The candidates with the most images, as one with few images may be the best by chance."""
-    most = max(map(images, candidates))
-    return [c for c in candidates if images(c) == most]
-
-
-@dataclass(slots=True)
-class _Record:
-    """One candidate's measurements in one view."""
-
-    errors: list[float] = field(default_factory=list)  # of an image, by each pair
-    times_s: list[float] = field(default_factory=list)
-
-
-class Rounds:
+class _Rounds:
     """The views, the candidates and the results so far."""
 
     def __init__(
         self,
         views: Sequence[Render],
-        candidates: Sequence[Candidate],
+        costs: Mapping[Candidate, ImageCost],
+        later_s: float,
         spp: int,
         seed: int,
-        later: Mapping[Candidate, float],
         weigh: Weigh,
         clock: Callable[[], float],
     ) -> None:
-        self._views = views
-        self._candidates = candidates
-        self._spp = spp
-        self._seeds = [count(seed + 1_000_003 * v) for v in range(len(views))]
-        self._later = later
-        self._weigh = weigh
-        self._clock = clock
-        self._begun = clock()
-        self.weights: dict[int, F32] = {}  # by view; black views are left out
-        self._records: dict[Candidate, dict[int, _Record]] = {c: {} for c in candidates}
-        self._block_sums = {c: BlockSums() for c in candidates}
-        self._shared: dict[int, list[float]] = {}  # by view, of each pair: the error that is left out
-
-    def scout(self) -> None:
         """Compile, and render the images that give each view's weights."""
-        turns = -(-SCOUTS // len(self._candidates))
-        for view, render in enumerate(self._views):
-            every = list(self._candidates) * turns
-            weights = self._weigh([self._render(render, c, next(self._seeds[view])) for c in every])
-            if weights is not None:
+        self._views, self._costs, self._later_s, self._spp, self._clock = views, costs, later_s, spp, clock
+        self._seeds = [count(seed + 1_000_003 * v) for v in range(len(views))]
+        self._errors: dict[Candidate, dict[int, list[float]]] = {c: {} for c in costs}  # of an image, by view and pair
+        self._seconds: dict[Candidate, list[float]] = {c: [] for c in costs}  # of an image
+        self._block_sums = {c: BlockSums() for c in costs}
+        self.shared: dict[int, list[float]] = {}  # by view, of each pair: the error that is left out
+        self.weights: dict[int, F32] = {}  # by view; black views are left out
+        for view, seeds in enumerate(self._seeds):
+            every = list(costs) * -(-SCOUTS // len(costs))
+            if (weights := weigh([self._image(view, c, next(seeds)) for c in every])) is not None:
                 self.weights[view] = weights
-                for candidate in self._candidates:
-                    self._records[candidate][view] = _Record()
 
-    def round(self, candidates: Sequence[Candidate], pairs: int) -> None:
-        """Render images, the candidates in turn, so that a slower machine slows all of them down."""
-        for view in self.weights:
+    def render(self, candidates: Sequence[Candidate], pairs: int) -> None:
+        """Render so many pairs of images of each view, the candidates in turn."""
+        for view, weights in self.weights.items():
             for _ in range(pairs):
                 seeds = next(self._seeds[view]), next(self._seeds[view])
-                images: dict[Candidate, list[F32]] = {c: [] for c in candidates}
-                for seed in seeds:
-                    for candidate in candidates:
-                        start = self._clock()
-                        images[candidate].append(self._render(self._views[view], candidate, seed))
-                        self._records[candidate][view].times_s.append(self._clock() - start)
-                self._note(view, {candidate: (a, b) for candidate, (a, b) in images.items()})
+                firsts, seconds = ([self._image(view, c, seed) for c in candidates] for seed in seeds)
+                images = list(zip(firsts, seconds, strict=True))
+                errors, shared = pair_errors(images, weights)
+                self.shared.setdefault(view, []).append(shared)
+                for candidate, error, (a, b) in zip(candidates, errors, images, strict=True):
+                    self._errors[candidate].setdefault(view, []).append(error)
+                    self._block_sums[candidate].add(a, b, weights, view)
 
-    def _note(self, view: int, pairs: dict[Candidate, tuple[F32, F32]]) -> None:
-        errors, shared = pair_errors(list(pairs.values()), self.weights[view])
-        self._shared.setdefault(view, []).append(shared)
-        for (candidate, (a, b)), error in zip(pairs.items(), errors, strict=True):
-            self._records[candidate][view].errors.append(error)
-            self._block_sums[candidate].add(a, b, self.weights[view], view)
-
-    def _render(self, render: Render, candidate: Candidate, seed: int) -> F32:
-        image = render(candidate, seed, self._spp)
+    def _image(self, view: int, candidate: Candidate, seed: int) -> F32:
+        start = self._clock()
+        image = self._views[view](candidate, seed, self._spp)
+        self._seconds[candidate].append(self._clock() - start)
         if not np.isfinite(image).all():
-            raise ValueError(f"choose: seed {seed} of candidate {candidate} gave an image that is not finite")
+            raise ValueError(f"measure_errors: seed {seed} of candidate {candidate} gave an image that is not finite")
         return image
 
     def affordable(self, candidates: Sequence[Candidate], pairs: int, seconds: float) -> int:
         """The number of pairs per view, at most `pairs`, that the remaining time allows."""
-        left = seconds - (self._clock() - self._begun)
-        per_pair = 2 * len(self.weights) * sum(self._time(c) for c in candidates)
-        room = MOST_PAIRS - max(self.images(c) for c in candidates) // (2 * len(self.weights))
-        return max(0, min(pairs, room, int(left / max(per_pair, 1e-9))))
+        per_pair = 2 * len(self.weights) * sum(float(np.median(self._seconds[c])) for c in candidates)
+        room = MOST_PAIRS - max(len(self._seen(c)) for c in candidates)
+        return max(0, min(pairs, room, int(seconds / max(per_pair, 1e-9))))
 
-    def images(self, candidate: Candidate) -> int:
-        """The number of images rendered of a candidate that count."""
-        return sum(len(record.times_s) for record in self._records[candidate].values())
+    def _seen(self, candidate: Candidate) -> NDArray[np.float64]:
+        """The errors that are seen, (pairs, views)."""
+        return np.stack(list(self._errors[candidate].values()), axis=1)
 
-    def _time(self, candidate: Candidate) -> float:
-        return float(np.mean([np.median(record.times_s) for record in self._records[candidate].values()]))
-
-    def _time_later(self, candidate: Candidate) -> float:
-        return self._time(candidate) * self._later.get(candidate, 1.0)
-
-    def inferred_error(self, candidate: Candidate) -> float:
+    def _inferred(self, candidate: Candidate) -> float:
         """The part of a candidate's error that is inferred from light that others found."""
-        return charge_for_missed(
-            self._block_sums[candidate], [sums for c, sums in self._block_sums.items() if c != candidate]
-        )
-
-    def _errors_that_count(self, candidate: Candidate) -> NDArray[np.float64]:
-        """The error that counts, by pairs and views, (pairs, views)."""
-        return np.stack([record.errors for record in self._records[candidate].values()], axis=1)
-
-    def shared_error(self) -> float:
-        """The error of rare bright samples that all candidates share in an image, which is left out."""
-        return float(np.mean([np.mean(shared) for shared in self._shared.values()]))
+        others = [sums for c, sums in self._block_sums.items() if c != candidate]
+        return charge_for_missed(self._block_sums[candidate], others)
 
     def is_suspect(self, candidate: Candidate) -> bool:
         """Whether a candidate seems to miss light that others find; the estimate grows with the number of images."""
-        inferred = self.inferred_error(candidate)
-        return bool(inferred > SUSPICIOUS * (self._errors_that_count(candidate).mean() + inferred))
+        inferred = self._inferred(candidate)
+        return bool(inferred > SUSPICIOUS * (self._seen(candidate).mean() + inferred))
 
     def cost(self, candidate: Candidate) -> float:
         """Error × time of a candidate: less is better."""
-        return float(
-            (self._errors_that_count(candidate).mean() + self.inferred_error(candidate)) * self._time_later(candidate)
-        )
-
-    def errors(self, candidate: Candidate) -> RelativeErrors:
-        """The errors beside those of plain path tracing, over the images that both rendered with equal seeds."""
-        seen = self._errors_that_count(candidate)
-        own, plain = (
-            seen + self.inferred_error(candidate),
-            self._errors_that_count(PLAIN)[: len(seen)] + self.inferred_error(PLAIN),
-        )
-        return RelativeErrors(images=self.images(candidate), own=_mean_over_pairs(own), plain=_mean_over_pairs(plain))
+        error = self._seen(candidate).mean() + self._inferred(candidate)
+        return float(error * self._costs[candidate].per_sample_s(self._later_s))
 
     def describe(self, candidate: Candidate) -> MeasuredCandidate:
-        """The error × time against plain path tracing."""
-        errors = self.errors(candidate)
-        cost = errors.ratio * self._time_later(candidate) / self._time_later(PLAIN)
-        relative = errors.relative_spread(errors.model_copy(update={"own": errors.plain}))
-        return MeasuredCandidate(
-            candidate=candidate,
-            errors=errors,
-            missed=self.inferred_error(candidate),
-            time_s=self._time(candidate),
-            relative_cost=cost,
-            spread=None if relative is None else cost * relative,
-        )
+        """The errors beside those of plain path tracing, over the images that both rendered with equal seeds."""
+        missed, seen = self._inferred(candidate), self._seen(candidate)
+        own, plain = seen + missed, self._seen(PLAIN)[: len(seen)] + self._inferred(PLAIN)
+        errors = RelativeErrors(images=2 * seen.size, own=_mean_over_pairs(own), plain=_mean_over_pairs(plain))
+        return MeasuredCandidate(candidate=candidate, errors=errors, missed=missed, cost=self._costs[candidate])
 
 
 def _mean_over_pairs(errors: NDArray[np.float64]) -> tuple[float, ...]:

@@ -1,4 +1,4 @@
-"""Which of two candidates is better, and whether that is known."""
+"""Which of two candidates is better, and whether that is known; what a time buys."""
 
 import math
 
@@ -7,18 +7,27 @@ import pytest
 from photonfarm.renderer.strategy.candidates import (
     PLAIN,
     Candidate,
+    CandidateAtCost,
+    ImageCost,
     MeasuredCandidate,
     RelativeErrors,
-    is_alike,
+    compare_at_cost,
     saving,
 )
 
 
-def measured(
-    own: tuple[float, ...], plain: tuple[float, ...], images: int = 12, time: float = 1.0
-) -> MeasuredCandidate:
-    errors = RelativeErrors(images=images, own=own, plain=plain)
-    return MeasuredCandidate(Candidate(0, 1.0), errors, 0.0, 1.0, errors.ratio * time, None)
+def measured(own: tuple[float, ...], plain: tuple[float, ...], images: int = 12, time: float = 1.0) -> CandidateAtCost:
+    """A candidate whose samples take `time`, where those of plain path tracing take 1."""
+    rows = [
+        MeasuredCandidate(
+            candidate=candidate,
+            errors=RelativeErrors(images=images, own=errors, plain=plain),
+            missed=0.0,
+            cost=ImageCost(0.0, sample_s),
+        )
+        for candidate, errors, sample_s in ((PLAIN, plain, 1.0), (Candidate(0, 1.0), own, time))
+    ]
+    return compare_at_cost(rows, 1, 1e4)[Candidate(0, 1.0)]
 
 
 def test_candidates_whose_errors_rise_and_fall_together_are_told_apart_however_much_these_vary() -> None:
@@ -27,7 +36,6 @@ def test_candidates_whose_errors_rise_and_fall_together_are_told_apart_however_m
     found = saving(one, over=other)
     assert found.factor == pytest.approx(9.03 / 4.5)
     assert found.significant
-    assert not is_alike(one, other)
     alone = saving(one, over=measured(plain, plain))
     assert alone.factor == pytest.approx(12 / 4.5)
     assert not alone.significant
@@ -58,4 +66,9 @@ def test_a_gain_counts_from_five_per_cent_and_two_standard_errors(
 def test_a_single_value_tells_nothing_of_its_error() -> None:
     found = saving(measured((1.0,), (1.0,)), over=measured((9.0,), (1.0,)))
     assert (found.factor, found.spread, found.significant) == (9.0, None, False)
-    assert found.over == Candidate(0, 1.0) != PLAIN
+
+
+def test_a_time_buys_whole_samples_and_one_at_least() -> None:
+    cost = ImageCost(fixed_s=1.0, sample_s=2.0)
+    assert [cost.bought(s) for s in (0.5, 3.0, 5.9, 6.1, 1e9)] == [1, 1, 2, 3, 65536]
+    assert [cost.pays(s) for s in (2.3, 2.5)] == [False, True]

@@ -29,7 +29,6 @@ from experiments.experiment import HERE, Experiment
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.pictures import Picture
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, GAP, LINE
-from photonfarm.trainer.predict.animation import read_png
 from photonfarm.trainer.report.views import OVERVIEW, colour_difference
 from photonfarm.trainer.report.worst_cases import name_kinds as worst_view
 
@@ -77,7 +76,7 @@ class Report:
                 "(runs of an earlier version are trained anew)"
             )
         names = [REFERENCE, *(row["name"] for row in document["evaluation"]["rows"])]
-        sheet = read_png(folder / COMPARISON)
+        sheet = np.asarray(Image.open(folder / COMPARISON))
         width = (sheet.shape[1] + GAP) // len(names) - GAP
         step = width + LINE + GAP
         top = sheet.shape[0] + GAP - len(shown) * step + LINE
@@ -161,7 +160,7 @@ def _wrap(head: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list
 def make_figures(name: str, report: Report, out: Path) -> None:
     """The figures of one room."""
     if Experiment.load(name, "small").part == "static":
-        save(read_png(report.folder / OVERVIEW), out / f"{name}.png")
+        save(np.asarray(Image.open(report.folder / OVERVIEW)), out / f"{name}.png")
         return
     for metric in METRICS:
         shutil.copy(report.folder / f"time-{metric}.svg", out / f"{name}-time-{metric}.svg")

@@ -40,8 +40,8 @@ from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.cli.train_verb import collect_settings
 from photonfarm.trainer.cli.train_verb import train as train_verb
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.predict.evaluation import HeldOutErrors, measure, read_batches
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.evaluation import HeldOutErrors, measure, read_batches
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import lock_run
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, TrainSettings, make_settings
 from photonfarm.trainer.training.learner import DivergedError

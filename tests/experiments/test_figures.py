@@ -12,9 +12,9 @@ import pytest
 from experiments import figures
 from experiments.figures import AFTER, BEFORE, REFERENCE, Report
 from photonfarm.core.errors import IncompleteError
+from photonfarm.core.pictures import write_png
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparison
 from photonfarm.trainer.compare.evaluation_samples import Target
-from photonfarm.trainer.predict.animation import write_png
 
 FIRST = [22, 55, 64, 65]
 WORST = {"mirrors and clear glass": 64, "specular surfaces": 305, "near surfaces": 22, "all pixels": 64}

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.predict.evaluation import make_network_predictor, measure, read_batches
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.evaluation import make_network_predictor, measure, read_batches
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report.trained_runs import Baselines
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT
 

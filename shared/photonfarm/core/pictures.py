@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import store_errors
 from photonfarm.core.records import F32
 
 Picture = NDArray[np.uint8]  # (H, W, 3)
@@ -73,6 +74,23 @@ def data_uri(picture: Picture, most: int | None = None) -> str:
     kind = "PNG" if shown.shape[1] <= EXACT else "WEBP"
     Image.fromarray(shown).save(stream, kind, quality=90)
     return f"data:image/{kind.lower()};base64,{base64.b64encode(stream.getvalue()).decode()}"
+
+
+PICTURE_WIDTH = 256  # px, at least
+
+
+def enlarge(exposed: F32) -> Picture:
+    """Exposed linear radiance, (H, W, 3), as a display shows it; the pixels of a small image are enlarged."""
+    scale = max(1, -(-PICTURE_WIDTH // exposed.shape[1]))
+    return display(exposed, 1.0).repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def write_png(picture: Picture, file: Path) -> None:
+    """Write one picture, (H, W, 3)."""
+    from PIL import Image
+
+    with store_errors("write the picture", file):
+        Image.fromarray(picture).save(file, "PNG")
 
 
 def _bytes(unit: NDArray[np.floating]) -> Picture:

@@ -20,7 +20,7 @@ from photonfarm.core.statistics import Estimate
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.store import Store
-from photonfarm.trainer.predict.evaluation import HeldOutErrors
+from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings

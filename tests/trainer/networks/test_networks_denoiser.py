@@ -10,7 +10,7 @@ from photonfarm.trainer.data.batch import TrainingBatch, choose_kept_pixels
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.inputs import Needs, SceneFrame
-from photonfarm.trainer.predict.evaluation import measure, read_batches
+from photonfarm.trainer.predictors.evaluation import measure, read_batches
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 DENOISERS = {"denoise_1": 1, "denoise_4": 4, "denoise_16": 16, "denoise_32": 32, "denoise_64": 64}

@@ -18,12 +18,12 @@ from photonfarm.core.pictures import display
 from photonfarm.core.records import LIT_POINTS, Guides, arrays_of
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
+from photonfarm.predict import infer
 from photonfarm.scene.camera_path import Frames, orbit
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.trainer.predict import animation, infer
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.training.loop import train
 
 
@@ -150,23 +150,16 @@ def test_a_path_becomes_pictures_an_animation_and_a_film(
     film = decoded(tmp_path / "out/path.mp4", 256, 256)
     assert len(film) == 5
     assert np.abs(film[2].astype(int) - pixels(tmp_path / "out/frame-0002.png")).mean() < 8
+    Image.new("RGB", (47, 33), (200, 200, 200)).save(tmp_path / "frame-0000.png")
+    infer.write_mp4([tmp_path / "frame-0000.png"], tmp_path / "odd.mp4", 12)
+    odd = decoded(tmp_path / "odd.mp4", 48, 34)
+    assert np.abs(odd[0, :33, :47].astype(int) - 200).max() <= 16
+    with pytest.raises(StoreError, match="ffmpeg"):
+        infer.write_mp4([tmp_path / "frame-0000.png"], tmp_path / "odd.unknown", 12)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     without = infer.show_frames(store, TrainedRun.load(tmp_path / "run"), path, tmp_path / "other")
     assert not (tmp_path / "other/path.mp4").exists()
     assert "pip install photonfarm[video]" in without.sentence
-
-
-def test_odd_sizes_become_even_in_a_film_and_stay_odd_in_pictures(tmp_path: Path) -> None:
-    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
-    picture = np.full((33, 47, 3), 200, np.uint8)
-    animation.write_mp4([picture] * 3, tmp_path / "film.mp4", 12)
-    animation.write_png(picture, tmp_path / "picture.png")
-    film = decoded(tmp_path / "film.mp4", 48, 34)
-    assert len(film) == 3
-    assert np.abs(film.astype(int) - 200).max() <= 3
-    with pytest.raises(StoreError):
-        animation.write_mp4([picture], tmp_path / "missing/film.mp4", 12)
-    assert pixels(tmp_path / "picture.png").shape == (33, 47, 3)
 
 
 def test_what_cannot_be_shown_is_refused(
@@ -189,12 +182,9 @@ def test_what_cannot_be_shown_is_refused(
         with pytest.raises(SpecError, match=named):
             infer.show_frames(store, network, buffers, tmp_path / "out")
     monkeypatch.setattr(infer, "can_render", lambda: False)
-    with pytest.raises(SpecError, match=r"buffers --scene .* --orbit 3"):
-        infer.render_frames(store, run, ["--orbit", "3"])
+    with pytest.raises(SpecError, match=r"photonfarm buffers --scene"):
+        infer.render_frames(store, run, None, 3)
     monkeypatch.undo()
-    with pytest.raises(PhotonfarmError) as error:
-        infer.render_frames(store, run, ["--orbit", "0"])
-    assert error.value.exit_code == 2
     for show in (
         lambda: infer.show_sample(tmp_path, run, 7, tmp_path / "out"),
         lambda: infer.show_frames(tmp_path, run, path, tmp_path / "out"),
@@ -241,26 +231,3 @@ def test_the_verb_refuses_none_or_several_things_to_show(arguments: list[str], s
     result = CliRunner().invoke(umbrella, ["infer", *arguments])
     assert result.exit_code == 2
     assert said in result.stderr
-
-
-def test_frames_of_a_film_are_poured_one_by_one_and_an_ffmpeg_that_ends_early_is_heard(tmp_path: Path) -> None:
-    """Frames are made as ffmpeg takes them; where it refuses what it is to write, the making stops."""
-    pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
-    made = []
-
-    def frames():
-        for i in range(200):
-            made.append(i)
-            yield np.full((64, 64, 3), i, np.uint8)
-
-    animation.write_mp4(frames(), tmp_path / "film.mp4", 12)
-    assert len(made) == len(decoded(tmp_path / "film.mp4", 64, 64)) == 200
-    made.clear()
-
-    def endless():
-        while True:
-            made.append(0)
-            yield np.zeros((256, 256, 3), np.uint8)
-
-    with pytest.raises(StoreError):
-        animation.write_mp4(endless(), tmp_path / "missing/film.mp4", 12)

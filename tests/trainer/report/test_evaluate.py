@@ -33,14 +33,14 @@ from photonfarm.trainer.data.batch import choose_kept_pixels, count_kept
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics import find_weights, metric_space, mse
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.predict.evaluation import (
+from photonfarm.trainer.predictors.evaluation import (
     TIMED_ROUNDS,
     WARM_ROUNDS,
     DevicePredictor,
     read_batches,
     time_by_turns,
 )
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.training.loop import train
 
 

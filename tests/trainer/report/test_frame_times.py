@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from photonfarm.core.archives import PARTS, FrameCosts, Seconds
-from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
+from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.frame_times import assemble_frame_time, count_points
 

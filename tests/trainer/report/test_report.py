@@ -28,7 +28,7 @@ from photonfarm.store import SceneReader, Store, store_status
 from photonfarm.store.read.merge import MergedView
 from photonfarm.trainer.compare.evaluate import PredictorRow
 from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report import write_report as report_of
 from photonfarm.trainer.report.contents import MOVABLE_LIGHTS, gather_contents
 from photonfarm.trainer.report.frame_times import FrameTime

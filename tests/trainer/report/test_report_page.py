@@ -13,8 +13,8 @@ from chromium import chromium, needs_chromium
 from photonfarm.core.records import Guides
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.store import SceneReader
-from photonfarm.trainer.predict.evaluation import HeldOutErrors
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.evaluation import HeldOutErrors
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.report.contents import ReportContents, gather_contents
 from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, encode_half_floats, encode_light

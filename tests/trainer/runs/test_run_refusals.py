@@ -10,7 +10,7 @@ import pytest
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.trainer import service
 from photonfarm.trainer.cli import train_verb as cli
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, lock_run

@@ -14,7 +14,7 @@ from read_batches import batch_of
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks import build
 from photonfarm.trainer.networks.inputs import Needs, SceneFrame
-from photonfarm.trainer.predict.evaluation import make_network_predictor
+from photonfarm.trainer.predictors.evaluation import make_network_predictor
 from photonfarm.trainer.runs import settings
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, make_settings
 from photonfarm.trainer.training.learner import build_optimiser, compute_rate

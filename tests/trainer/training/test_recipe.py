@@ -9,8 +9,8 @@ import torch
 from held_out_errors import held_out_errors
 
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.predict.evaluation import read_batches
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.evaluation import read_batches
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
 from photonfarm.trainer.runs.settings import PRESETS, TrainSettings

@@ -15,8 +15,8 @@ import torch
 from photonfarm.core.errors import StoreError
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.cli import show
-from photonfarm.trainer.predict.evaluation import HeldOutErrors
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.evaluation import HeldOutErrors
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, METRICS
 from photonfarm.trainer.training import loop

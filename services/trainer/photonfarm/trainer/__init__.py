@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from photonfarm.trainer.predict.trained import TrainedRun
+    from photonfarm.trainer.predictors.trained import TrainedRun
 
 __all__ = ["train"]
 
@@ -47,7 +47,7 @@ def train(
     from photonfarm.store import Store  # torch is slow to load, and settings are read without it
     from photonfarm.store.read.find import scene_named
     from photonfarm.trainer import service
-    from photonfarm.trainer.predict.trained import TrainedRun
+    from photonfarm.trainer.predictors.trained import TrainedRun
 
     scene_id = scene_named(Store(store), scene)
     service.run(None, store, Path(run), preset, settings, redis_url, scene_id=scene_id, log=log)

@@ -59,15 +59,16 @@ def buffers(
 
     Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
     """
-    from photonfarm.renderer.jobs.path_buffers import write_buffers
+    from photonfarm.renderer.jobs.path_buffers import render_path
     from photonfarm.scene.camera_path import CameraPath
 
     if (path is None) == (orbit is None):
         raise click.UsageError("one of --camera-path and --orbit is required")
     along = orbit or CameraPath.load(path or Path())
     with tell_waiting(partial(click.echo, err=True), f"rendering buffers of {scene}"):
-        frames = write_buffers(store, scene, modification, along, out)
-    click.echo(f"{out}: {frames} frames")
+        frames = render_path(store, scene, modification, along)
+        frames.write(out)
+    click.echo(f"{out}: {len(frames)} frames")
 
 
 @click.command("measure-frames")

@@ -28,8 +28,8 @@ from photonfarm.store import Store
 from photonfarm.store.read.find import scene_named
 
 
-def write_buffers(store: str | Path, scene: str, modification: str | None, path: CameraPath | int, out: Path) -> int:
-    """Render the buffers of a camera path, or of an orbit of so many frames, into a file; returns the number of frames.
+def render_path(store: str | Path, scene: str, modification: str | None, path: CameraPath | int) -> Frames:
+    """The buffers of a camera path, or of an orbit of so many frames.
 
     Raises StoreError for a scene that the store does not hold, SceneNotHereError if its files are not on this machine,
     SpecError for an impossible configuration.
@@ -42,9 +42,7 @@ def write_buffers(store: str | Path, scene: str, modification: str | None, path:
         views = orbit(spec, path, configuration)
     else:
         views = check_clear(spec, path.sample(), configuration)
-    cloud = stored.base()[1] if stored.has_base() else None
-    frames_of(spec, configuration, views, cloud).write(out)
-    return len(views)
+    return frames_of(spec, configuration, views, stored.base()[1] if stored.has_base() else None)
 
 
 def frames_of(

@@ -33,7 +33,7 @@ from photonfarm.trainer.metrics import (
     measure_images,
 )
 from photonfarm.trainer.networks.inputs import Inputs
-from photonfarm.trainer.predict.evaluation import (
+from photonfarm.trainer.predictors.evaluation import (
     NONE_COMPLETE,
     DevicePredictor,
     HeldOutErrors,
@@ -42,7 +42,7 @@ from photonfarm.trainer.predict.evaluation import (
     read_batches,
     time_by_turns,
 )
-from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
+from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.devices import describe_device, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 

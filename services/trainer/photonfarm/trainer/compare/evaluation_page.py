@@ -14,15 +14,14 @@ import numpy as np
 
 from photonfarm.core.errors import store_errors
 from photonfarm.core.formatting import format_count, format_markdown_table, format_milliseconds
-from photonfarm.core.pictures import Picture
+from photonfarm.core.pictures import Picture, enlarge, write_png
 from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import References, Target
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
 from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
-from photonfarm.trainer.predict.animation import enlarge, write_png
-from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.evaluation import TIMED_ROUNDS
+from photonfarm.trainer.predictors.trained import TrainedRun
 
 EVALUATION = "evaluation.json"
 

@@ -12,10 +12,10 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.core.errors import store_errors
+from photonfarm.core.pictures import write_png
 from photonfarm.trainer.compare.evaluate import MeasureProgress
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparison
-from photonfarm.trainer.predict.animation import write_png
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report.contents import gather_contents
 from photonfarm.trainer.report.page import Verdict, format_markdown, format_page
 from photonfarm.trainer.report.plots import draw_plots

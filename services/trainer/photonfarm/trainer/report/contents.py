@@ -20,7 +20,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.compare import evaluate
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
 from photonfarm.trainer.compare.evaluation_samples import Reference
-from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
+from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.report.dataset_card import DatasetCard
 from photonfarm.trainer.report.frame_times import (
     FrameTime,

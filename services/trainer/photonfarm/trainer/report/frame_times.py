@@ -18,7 +18,7 @@ from typing import Any
 from photonfarm.core.archives import FrameCosts, Seconds
 from photonfarm.core.errors import BackendError
 from photonfarm.core.processes import can_render, command
-from photonfarm.trainer.predict.trained import ReadyPredictor, TrainedRun
+from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.run_folder import make_environment
 
 CPU_INFO = Path("/proc/cpuinfo")

@@ -24,7 +24,7 @@ from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
-from photonfarm.trainer.predict.evaluation import BLOCK, HeldOutErrors
+from photonfarm.trainer.predictors.evaluation import BLOCK, HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.plots import Plot, group_by_kind
 from photonfarm.trainer.report.tables import Table, list_facts, make_tables

@@ -10,7 +10,7 @@ from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.compare.evaluation_page import describe_device, list_notes
 from photonfarm.trainer.metrics import confidence_interval
 from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE, TITLES
-from photonfarm.trainer.predict.evaluation import TIMED_ROUNDS
+from photonfarm.trainer.predictors.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry
 
 

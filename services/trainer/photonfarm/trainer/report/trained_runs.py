@@ -13,7 +13,7 @@ import numpy as np
 
 from photonfarm.core.errors import IncompleteError
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.predict.evaluation import (
+from photonfarm.trainer.predictors.evaluation import (
     HeldOutErrors,
     average_colours,
     make_constant_predictor,
@@ -21,7 +21,7 @@ from photonfarm.trainer.predict.evaluation import (
     measure,
     read_batches,
 )
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.devices import AUTO, usable_device
 from photonfarm.trainer.runs.progress import divide_by_used, find_bottleneck, share_waits

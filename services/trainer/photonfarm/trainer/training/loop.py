@@ -21,7 +21,7 @@ from photonfarm.core.statistics import group_means
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
 from photonfarm.trainer.data.batch_stream import BatchStream, Growth
 from photonfarm.trainer.data.feed import Feed, SampleSource
-from photonfarm.trainer.predict.evaluation import make_network_predictor, read_batches
+from photonfarm.trainer.predictors.evaluation import make_network_predictor, read_batches
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import SINGLE_PROCESS, TrainingGroup, usable_device
 from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used, share_waits

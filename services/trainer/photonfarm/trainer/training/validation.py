@@ -17,7 +17,7 @@ from photonfarm.core.errors import store_errors
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.data.batch import TrainingBatch
-from photonfarm.trainer.predict.evaluation import HeldOutErrors, Predictor, measure
+from photonfarm.trainer.predictors.evaluation import HeldOutErrors, Predictor, measure
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import GOOD
 from photonfarm.trainer.training.learner import DivergedError, Learner

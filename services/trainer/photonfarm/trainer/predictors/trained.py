@@ -17,8 +17,8 @@ from photonfarm.store import SceneReader
 from photonfarm.trainer.networks import build, find_kind
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.predict.denoisers import fill_in
-from photonfarm.trainer.predict.evaluation import DevicePredictor, make_network_predictor
+from photonfarm.trainer.predictors.denoisers import fill_in
+from photonfarm.trainer.predictors.evaluation import DevicePredictor, make_network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.devices import usable_device
@@ -115,6 +115,6 @@ class ReadyPredictor:
             return lambda inputs: require(inputs.noisy).colour
         if self.denoiser == "fill-in":
             return lambda inputs: fill_in(require(inputs.noisy), inputs.albedo)
-        from photonfarm.trainer.predict.denoisers import Oidn
+        from photonfarm.trainer.predictors.denoisers import Oidn
 
         return Oidn(self.settings.threads)

@@ -1,40 +1,43 @@
 """`photonfarm infer`: a trained network's image of a sample, or of a camera path.
 
-The views of a path are in no store, and their buffers come from the renderer: from a file that `photonfarm buffers`
-wrote, or from that verb, run as a process of its own if it is installed.
+The views of a path are in no store. The renderer makes their buffers where it is installed, or `photonfarm buffers` has
+written them to a file.
 """
 
 from __future__ import annotations
 
+import os
 import subprocess
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
-from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, StoreError, store_errors
-from photonfarm.core.processes import can_render, command
-from photonfarm.core.records import F32
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError, store_errors
+from photonfarm.core.pictures import enlarge, write_png
+from photonfarm.core.processes import can_render
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.plan.hold_out import rows_held_out
-from photonfarm.scene.camera_path import Frames
+from photonfarm.scene.camera_path import CameraPath, Frames
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import Sample, SceneReader, Store
 from photonfarm.store.read.find import Query, find_samples
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import require
-from photonfarm.trainer.predict import animation
-from photonfarm.trainer.predict.evaluation import choose_error
-from photonfarm.trainer.predict.trained import TrainedRun
+from photonfarm.trainer.predictors.evaluation import choose_error
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import make_environment
 
-VERB = "buffers"  # of the renderer
 NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
+FFMPEG = "imageio_ffmpeg"
+"""The package with ffmpeg, of the extra `video`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,51 +89,39 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     files = tuple(out / f"{name}.png" for name in shown)
     _make_folder(out)
     for file, pixels in zip(files, shown.values(), strict=True):
-        animation.write_png(animation.enlarge(pixels), file)
+        write_png(enlarge(pixels), file)
     (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
-    return InferResult(files, f"row {row}: {_judge(image, batch) if is_held_out else NOT_JUDGED}")
+    if not is_held_out:
+        return InferResult(files, f"row {row}: {NOT_JUDGED}")
+    error = choose_error(batch)(image, *batch.target[0].numpy())
+    return InferResult(files, f"row {row}: held out; squared error {error:.5f}, the noise taken out")
 
 
-def _explain_missing(source: SceneReader, row: int) -> PhotonfarmError:
+def _explain_missing(source: SceneReader, row: int) -> StoreError | IncompleteError:
     rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests), default=0)
     if row >= rows:
         return StoreError(f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0")
     return IncompleteError(f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers")
 
 
-def _judge(image: F32, batch: TrainingBatch) -> str:
-    half_a, half_b = batch.target[0].numpy()
-    return f"held out; squared error {choose_error(batch)(image, half_a, half_b):.5f}, the noise taken out"
-
-
 # ------------------------------------------------------------------------------------------------------ a camera path
 
 
-def render_frames(store: str | Path, run: TrainedRun, arguments: Sequence[str]) -> Frames:
-    """The frames that `photonfarm buffers` makes for the arguments, such as --orbit 24, and the scene of the run.
+def render_frames(store: str | Path, run: TrainedRun, modification: str | None, path: CameraPath | int) -> Frames:
+    """The buffers of a camera path, or of an orbit of so many frames, in the scene of the run.
 
-    Raises SpecError without the renderer, PhotonfarmError with its exit code if it failed.
+    Raises SpecError without the renderer, and as `path_buffers.render_path` does.
     """
     if not can_render():
         raise SpecError(
             "the buffers of a camera path come from the renderer, which is not installed here (pip install "
-            "'photonfarm[render]'); where it is, run "
-            f"`photonfarm {VERB} --scene {run.scene_id} {' '.join(arguments)}`, and give its file as --buffers FILE"
+            f"'photonfarm[render]'); where it is, run `photonfarm buffers --scene {run.scene_id}` with the same path, "
+            "and give its file as --buffers FILE"
         )
-    with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
-        file = Path(folder) / "buffers.npz"
-        named = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
-        verb, environment = command(VERB, *named, *arguments), make_environment(run.folder)
-        if code := subprocess.run(verb, env=environment, stdout=subprocess.DEVNULL, check=False).returncode:
-            raise _make_error(code)
-        return Frames.read(file)
+    os.environ.update(make_environment(run.folder))
+    from photonfarm.renderer.jobs.path_buffers import render_path
 
-
-def _make_error(code: int) -> PhotonfarmError:
-    """An error with the exit code of the verb, which has printed the reason."""
-    error = PhotonfarmError(f"`photonfarm {VERB}` ended with exit code {code}; what it said stands above")
-    error.exit_code = code
-    return error
+    return render_path(store, run.scene_id, modification, path)
 
 
 def show_frames(
@@ -152,14 +143,16 @@ def show_frames(
         began = time.perf_counter()
         image = predict(next(frame_batches))[0]
         seconds += time.perf_counter() - began
-        animation.write_png(animation.enlarge(image), file)
+        write_png(enlarge(image), file)
     sentence = f"{len(frames)} frames, {1e3 * seconds / len(frames):.1f} ms each for the network and what it reads"
-    animation.write_gif(map(animation.read_png, files), out / "path.gif", fps)
-    if not animation.can_write_mp4():
+    films = [out / "path.gif"]
+    write_gif(files, films[0], fps)
+    if find_spec(FFMPEG) is None:
         sentence += "; no MP4: pip install photonfarm[video]"
-        return InferResult((*files, out / "path.gif"), sentence)
-    animation.write_mp4(map(animation.read_png, files), out / "path.mp4", fps)
-    return InferResult((*files, out / "path.gif", out / "path.mp4"), sentence)
+    else:
+        films.append(out / "path.mp4")
+        write_mp4(files, films[1], fps)
+    return InferResult((*files, *films), sentence)
 
 
 def check_path(run: TrainedRun) -> None:
@@ -215,3 +208,30 @@ def _open_source(store: str | Path, run: TrainedRun) -> SceneReader:
 def _make_folder(folder: Path) -> None:
     with store_errors("make the folder of the pictures", folder):
         folder.mkdir(parents=True, exist_ok=True)
+
+
+def write_gif(pictures: Sequence[Path], file: Path, fps: float) -> None:
+    """Write an animation that repeats for ever, with 256 colours a picture; GIF rounds times to hundredths of a second.
+
+    Pillow holds the pictures until it writes them, at a byte a pixel.
+    """
+    images, duration_ms = map(Image.open, pictures), max(round(100 / fps), 2) * 10
+    with store_errors("write the animation", file):
+        next(images).save(
+            file, "GIF", save_all=True, append_images=images, duration=duration_ms, loop=0, optimize=False
+        )
+
+
+def write_mp4(pictures: Sequence[Path], file: Path, fps: float) -> None:
+    """Write a film, H.264 with 4:2:0 colour, in the folder of the pictures, which are frame-0000.png and so on.
+
+    An odd width or height gets a black column or row. Raises StoreError if ffmpeg fails, with its last line.
+    """
+    given = ["-framerate", f"{fps:g}", "-i", "frame-%04d.png", "-frames:v", str(len(pictures))]
+    coded = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p"]
+    ffmpeg = [import_module(FFMPEG).get_ffmpeg_exe(), "-loglevel", "error", "-y"]
+    command = [*ffmpeg, *given, *coded, "-movflags", "+faststart", file.name]
+    done = subprocess.run(command, cwd=file.parent, capture_output=True, text=True, errors="replace", check=False)
+    if done.returncode:
+        *_, reason = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
+        raise StoreError(f"{file}: ffmpeg cannot write the film: {reason}")

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.trainer.networks.inputs import NoisyColour
-from photonfarm.trainer.predict.denoisers import LEAST_ALBEDO, REACH, SPREAD, fill_in
+from photonfarm.trainer.predictors.denoisers import LEAST_ALBEDO, REACH, SPREAD, fill_in
 
 
 def dropped(colour: Tensor, of: int, seed: int = 0) -> NoisyColour:

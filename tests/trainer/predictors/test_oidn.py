@@ -10,8 +10,8 @@ import pytest
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.predict.denoisers import Oidn, fill_in
-from photonfarm.trainer.predict.evaluation import measure, read_batches
+from photonfarm.trainer.predictors.denoisers import Oidn, fill_in
+from photonfarm.trainer.predictors.evaluation import measure, read_batches
 
 pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
 
@@ -75,7 +75,7 @@ def test_without_its_package_it_says_what_to_install(monkeypatch) -> None:
 def test_it_needs_no_mitsuba_and_no_gpu() -> None:
     lines = (
         "import sys, torch",
-        "from photonfarm.trainer.predict.denoisers import Oidn",
+        "from photonfarm.trainer.predictors.denoisers import Oidn",
         "Oidn()",
         "assert not {'mitsuba', 'drjit'} & set(sys.modules)",
         "assert not torch.cuda.is_initialized()",

@@ -5,7 +5,7 @@ import torch
 
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks.inputs import Inputs
-from photonfarm.trainer.predict.evaluation import BLOCK, average_colours, make_constant_predictor, measure
+from photonfarm.trainer.predictors.evaluation import BLOCK, average_colours, make_constant_predictor, measure
 
 
 def batch(image: torch.Tensor) -> TrainingBatch:

@@ -1,1 +1,0 @@
-"""Predictors: trained runs and ready denoisers, their images, and their held-out error."""

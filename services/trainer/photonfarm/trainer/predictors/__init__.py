@@ -1,0 +1,1 @@
+"""Predictors: trained runs and ready denoisers, and their held-out error."""

@@ -70,7 +70,7 @@ def test_status_with_a_redis_loads_only_what_it_needs(
     environment = {**os.environ, "PHOTONFARM_STORE": str(store), "PHOTONFARM_REDIS_URL": common_redis.url}
     command = [sys.executable, "-c", CODE, "status"]
     done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
-    assert "0 queued" in done.stdout
+    assert "0 jobs queued" in done.stdout
     assert (HEAVY - {"zarr"}).isdisjoint(json.loads(done.stderr.splitlines()[-1]))
 
 

@@ -21,8 +21,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from photonfarm import queue
 from photonfarm.cli.main import main
 from photonfarm.core.errors import StoreError
+from photonfarm.farm.progress import FarmProgress
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.farm.watch import FarmView, FarmWatch
+from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneStore, Store
 from photonfarm.web.images import Cached
@@ -140,7 +141,7 @@ def test_names_have_units_and_suffixes_as_prometheus_wants_them_and_each_has_a_h
 def test_several_scrapers_within_seconds_cost_one_look(farm: FarmWatch) -> None:
     looks = []
 
-    def look() -> FarmView:
+    def look() -> FarmProgress:
         looks.append(farm.look())
         return looks[-1]
 

@@ -32,9 +32,8 @@ from photonfarm.plan.sample_costs import relative_variance
 from photonfarm.scene.modification import rebuild
 from photonfarm.store import SceneStore, Store
 from photonfarm.web import images
-from photonfarm.web.farm_pages import FarmPages
+from photonfarm.web.farm_pages import FarmPages, SceneSamples
 from photonfarm.web.images import POINT, Cached
-from photonfarm.web.samples import SceneSamples
 from photonfarm.web.server import PageServer, make_page_routes
 
 EVIL = "<img src=x onerror=alert(1)>"
@@ -139,8 +138,10 @@ def picture(server: PageServer, path: str) -> np.ndarray:
 def test_the_state_is_that_of_store_and_run(server: PageServer, scene: SceneStore, run: Path) -> None:
     found = document(server, "/api/state")
     (shown,) = found["scenes"]
-    assert (shown["scene_id"], shown["samples"], shown["jobs"], shown["missing"]) == (scene.scene_id, [6, 8], [3, 4], 2)
-    assert (found["queue"], found["failed_before"]) == (None, [])
+    assert (shown["scene_id"], shown["samples"], shown["missing"]) == (scene.scene_id, [6, 8], 2)
+    assert (shown["jobs_committed"], shown["jobs_planned"]) == (3, 4)
+    assert found["queue"].startswith("no Redis at")
+    assert found["failed_before"] == []
     (training,) = found["trainings"]
     assert (training["run"], training["step"], training["steps"]) == (run.name, 100, 200)
 

@@ -174,31 +174,17 @@ def status(
 
     Where `photonfarm up` is at work on the store here, its queue is shown, unless --redis names another.
     """
-    from photonfarm.cli import show_status
-    from photonfarm.farm.running_farm import running_farm
-    from photonfarm.farm.status import check_read, queue_of, since_commit_s
-    from photonfarm.farm.training import RunFolder
-    from photonfarm.store import Store, store_status
+    from photonfarm.cli import show_farm
+    from photonfarm.farm.watch import FarmWatch
+    from photonfarm.store import Store
 
-    opened, named = Store(store), names_redis()
+    farm_watch = FarmWatch(Store(store), redis_url, runs, named_redis=names_redis())
     if watch:
-        from photonfarm.cli.show_watch import keep_watching
-        from photonfarm.farm.watch import FarmWatch
-
-        keep_watching(FarmWatch(opened, redis_url, runs, named_redis=named))
+        show_farm.keep_watching(farm_watch, store)
         return
-    scenes, running = store_status(opened), running_farm(opened)
-    url = redis_url if named or running is None else running.redis_url
-    folders = runs or ((Path(running.run),) if running and running.run else ())
-    trainings = [RunFolder(folder).look() for folder in folders]
-    if as_json:
-        show_status.document(scenes, queue_of(opened, url), store, running, trainings)
-    else:
-        show_status.scenes(scenes)  # before Redis is asked, which may not answer
-        since_s = since_commit_s(opened)
-        show_status.queue(queue_of(opened, url), scenes, store, running, named_redis=named, since_commit_s=since_s)
-        show_status.trainings(trainings)
-    check_read(scenes)
+    farm = farm_watch.look()
+    (show_farm.print_document if as_json else show_farm.print_farm)(farm, store)
+    farm.check_read()
 
 
 @click.command()
@@ -279,7 +265,7 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
 
     Ctrl-C stops it within seconds; the same command goes on from there.
     """
-    from photonfarm.cli.show_watch import FarmTalk
+    from photonfarm.cli.show_farm import follow_up
     from photonfarm.farm.devices import AUTO, CPU, DEVICE_VARIABLE, cards_here, worker_devices
     from photonfarm.farm.up import WORKERS, run_farm, trainer_arguments
 
@@ -291,7 +277,8 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
             _check_arguments(arguments, "torch", "train", "--train-steps 0 renders only")
         devices = worker_devices(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())
         options["workers"] = options["workers"] or (WORKERS if devices == (CPU,) else len(devices))
-        run_farm(spec, store, request, FarmTalk(), devices=devices, **options)
+        say = partial(click.echo, err=True)
+        run_farm(spec, store, request, say, follow_up(store), devices=devices, **options)
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)

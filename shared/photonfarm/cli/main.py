@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points, requires
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import click
 from click.core import ParameterSource
@@ -36,13 +36,35 @@ def _find_verbs() -> dict[str, EntryPoint]:
     return {entry.name: entry for entry in entry_points(group=GROUP)}
 
 
-class Suggesting(click.Group):
-    """A group that answers an unknown verb with those that resemble it, also with `store check` to `check`."""
+class Verbs(click.Group):
+    """A group with subcommands that are entry points, each imported only when it is used."""
+
+    def __init__(self, *arguments: Any, prefix: str = "", **settings: Any) -> None:
+        """Take what the names of the entry points begin with, beside what click takes."""
+        super().__init__(*arguments, **settings)
+        self._prefix = prefix
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """The group's own subcommands and the installed ones."""
+        below = [name.removeprefix(self._prefix) for name in _find_verbs() if name.startswith(self._prefix)]
+        return sorted({*super().list_commands(ctx), *(name.partition(".")[0] for name in below)})
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        """The subcommand, imported only now; None for one that there is not."""
+        if "." in cmd_name:
+            return None
+        name = self._prefix + cmd_name
+        entry = _find_verbs().get(name)
+        command = entry.load() if entry else super().get_command(ctx, cmd_name)
+        if not any(known.startswith(f"{name}.") for known in _find_verbs()):
+            return command
+        about = command.help if command else _BARE.get(name)
+        return Verbs(cmd_name, help=about, commands=getattr(command, "commands", None), prefix=f"{name}.")
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        """The verb with its name and the arguments behind it; raises UsageError for an unknown one."""
+        """The verb with its name and the arguments behind it; raises UsageError with verbs that resemble an unknown."""
         name = args[0]
         if self.get_command(ctx, name) is None and not ctx.resilient_parsing:
             near = difflib.get_close_matches(name, self.list_commands(ctx))
@@ -50,42 +72,6 @@ class Suggesting(click.Group):
             hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
             raise click.UsageError(f"No such command {name!r}.{hint}", ctx)
         return super().resolve_command(ctx, args)
-
-
-class Umbrella(Suggesting):
-    """A group whose verbs are the entry points."""
-
-    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002
-        """The installed verbs."""
-        return sorted({name.partition(".")[0] for name in _find_verbs()})
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The verb, imported only now."""
-        if cmd_name not in self.list_commands(ctx):
-            return None
-        entry = _find_verbs().get(cmd_name)
-        command = None if entry is None else entry.load()
-        prefix = f"{cmd_name}."
-        below = {name.removeprefix(prefix): sub for name, sub in _find_verbs().items() if name.startswith(prefix)}
-        return Extended(cmd_name, command, below) if below else command
-
-
-class Extended(Suggesting):
-    """A group with subcommands that have entry points of their own."""
-
-    def __init__(self, name: str, own: click.Group | None, below: dict[str, EntryPoint]) -> None:
-        """Take the group of the verb's own entry point, None where it has none."""
-        super().__init__(name, help=own.help if own else _BARE[name], commands=own.commands if own else None)
-        self._below = below
-
-    def list_commands(self, ctx: click.Context) -> list[str]:
-        """The verb's own subcommands and those of others."""
-        return sorted({*super().list_commands(ctx), *self._below})
-
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        """The subcommand; one with an entry point of its own is imported only now."""
-        entry = self._below.get(cmd_name)
-        return super().get_command(ctx, cmd_name) if entry is None else entry.load()
 
 
 def options_by_command(umbrella: click.Group) -> dict[str, dict[str, str]]:
@@ -117,7 +103,7 @@ STOPPED = 130
 CONFIG_VARIABLE = "PHOTONFARM_CONFIG"
 
 
-@click.group(cls=Umbrella, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.group(cls=Verbs, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(package_name="photonfarm", prog_name="photonfarm")
 @click.option(
     "--config",

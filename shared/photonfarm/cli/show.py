@@ -26,14 +26,19 @@ def print_json(document: Any) -> None:
     click.echo(json.dumps(document, indent=2))
 
 
-def print_table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
-    """Print rows of text as a table, with a head or without one."""
+def make_table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> Table:
+    """Rows of text as a table, with a head or without one."""
     table = Table(*head, box=None, show_header=bool(head), pad_edge=False)
     for row in rows:
         table.add_row(*map(markup.escape, row))
+    return table
+
+
+def print_table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> None:
+    """Print `make_table`."""
     console = Console(soft_wrap=True)
     console.width = max(console.width, 132)  # ids are for copying: never cut
-    console.print(table, highlight=False)
+    console.print(make_table(rows, head), highlight=False)
 
 
 # ----------------------------------------------------------------------------------------------------------- scene show

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,13 +16,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from photonfarm.cli.show import print_json
 from photonfarm.core.errors import StoreError
-from photonfarm.core.formatting import format_count
+from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import SILENCE_S
-from photonfarm.farm.join import JoinedScene, OnProgress
+from photonfarm.farm.join import JoinedScene
 from photonfarm.store import Store
 from photonfarm.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
-from photonfarm.store.model.findings import Finding, FindingGroup, Remedy
-from photonfarm.store.model.withdrawal import Forgotten, Withdrawal
+from photonfarm.store.model.findings import FindingGroup, Remedy
+from photonfarm.store.model.withdrawal import Withdrawal
 from photonfarm.store.read.find import FoundSample, Matches
 from photonfarm.store.read.merge import WrittenView
 
@@ -41,7 +41,7 @@ def progress(done_in_words: str = "read") -> Iterator[CheckProgress]:
         def show(scene: str, done: int, total: int, size_bytes: int) -> None:
             if scene not in tasks:
                 tasks[scene] = bars.add_task(scene, total=total, read="")
-            bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs{_size(size_bytes)}")
+            bars.update(tasks[scene], completed=done, read=f"{done}/{total} jobs{_describe_size(size_bytes)}")
 
         yield show
 
@@ -55,38 +55,39 @@ def _lines(done_in_words: str) -> CheckProgress:
         if done == total or time.monotonic() - said > SILENCE_S * 0.8:
             said = time.monotonic()
             of = "" if done == total else f" of {total}"
-            click.echo(f"{scene}: {done}{of} jobs {done_in_words}{_size(size_bytes)}", err=True)
+            click.echo(f"{scene}: {done}{of} jobs {done_in_words}{_describe_size(size_bytes)}", err=True)
 
     return line
 
 
-def _size(size_bytes: int) -> str:
-    return f", {size_bytes / 1e6:,.1f} MB" if size_bytes else ""
+def _describe_size(size_bytes: int) -> str:
+    return f", {format_bytes(size_bytes)}" if size_bytes else ""
 
 
 # ---------------------------------------------------------------------------------------------------------------- check
 
 
-def check(report: StoreReport, as_json: bool) -> None:
+def print_check(report: StoreReport, as_json: bool) -> None:
     """Print what a check read and found, by scene and cause, and what to do about it."""
     if as_json:
-        print_json(_document(report))
+        scenes = [{**asdict(scene), "groups": [_group(group) for group in scene.groups]} for scene in report.scenes]
+        about = {"exit_code": report.exit_code, "quarantine": report.quarantine, "parts": report.parts}
+        print_json({**about, "scenes": scenes})
         return
     for scene in report.scenes:
-        _scene(scene)
+        _print_scene(scene)
     if report.parts:
         click.echo(f"tmp: {report.parts} unfinished files; workers sweep those of the dead")
     if report.quarantine:
         click.echo(
             f"set aside to {report.quarantine}, with a record of why; workers render the jobs that are missing now"
         )
-    wrong = sum(_wrong(scene) for scene in report.scenes)
+    groups = [group for scene in report.scenes for group in scene.groups]
+    wrong = sum(group.count for group in groups if group.cause.remedy is not Remedy.LOOK)
     if not wrong:
         click.echo("nothing is wrong")
     elif not report.repaired:
-        click.echo(
-            f"{'1 finding' if wrong == 1 else f'{wrong} findings'}; --repair sets aside what can be written again"
-        )
+        click.echo(f"{format_count(wrong, 'finding')}; --repair sets aside what can be written again")
     elif report.exit_code == StoreError.exit_code:
         click.echo(
             "something is still wrong, and --repair does not help: see above for what does. A plan comes back from a "
@@ -94,12 +95,8 @@ def check(report: StoreReport, as_json: bool) -> None:
         )
 
 
-def _wrong(scene: SceneReport) -> int:
-    return sum(group.count for group in scene.groups if group.cause.remedy is not Remedy.LOOK)
-
-
-def _scene(scene: SceneReport) -> None:
-    read = f"{scene.jobs} jobs, {scene.samples} samples, {scene.size_bytes / 1e6:,.1f} MB"
+def _print_scene(scene: SceneReport) -> None:
+    read = f"{scene.jobs} jobs, {scene.samples} samples, {format_bytes(scene.size_bytes)}"
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
         click.echo(f"  A against B: {halves_in_words(scene.halves)}")
@@ -107,37 +104,22 @@ def _scene(scene: SceneReport) -> None:
         click.echo(f"  first hits seen from behind: {scene.back_facing_share:.2%} of the pixels that meet something")
     for group in scene.groups:
         click.echo(f"  {group.count} × {group.cause.label}: {group.cause.sentence} ({group.cause.remedy.value})")
-        for finding in group.first:
-            click.echo(f"      {_named(finding)}")
+        for f in group.first:
+            numbers = (f"{what} {n}" for what, n in (("job", f.job), ("row", f.row)) if n is not None)
+            click.echo(f"      {', '.join(filter(None, (*numbers, f.file)))}: {f.detail}")
         if group.count > len(group.first):
             click.echo(f"      and {group.count - len(group.first)} more")
     if scene.set_aside:
         click.echo(f"  set aside: {', '.join(scene.set_aside)}")
 
 
-def _named(finding: Finding) -> str:
-    job, row = (f"{what} {n}" if n is not None else "" for what, n in (("job", finding.job), ("row", finding.row)))
-    return ", ".join(part for part in (job, row, finding.file or "") if part) + f": {finding.detail}"
-
-
-def _document(report: StoreReport) -> dict[str, Any]:
-    return {
-        "exit_code": report.exit_code,
-        "quarantine": report.quarantine,
-        "parts": report.parts,
-        "scenes": [{**asdict(scene), "groups": [_group(group) for group in scene.groups]} for scene in report.scenes],
-    }
-
-
 def _group(group: FindingGroup) -> dict[str, Any]:
-    first = [{"job": f.job, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first]
-    cause = group.cause
     return {
-        "cause": cause.label,
-        "means": cause.sentence,
-        "remedy": cause.remedy.value,
+        "cause": group.cause.label,
+        "means": group.cause.sentence,
+        "remedy": group.cause.remedy.value,
         "count": group.count,
-        "first": first,
+        "first": [{"job": f.job, "row": f.row, "file": f.file, "detail": f.detail} for f in group.first],
     }
 
 
@@ -147,11 +129,15 @@ def _group(group: FindingGroup) -> dict[str, Any]:
 def print_matches(matches: Matches, store: str | Path, as_json: bool) -> None:
     """Print samples: what they show, where their values are stored, and commands to read and render one."""
     if as_json:
-        samples = [{**_fields(s), "complete": s.complete, "commands": commands(s, store)} for s in matches.samples]
+        samples = [
+            {name.removesuffix("_"): value for name, value in asdict(sample).items()}  # `pass` is a word of Python's
+            | {"complete": sample.complete, "commands": list_commands(sample, store)}
+            for sample in matches.samples
+        ]
         print_json({"count": matches.count, "nearest": matches.nearest, "samples": samples})
         return
     for sample in matches.samples:
-        _sample(sample, store)
+        _print_sample(sample, store)
     if matches.count > len(matches.samples):
         click.echo(f"{matches.count - len(matches.samples)} more; --limit shows more of them", err=True)
     if not matches.count:
@@ -159,24 +145,7 @@ def print_matches(matches: Matches, store: str | Path, as_json: bool) -> None:
         click.echo(f"no sample fits{near}", err=True)
 
 
-def _fields(sample: FoundSample) -> dict[str, Any]:
-    """The fields of a sample by their names; `pass` is a word of Python's."""
-    return {name.removesuffix("_"): value for name, value in asdict(sample).items()}
-
-
-def print_merged(view: WrittenView) -> None:
-    """Print a line about a merged view."""
-    passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
-    error = f"standard error of a value {view.standard_error:.2g} (RMS)"
-    click.echo(f"{view.file}: {passes}, mean {view.mean:.4g}, {error}")
-
-
-def print_merged_document(views: Iterable[WrittenView]) -> None:
-    """Print merged views as JSON."""
-    print_json([asdict(view) for view in views])
-
-
-def _sample(sample: FoundSample, store: str | Path) -> None:
+def _print_sample(sample: FoundSample, store: str | Path) -> None:
     state = "complete" if sample.complete else "not complete"
     click.echo(f"{sample.scene_name} {sample.scene_id}, row {sample.row}, pass {sample.pass_}: {state}")
     click.echo(f"  key           {sample.key}")
@@ -189,11 +158,11 @@ def _sample(sample: FoundSample, store: str | Path) -> None:
     for place in sample.places:
         held = "" if place.there else "  (not there)"
         click.echo(f"  {place.array:<16} {place.file}  inner chunk {place.chunk}, index {place.index}{held}")
-    for what, command in commands(sample, store).items():
+    for what, command in list_commands(sample, store).items():
         click.echo(f"  {what:<13} {command}")
 
 
-def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
+def list_commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
     """The command lines that read a sample, and those that render what is missing of it."""
     listed = {}
     if sample.complete:
@@ -208,35 +177,24 @@ def commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
     return listed
 
 
-# ----------------------------------------------------------------------------------------------------------------- join
+# ---------------------------------------------------------------------------------------------- merge, join, withdraw
 
 
-@contextlib.contextmanager
-def copying() -> Iterator[OnProgress]:
-    """A progress callback for a join."""
-    with progress("copied") as show:
-        yield lambda scene, done, total: show(scene, done, total, 0)
+def print_merged(view: WrittenView) -> None:
+    """Print a line about a merged view."""
+    passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
+    error = f"standard error of a value {view.standard_error:.2g} (RMS)"
+    click.echo(f"{view.file}: {passes}, mean {view.mean:.4g}, {error}")
 
 
-def print_joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
+def print_joined(scenes: Sequence[JoinedScene]) -> None:
     """Print what a join has copied, scene by scene."""
-    if as_json:
-        print_json([asdict(scene) for scene in scenes])
-        return
     for scene in scenes:
         known = scene.there - scene.planned
         jobs = format_count(scene.jobs, "job")
         said = f"{scene.there} samples there, {scene.planned} planned here now, {known} before; {jobs} copied"
         left = f"; {scene.left} are left to workers, as their jobs here are not whole there" if scene.left else ""
         click.echo(f"{scene.name} {scene.scene_id}: {said}{left}")
-
-
-# ------------------------------------------------------------------------------------------- withdraw, forget, waiting
-
-
-def print_waiting(sentence: str) -> None:
-    """Print whom a verb waits for."""
-    click.echo(sentence, err=True)
 
 
 def describe_contents(store: Store, scene_id: str) -> str:
@@ -250,23 +208,10 @@ def describe_contents(store: Store, scene_id: str) -> str:
     return f"scene {scene_id} ({scene.spec.name}), of which {rendered},"
 
 
-def print_forgotten(result: Forgotten, as_json: bool) -> None:
-    """Print that a scene is forgotten."""
-    if as_json:
-        print_json(asdict(result))
-        return
-    jobs = "1 rendered job" if result.jobs == 1 else f"{result.jobs} rendered jobs"
-    click.echo(f"scene {result.scene_id} is forgotten, with {jobs}")
-
-
-def print_withdrawn(result: Withdrawal, as_json: bool) -> None:
+def print_withdrawn(result: Withdrawal) -> None:
     """Print what a withdrawal has forgotten, and what stays."""
-    if as_json:
-        print_json(asdict(result))
-        return
     kept = f", {result.kept} stay planned, as rendered ones show their views or configurations" if result.kept else ""
-    jobs = "1 job" if result.jobs == 1 else f"{result.jobs} jobs"
-    forgotten = f"{result.samples} samples in {jobs} are forgotten" if result.jobs else "nothing is left to withdraw"
+    forgotten = f"{result.samples} samples in {format_count(result.jobs, 'job')} are forgotten"
+    said = f"{forgotten if result.jobs else 'nothing is left to withdraw'}; {result.rendered} are rendered and stay"
     left = "" if result.jobs else f"; {result.left}"
-    said = f"{forgotten}; {result.rendered} are rendered and stay{kept}{left}"
-    click.echo(f"plan {result.plan} of scene {result.scene_id} ({result.name}): {said}")
+    click.echo(f"plan {result.plan} of scene {result.scene_id} ({result.name}): {said}{kept}{left}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,12 +18,7 @@ from photonfarm.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from photonfarm.farm.slurm import Surroundings
-    from photonfarm.farm.submission import Submission
     from photonfarm.plan.request import Request
-    from photonfarm.scene.spec_loading import NamedSpec
 
 
 def _limit(ctx: click.Context, param: click.Parameter, text: str | None) -> str | None:  # noqa: ARG001
@@ -98,6 +92,8 @@ def slurm(
     queue_url: str | None,
     request: Request,
     shard_rows: int | None,
+    no_queue: bool,
+    retry: bool,
     dry_run: bool,
     as_json: bool,
     **options: Any,
@@ -110,39 +106,19 @@ def slurm(
 
     Exit code 9: sbatch is not here, or refuses.
     """
-    from photonfarm.farm.slurm import check_slurm, launch
+    from photonfarm.farm.slurm import Asked, check_slurm, launch, make_scripts
     from photonfarm.scene.spec_loading import NamedSpec
 
-    if options["train"] and len(specs) > 1:
+    asked = Asked(**options)
+    if asked.train and len(specs) > 1:
         raise click.UsageError("--train takes one SPEC: a trainer trains on one scene")
-    queue_url = None if options["no_queue"] else queue_url
+    queue_url = None if no_queue else queue_url
     named = [NamedSpec.load(spec) for spec in specs]
-    scripts = _scripts(named, store, queue_url, options)
+    scripts = make_scripts(named, store, queue_url, asked)
     if dry_run:
         click.echo("\n".join(scripts.values()), nl=False)
         return
     check_slurm()
-    planned = _plan(named, store, queue_url, request, shard_rows, options)
-    started = launch(scripts, options["logs"].absolute())
-    if as_json:
-        from photonfarm.cli import show
-
-        show.print_json({"plans": list(map(asdict, planned)), **asdict(started)})
-        return
-    click.echo(f"job {started.workers}: {options['workers']} workers; logs in {started.logs}")
-    if started.trainer is not None:
-        click.echo(f"job {started.trainer}: the trainer, which begins once the first worker has")
-
-
-def _plan(
-    named: Sequence[NamedSpec],
-    store: str | Path,
-    queue_url: str | None,
-    request: Request,
-    shard_rows: int | None,
-    options: dict[str, Any],
-) -> list[Submission]:
-    """Plan a request for each spec, and queue all that is missing if there is a queue."""
     from photonfarm.farm.submission import hold_out_warning, queue_missing, submit
     from photonfarm.scene.plausibility import warnings
     from photonfarm.store import Store
@@ -151,62 +127,19 @@ def _plan(
     for spec in named:
         for warning in filter(None, (*warnings(spec), hold_out_warning(spec.spec, store, request))):
             click.echo(f"warning: {warning}", err=True)
-        settings = {"retry": options["retry"], "shard_rows": shard_rows, "workers": options["workers"]}
-        planned.append(submit(spec, store, None, request, **settings))
-        found = planned[-1]
+        found = submit(spec, store, None, request, retry=retry, shard_rows=shard_rows, workers=asked.workers)
         click.echo(f"scene {found.scene_id}: {found.planned} samples planned, {found.planned_before} before", err=True)
+        planned.append(found)
     if queue_url is not None:
         from photonfarm.queue import add_password
 
-        url = add_password(password_file(), queue_url)
-        queue_missing(Store(store), url, retry=options["retry"])
-    return planned
+        queue_missing(Store(store), add_password(password_file(), queue_url), retry=retry)
+    started = launch(scripts, asked.logs.absolute())
+    if as_json:
+        from photonfarm.cli import show
 
-
-def _scripts(
-    named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, options: dict[str, Any]
-) -> dict[str, str]:
-    """The scripts by their names."""
-    from photonfarm.farm.slurm import TRAINER, WORKERS, Resources, trainer_script, worker_script
-
-    at = _surroundings(named, store, queue_url, options["logs"])
-    words = [_word(spec.name) for spec in named]
-    asked = {"partition": options["partition"], "time": options["time"]}
-    workers = Resources(**asked, gpu=options["gpus"], further=options["further"])
-    only = named[0].spec.scene_id if len(named) == 1 else ""
-    scripts = {WORKERS: worker_script(at, workers, options["workers"], words, only)}
-    if options["train"]:
-        further = options["further"] + options["train_further"]
-        trainer = Resources(**asked, gpu=options["train_gpus"], further=further)
-        arguments = ["train", words[0], "--run", str(options["run"].absolute())]
-        steps = options["train_steps"]
-        scripts[TRAINER] = trainer_script(at, trainer, [*arguments, *(["--steps", str(steps)] if steps else [])])
-    return scripts
-
-
-def _surroundings(named: Sequence[NamedSpec], store: str | Path, queue_url: str | None, logs: Path) -> Surroundings:
-    from photonfarm.farm.slurm import Surroundings
-
-    place = str(store.absolute()) if isinstance(store, Path) else store
-    scenes = dict.fromkeys(spec.scenes for spec in named if spec.scenes)
-    config, file = os.environ.get("PHOTONFARM_CONFIG"), password_file()
-    variables = {"PHOTONFARM_CONFIG": config, "PHOTONFARM_REDIS_PASSWORD_FILE": str(file) if file else None}
-    absolute = tuple((name, str(Path(path).absolute())) for name, path in variables.items() if path)
-    return Surroundings(
-        Path.cwd(), logs.absolute(), place, queue_url is not None, _url_of_script(queue_url), tuple(scenes), absolute
-    )
-
-
-def _url_of_script(queue_url: str | None) -> str | None:
-    """The URL of Redis for a script; None if it holds a password, which the environment or configuration has."""
-    if queue_url is None:
-        return None
-    from photonfarm.queue import has_password
-
-    return None if has_password(queue_url) else queue_url
-
-
-def _word(name: str) -> str:
-    """A spec as a script names it: absolute, if it is a file."""
-    path = Path(name)
-    return str(path.absolute()) if path.suffix == ".toml" or path.is_file() else name
+        show.print_json({"plans": list(map(asdict, planned)), **asdict(started)})
+        return
+    click.echo(f"job {started.workers}: {asked.workers} workers; logs in {started.logs}")
+    if started.trainer is not None:
+        click.echo(f"job {started.trainer}: the trainer, which begins once the first worker has")

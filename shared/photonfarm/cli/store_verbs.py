@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from dataclasses import asdict
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import click
+from click.decorators import FC
 
 from photonfarm.cli.options import json_option, store_option
 from photonfarm.core.errors import IncompleteError, StoreError
 
 
-def scene_option(command: click.decorators.FC) -> click.decorators.FC:
+def _scene_option(required: bool = False) -> Callable[[FC], FC]:
     """`--scene ID`, one scene of the store."""
-    return click.option("--scene", metavar="ID", help="This scene alone: its id, how it begins, or its name.")(command)
+    text = "One scene alone: its id, how it begins, or its name."
+    return click.option("--scene", metavar="ID", required=required, help=text)
+
+
+tell = partial(click.echo, err=True)
+"""Says whom a verb waits for."""
 
 
 @click.command()
 @store_option
-@scene_option
+@_scene_option()
 @click.option("--repair", is_flag=True, help="Set what is damaged aside, to be written again.")
 @click.option(
     "--joined-from",
@@ -59,15 +68,15 @@ def check(store: str | Path, scene: str | None, repair: bool, joined_from: str |
             repair=repair,
             joined_from=Store(joined_from) if joined_from else None,
             on_progress=on_progress,
-            on_wait=show_store.print_waiting,
+            on_wait=tell,
         )
-    show_store.check(report, as_json)
+    show_store.print_check(report, as_json)
     sys.exit(report.exit_code)
 
 
 @click.command()
 @store_option
-@scene_option
+@_scene_option()
 @click.option("--modification", metavar="VECTOR|KEY", help="4 numbers per movable group (x, y, z, present), or a key.")
 @click.option("--view", metavar="VECTOR|KEY", help="6 numbers (camera position, look-at point), or a key.")
 @click.option("--sample", metavar="KEY", help="The sample of a key: 32 hexadecimal digits.")
@@ -111,7 +120,7 @@ def find(
 
 @click.command()
 @store_option
-@scene_option
+@_scene_option()
 @click.option("--modification", metavar="VECTOR|KEY", help="Views of this configuration, as `store find` takes it.")
 @click.option("--view", metavar="VECTOR|KEY", help="This view, as `store find` takes it.")
 @click.option("--row", type=click.IntRange(0), help="The view of the sample in a row.")
@@ -143,6 +152,7 @@ def merge(
     Exit codes: 0 some view was merged, 7 none yet, as samples or passes are missing, 4 no sample that is planned fits.
     """
     from photonfarm.cli import show_store
+    from photonfarm.cli.show import print_json
     from photonfarm.store import Store
     from photonfarm.store.read.find import Query, find_samples, scene_named
     from photonfarm.store.read.merge import merge_views, write_views
@@ -157,7 +167,7 @@ def merge(
         if not as_json:
             show_store.print_merged(each)
     if as_json:
-        show_store.print_merged_document(written)
+        print_json([asdict(each) for each in written])
     if not written:
         if not find_samples(opened, ids, query, limit=1).count:
             raise StoreError("no sample that is planned fits; `photonfarm store find` shows what there is")
@@ -168,7 +178,7 @@ def merge(
 @click.command()
 @click.argument("other")
 @store_option
-@click.option("--scene", metavar="ID", help="This scene of OTHER alone: its id, how it begins, or its name.")
+@_scene_option()
 @json_option
 def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> None:
     """Copy the complete samples of the store OTHER, a folder or bucket, into this one, which may be new.
@@ -182,16 +192,20 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
     read or written, and what is copied stays.
     """
     from photonfarm.cli import show_store
-    from photonfarm.farm.join import join as joined
+    from photonfarm.cli.show import print_json
+    from photonfarm.farm.join import join as join_stores
 
-    with show_store.copying() as on_progress:
-        result = joined(store, other, scene, on_progress=on_progress, on_wait=show_store.print_waiting)
-    show_store.print_joined(result, as_json)
+    with show_store.progress("copied") as show:
+        result = join_stores(store, other, scene, on_progress=lambda name, *jobs: show(name, *jobs, 0), on_wait=tell)
+    if as_json:
+        print_json([asdict(each) for each in result])
+    else:
+        show_store.print_joined(result)
 
 
 @click.command()
 @store_option
-@click.option("--scene", metavar="ID", required=True, help="The scene: its id, how it begins, or its name.")
+@_scene_option(required=True)
 @click.option(
     "--plan", type=click.IntRange(0), help="The plan's number.  [default: the last one with samples to forget]"
 )
@@ -203,18 +217,22 @@ def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> 
     again later. Refused where a later plan has passes of the plan's views: withdraw that one first.
     """
     from photonfarm.cli import show_store
+    from photonfarm.cli.show import print_json
     from photonfarm.store import Store
-    from photonfarm.store.model.withdrawal import withdraw as withdrawn
+    from photonfarm.store.model.withdrawal import withdraw as withdraw_plan
     from photonfarm.store.read.find import scene_named
 
     opened = Store(store)
-    stored = opened.scene(scene_named(opened, scene))
-    show_store.print_withdrawn(withdrawn(stored, plan, on_wait=show_store.print_waiting), as_json)
+    result = withdraw_plan(opened.scene(scene_named(opened, scene)), plan, on_wait=tell)
+    if as_json:
+        print_json(asdict(result))
+    else:
+        show_store.print_withdrawn(result)
 
 
 @click.command()
 @store_option
-@click.option("--scene", metavar="ID", required=True, help="The scene: its id, how it begins, or its name.")
+@_scene_option(required=True)
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @json_option
 def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
@@ -224,8 +242,10 @@ def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
     queue as workers meet them. A trainer of the scene ends.
     """
     from photonfarm.cli import show_store
+    from photonfarm.cli.show import print_json
+    from photonfarm.core.formatting import format_count
     from photonfarm.store import Store
-    from photonfarm.store.model.withdrawal import forget as forgotten
+    from photonfarm.store.model.withdrawal import forget as forget_scene
     from photonfarm.store.read.find import scene_named
 
     opened = Store(store)
@@ -236,4 +256,8 @@ def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:
             raise click.UsageError(f"{question} Without a terminal to ask, --yes is required.")
         if not click.confirm(question, err=True):
             raise click.ClickException("nothing is deleted")
-    show_store.print_forgotten(forgotten(opened, scene_id, on_wait=show_store.print_waiting), as_json)
+    result = forget_scene(opened, scene_id, on_wait=tell)
+    if as_json:
+        print_json(asdict(result))
+    else:
+        click.echo(f"scene {result.scene_id} is forgotten, with {format_count(result.jobs, 'rendered job')}")

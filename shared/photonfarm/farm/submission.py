@@ -46,7 +46,7 @@ def check_hold_out(spec: SceneSpec, store: str | Path, share: float, request: Re
     Nothing is written. The message names numbers that would do. The trainer checks the same, but only after everything
     is rendered.
     """
-    if (fault := _fault(spec, _plans(spec, store), share, request)) is not None:
+    if fault := _find_fault(spec, _read_plans(spec, store), share, request):
         raise SpecError(fault)
 
 
@@ -55,11 +55,11 @@ def choose_hold_out(spec: SceneSpec, store: str | Path, request: Request) -> flo
 
     Raises SpecError if there is only one configuration (in a static scene, view).
     """
-    plans = _plans(spec, store)
-    keys = _units(spec, plans, request)
+    plans = _read_plans(spec, store)
+    keys = _list_units(spec, plans, request)
     share = enough(keys) or enough(keys, least=0.0)
     if share is None:
-        more = _least(request, lambda wanted: enough(_units(spec, plans, wanted)) is not None)
+        more = _least(request, lambda wanted: enough(_list_units(spec, plans, wanted)) is not None)
         remedy = f"--modifications {more} plans enough" if more else "the spec has no other, as nothing in it varies"
         kind = "configuration" if spec.groups else "view"
         raise SpecError(f"{len(keys)} {kind} is planned: one to train on and one to validate on are needed; {remedy}")
@@ -72,33 +72,31 @@ def hold_out_warning(spec: SceneSpec, store: str | Path, request: Request) -> st
     A store that cannot be read is left to those who write into it.
     """
     few = request.model_copy(update={"modifications": min(request.modifications, PLENTY)})
-    if _splits(are_held_out(_units(spec, [], few), HOLD_OUT)):
+    if _find_fault(spec, [], HOLD_OUT, few) is None:
         return None  # whatever else is planned, which may be much
     with suppress(StoreError):
-        if (fault := _fault(spec, _plans(spec, store), HOLD_OUT, few)) is not None:
+        if fault := _find_fault(spec, _read_plans(spec, store), HOLD_OUT, few):
             return f"`photonfarm train` will refuse this: {fault}"
     return None
 
 
-def _fault(spec: SceneSpec, plans: list[StoredPlan], share: float, request: Request) -> str | None:
+def _find_fault(spec: SceneSpec, plans: list[StoredPlan], share: float, request: Request) -> str | None:
     """What is wrong with a share for what is planned and requested, and the numbers that would do, in words."""
-    keys = _units(spec, plans, request)
-    held_out = are_held_out(keys, share)
-    if _splits(held_out):
+
+    def splits(wanted: Request) -> bool:
+        return len(set(are_held_out(_list_units(spec, plans, wanted), share))) == 2
+
+    if splits(request):
         return None
-    found = []
+    keys, remedies = _list_units(spec, plans, request), []
     if (other := enough(keys, least=0.0)) is not None:
-        found.append(f"--hold-out {other:g} holds out one of these")
-    if more := _least(request, lambda wanted: _splits(are_held_out(_units(spec, plans, wanted), share))):
-        found.append(f"--modifications {more} plans enough")
-    which = "all are held out, and none is left to train on" if any(held_out) else "none is held out, and one is needed"
+        remedies.append(f"--hold-out {other:g} holds out one of these")
+    if more := _least(request, splits):
+        remedies.append(f"--modifications {more} plans enough")
+    all_are = any(are_held_out(keys, share))
+    which = "all are held out, and none is left to train on" if all_are else "none is held out, and one is needed"
     of = f"of the {format_count(len(keys), 'configuration' if spec.groups else 'view')} planned"
-    return f"hold_out = {share:g}: {of} {which}; {', and '.join(found) or 'plan more, or use another --hold-out'}"
-
-
-def _splits(held_out: list[bool]) -> bool:
-    """Whether some are held out, and some are not."""
-    return 0 < sum(held_out) < len(held_out)
+    return f"hold_out = {share:g}: {of} {which}; {', and '.join(remedies) or 'plan more, or use another --hold-out'}"
 
 
 def _least(request: Request, works: Callable[[Request], bool]) -> int | None:
@@ -112,27 +110,22 @@ def _least(request: Request, works: Callable[[Request], bool]) -> int | None:
     return found if found < MOST_NAMED else None
 
 
-def _units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> set[Key]:
+def _list_units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> set[Key]:
     """What is held out as one, of all that is planned and requested: configurations, or a static scene's views."""
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:
         wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
-    planned = _plan_views(spec, plans, wanted)
-    return set(units_of(planned, np.arange(len(planned.view_row))))
-
-
-def _plans(spec: SceneSpec, store: str | Path) -> list[StoredPlan]:
-    """The plans of a scene; none if the store does not have it."""
-    return [] if is_vacant(store) else load_all(Store(store).storage, f"{SCENES}/{spec.scene_id}", [])
-
-
-def _plan_views(spec: SceneSpec, plans: list[StoredPlan], wanted: Request) -> PlannedViews:
-    """The views of a scene's plans and of a request."""
     known = content(plans)
     first_job, shard_rows = (plans[-1].end_job, plans[0].shard_rows) if plans else (0, SHARD_ROWS)
     new = expand(spec, wanted, known, first_job=first_job, shard_rows=shard_rows).rows
     more = [] if new is None else [(first_job * shard_rows, new)]
-    return PlannedViews.of(spec, PlannedContent([*known.plans, *more]))
+    views = PlannedViews.of(spec, PlannedContent([*known.plans, *more]))
+    return set(units_of(views, np.arange(len(views.view_row))))
+
+
+def _read_plans(spec: SceneSpec, store: str | Path) -> list[StoredPlan]:
+    """The plans of a scene; none if the store does not have it."""
+    return [] if is_vacant(store) else load_all(Store(store).storage, f"{SCENES}/{spec.scene_id}", [])
 
 
 WORKERS = 8

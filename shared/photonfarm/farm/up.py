@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import signal
 import subprocess
@@ -10,63 +9,38 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from photonfarm.core.errors import IncompleteError, SpecError, store_errors
 from photonfarm.core.processes import command, free_port, tie
+from photonfarm.core.waiting import Log
 from photonfarm.farm.devices import CPU
+from photonfarm.farm.progress import FarmProgress
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.running_farm import WEB_PORT, announce
-from photonfarm.farm.status import NoQueue, StoreQueue, queue_now, waits
 from photonfarm.farm.submission import check_hold_out, choose_hold_out, submit, top_up
-from photonfarm.farm.training import RunFolder, TrainingProgress, check_run, hold_out_of
+from photonfarm.farm.training import check_run, hold_out_of
+from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.hold_out import HOLD_OUT
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp, spp_per_pass
-from photonfarm.queue import QueueStatus
 from photonfarm.scene.plausibility import warnings
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_spec
-from photonfarm.store import SceneStore, Store
+from photonfarm.store import Store
 
 WORKERS = 2
 """The workers on a processor, unless another number is asked for."""
 
 POLL_S = 0.5
-ASK_S = 2.0  # between questions to Redis
+LOOK_S = 2.0  # between looks at the store and Redis
 STOP_S = 7.0  # for all processes to end: a worker gives its job 5 s, and Docker gives this one 10 s
 AT_ONCE_S = 1.0  # for processes to end after a second request, even in the middle of a job
+PAGES = "web"
 
 Process = subprocess.Popen[bytes]
-CommittedAndPlanned = tuple[int, int]
-"""How many rows are committed, and how many are planned."""
-
-
-@dataclass(frozen=True, slots=True)
-class FarmProgress:
-    """How far rendering and training are."""
-
-    samples: CommittedAndPlanned
-    passes: CommittedAndPlanned  # further ones, of views that have samples
-    step: int
-    steps: int
-    note: str  # what training does and its last held-out error, in words
-    in_hand: int = 0  # samples and passes that are rendered, in jobs that are not committed yet
-    doing: tuple[str, ...] = ()  # what each worker does, in words
-    waits: tuple[str, ...] = ()  # what waits for what, in sentences
-
-
-class Talk(Protocol):
-    """Where a farm says what it does."""
-
-    def say(self, line: str) -> None:
-        """Say a sentence."""
-
-    def progress(self, steps: int) -> AbstractContextManager[Callable[[FarmProgress, bool], None]]:
-        """A context manager that gives a function: call it with each progress, and with True for the last."""
+Display = AbstractContextManager[Callable[[FarmProgress, bool], None]]
+"""A context manager that gives a function: it is called with each look at the farm, and with True for the last."""
 
 
 def trainer_arguments(spec: str, *, run: Path, train_steps: int, hold_out: float) -> list[str]:
@@ -83,7 +57,8 @@ def run_farm(
     spec: str,
     store: str | Path,
     request: Request,
-    talk: Talk,
+    say: Log,
+    display: Display,
     *,
     workers: int,
     run: Path,
@@ -109,12 +84,12 @@ def run_farm(
     """
     named = NamedSpec.load(spec)
     for warning in warnings(named):
-        talk.say(f"warning: {warning}")
+        say(f"warning: {warning}")
     references = train_steps > 0 and reference_views > 0
     if train_steps:
         check_run(run, named.spec, store)
     asked = hold_out or hold_out_of(run)
-    share = _checked_hold_out(named.spec, store, asked, request, talk) if train_steps else asked or HOLD_OUT
+    share = _checked_hold_out(named.spec, store, asked, request, say) if train_steps else asked or HOLD_OUT
     which = (f"held-out={share}", f"views=first:{reference_views}")  # of the planned views get references
     if references:
         TopUp.of(str(reference_spp), which)
@@ -126,15 +101,14 @@ def run_farm(
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(named, store, redis.url, request, retry=True, shard_rows=shard_rows, workers=workers)
-        talk.say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
+        say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
             there = f"passes that the samples have, or that were planned before: {added.planned_before}"
-            talk.say(f"references: {added.planned} further passes planned; {there}")
+            say(f"references: {added.planned} further passes planned; {there}")
         opened = Store(store)
-        scene = opened.scene(planned.scene_id)
-        rows = scene.plans()[0].shard_rows
-        talk.say(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
+        rows = opened.scene(planned.scene_id).plans()[0].shard_rows
+        say(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
         environment = _environment(spec, store, redis.url)
         verbs = {
             f"worker-{i + 1}": worker_arguments(planned.scene_id, f"worker-{i + 1}", devices[i % len(devices)])
@@ -142,18 +116,24 @@ def run_farm(
         }
         if train_steps:
             verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=share)
-        address = stack.enter_context(_pages(store, redis.url, run, talk)) if web else None
-        trained = run if train_steps else None
-        stack.enter_context(announce(opened, redis_url=redis.url, run=trained, web=address))
-        running = stack.enter_context(_processes(verbs, environment, run, talk))
+        address, trained = None, [run] if train_steps else []
+        if web:
+            port = free_port(WEB_PORT)
+            address = f"http://localhost:{port}/"
+            verbs[PAGES] = ["web", "--run", str(run), "--port", str(port)]
+            say(f"watch it at {address}")
+        announced = announce(opened, redis_url=redis.url, run=run if train_steps else None, web=address)
+        stack.enter_context(announced)
+        running = stack.enter_context(_processes(verbs, environment, run, say))
         preview = ["preview", planned.scene_id, "--out", str(out / "preview.html")]
         try:
-            farm = _Farm(scene, run, train_steps, partial(queue_now, opened, redis.url))
-            _watch(running, farm, redis, talk)
+            watch = FarmWatch(opened, redis.url, trained, scene_id=planned.scene_id)
+            with display as show:
+                _watch(running, watch, redis, show, run)
             if train_steps:
                 beside: list[str] = []
                 if references:
-                    passes = -(-reference_spp // spp_per_pass(scene.spec))
+                    passes = -(-reference_spp // spp_per_pass(named.spec))
                     folder = str(out / "references")
                     merge = ["--scene", planned.scene_id, "--least", str(passes), "--out", folder]
                     _call(["store", "merge", *merge], environment)
@@ -168,14 +148,14 @@ def run_farm(
         _call(preview, environment)
 
 
-def _checked_hold_out(spec: SceneSpec, store: str | Path, asked: float | None, request: Request, talk: Talk) -> float:
+def _checked_hold_out(spec: SceneSpec, store: str | Path, asked: float | None, request: Request, say: Log) -> float:
     """The share to hold out, as asked for or just enough; raises SpecError if it would leave one side empty."""
     if asked is not None:
         check_hold_out(spec, store, asked, request)
         return asked
     share = choose_hold_out(spec, store, request)
     if share != HOLD_OUT:
-        talk.say(f"hold-out {share:g}, as {HOLD_OUT:g} would not suit so few configurations")
+        say(f"hold-out {share:g}, as {HOLD_OUT:g} would not suit so few configurations")
     return share
 
 
@@ -204,31 +184,27 @@ def _call(arguments: list[str], environment: Mapping[str, str]) -> None:
 
 @contextmanager
 def _processes(
-    verbs: Mapping[str, list[str]], environment: Mapping[str, str], logs: Path, talk: Talk
+    verbs: Mapping[str, list[str]], environment: Mapping[str, str], logs: Path, say: Log
 ) -> Iterator[dict[str, Process]]:
     """Run each verb as a process of its own; at the end all are asked to stop at once, and waited for together."""
     running: dict[str, Process] = {}
     try:
         for name, verb in verbs.items():
-            running[name] = _start(verb, environment, logs / f"{name}.log")
+            with (logs / f"{name}.log").open("ab") as log:
+                running[name] = subprocess.Popen(
+                    tie(command(*verb)),
+                    env=environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, by us
+                )
         yield running
     finally:
-        alive = [process for process in running.values() if process.poll() is None]
-        if alive:
-            talk.say("stopping; a job in hand that is not nearly done will be rendered again")
-            _stop(alive)
-
-
-def _start(arguments: list[str], environment: Mapping[str, str], log: Path) -> Process:
-    with log.open("ab") as output:
-        return subprocess.Popen(
-            tie(command(*arguments)),
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,  # Ctrl-C in the terminal is for us; they are asked to stop once, by us
-        )
+        alive = {name: process for name, process in running.items() if process.poll() is None}
+        if alive.keys() - {PAGES}:
+            say("stopping; a job in hand that is not nearly done will be rendered again")
+        _stop([*alive.values()])
 
 
 def _stop(processes: list[Process]) -> None:
@@ -252,80 +228,32 @@ def _ask(processes: list[Process], seconds: float) -> None:
             process.wait(max(end - time.monotonic(), 0.0))
 
 
-@contextmanager
-def _pages(store: str | Path, redis_url: str, run: Path, talk: Talk) -> Iterator[str]:
-    """Serve the farm's pages until the block ends; yields their address."""
-    port = free_port(WEB_PORT)
-    verb = ["web", "--store", str(store), "--redis", redis_url, "--run", str(run), "--port", str(port)]
-    process = _start(verb, os.environ, run / "web.log")
-    address = f"http://localhost:{port}/"
-    talk.say(f"watch it at {address}")
-    try:
-        yield address
-    finally:
-        _stop([process])
-
-
-class _Farm:
-    """The progress of rendering and training, read from their files and their queue."""
-
-    def __init__(
-        self, scene: SceneStore, run: Path, steps: int, ask: Callable[[], StoreQueue | NoQueue] | None = None
-    ) -> None:
-        """Take the scene, the trainer's folder, and how to ask for the queue, which is done now and then."""
-        self.scene = scene
-        self.run = run
-        self.steps = steps
-        self._training = RunFolder(run)
-        self._ask = ask
-        self._queue: StoreQueue | NoQueue = NoQueue("not asked yet")
-        self._asked_s = -math.inf
-
-    def look(self) -> FarmProgress:
-        """Count the samples and the further passes of their views, and read the trainer's log."""
-        trained = self._training.look() if self.steps else TrainingProgress("")  # else its files are of another run
-        found, status = self.scene.progress(), self._status()
-        passes = found.committed_passes, found.planned_passes
-        samples = found.committed_samples - passes[0], found.planned_samples - passes[1]
-        named = {self.scene.scene_id: self.scene.spec.name}
-        missing = found.planned_samples - found.committed_samples
-        activities = status.activities if status and missing else {}  # a report may be seconds old
-        return FarmProgress(
-            samples,
-            passes,
-            trained.step,
-            self.steps,
-            trained.note,
-            min(sum(each.done for each in activities.values()), found.planned_samples - found.committed_samples),
-            tuple(f"{name} {each}" for name, each in sorted(activities.items())),
-            tuple(map(str, waits(self._queue, named, 0))),
-        )
-
-    def _status(self) -> QueueStatus | None:
-        """The queue's status, at most `ASK_S` old; None while nothing is known of it."""
-        if self._ask is not None and time.monotonic() - self._asked_s >= ASK_S:
-            self._queue, self._asked_s = self._ask(), time.monotonic()
-        return self._queue.status if isinstance(self._queue, StoreQueue) else None
-
-
-def _watch(running: Mapping[str, Process], farm: _Farm, redis: EmbeddedRedis, talk: Talk) -> None:
-    """Show progress until every process has ended; raises IncompleteError as soon as one has failed."""
-    with talk.progress(farm.steps) as show:
-        while True:
-            redis.keep_running()
-            codes = {name: process.poll() for name, process in running.items()}
-            alive = None in codes.values()
-            show(farm.look(), not alive or any(codes.values()))
-            for name, code in codes.items():
-                if code:
-                    log = farm.run / f"{name}.log"
-                    said = f"{name} {_end(code)}; {log} says: {_tail(log)}. What is rendered and trained"
-                    if code == SpecError.exit_code:  # the same command would be refused again
-                        raise IncompleteError(f"{said} is kept")
-                    raise IncompleteError(f"{said} is kept, and the same command goes on from there")
-            if not alive:
-                return
-            time.sleep(POLL_S)
+def _watch(
+    running: Mapping[str, Process],
+    watch: FarmWatch,
+    redis: EmbeddedRedis,
+    show: Callable[[FarmProgress, bool], None],
+    logs: Path,
+) -> None:
+    """Show progress until every process but the pages has ended; raises IncompleteError as soon as one has failed."""
+    looked = -LOOK_S
+    while True:
+        redis.keep_running()
+        codes = {name: process.poll() for name, process in running.items() if name != PAGES}
+        last = None not in codes.values() or any(codes.values())
+        if last or time.monotonic() - looked >= LOOK_S:
+            looked = time.monotonic()
+            show(watch.look(), last)
+        for name, code in codes.items():
+            if code:
+                log = logs / f"{name}.log"
+                said = f"{name} {_end(code)}; {log} says: {_tail(log)}. What is rendered and trained"
+                if code == SpecError.exit_code:  # the same command would be refused again
+                    raise IncompleteError(f"{said} is kept")
+                raise IncompleteError(f"{said} is kept, and the same command goes on from there")
+        if last:
+            return
+        time.sleep(POLL_S)
 
 
 def _end(code: int) -> str:

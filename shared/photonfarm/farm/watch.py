@@ -1,22 +1,34 @@
-"""A farm looked at again and again: how far each scene is, how fast, and what holds it up.
+"""A farm looked at again and again.
 
 A look costs one listing of the markers of each scene, the markers that are new, and a few questions to Redis.
 """
 
 from __future__ import annotations
 
+import contextlib
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
-from photonfarm.core.errors import StoreError
-from photonfarm.farm.running_farm import RunningFarm, running_farm
-from photonfarm.farm.status import NoQueue, StoreQueue, Wait, queue_now, waits
-from photonfarm.farm.training import RunFolder, TrainingProgress
-from photonfarm.queue import Activity, RenderArguments
-from photonfarm.store import SceneStore, Store
+from photonfarm.core.errors import CorruptError, QueueError, StoreError, store_errors
+from photonfarm.farm.progress import FarmProgress, QueueProgress, SceneProgress
+from photonfarm.farm.running_farm import running_farm
+from photonfarm.farm.training import RunFolder
+from photonfarm.store import SceneStatus, SceneStore, Store
+from photonfarm.store.model.store import FAILURES_FOLDER
+
+if TYPE_CHECKING:
+    from photonfarm.queue import Activity, Failure
+
+ANSWER_S = 5.0
+"""How long an answer of Redis is waited for; workers wait longer."""
 
 WINDOW_S = 120.0
 """The span over which a pace is taken."""
@@ -24,47 +36,8 @@ WINDOW_S = 120.0
 STEADY_S = 10.0
 """The least span of looks that a pace is taken from."""
 
-CommittedAndPlanned = tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True)
-class SceneView:
-    """How far a scene is."""
-
-    scene_id: str
-    name: str
-    samples: CommittedAndPlanned = (0, 0)  # without further passes
-    passes: CommittedAndPlanned = (0, 0)  # further ones, of views that have samples
-    jobs: CommittedAndPlanned = (0, 0)
-    in_hand: int = 0  # samples that are rendered, in jobs that are not committed yet
-    size_bytes: int = 0  # of the committed jobs, without guides
-    core_s: float = 0.0  # that they took
-    rate: float | None = None  # samples per second, lately
-    left_s: float | None = None
-    error: str | None = None  # why it cannot be read
-
-    @property
-    def missing(self) -> int:
-        """The samples and passes that are planned and not committed."""
-        return self.samples[1] - self.samples[0] + self.passes[1] - self.passes[0]
-
-
-@dataclass(frozen=True, slots=True)
-class FarmView:
-    """A farm at one moment."""
-
-    scenes: list[SceneView]
-    queue: StoreQueue | NoQueue
-    trainings: list[TrainingProgress]
-    running: RunningFarm | None  # a `photonfarm up` of this machine that is at work on the store
-    named_redis: bool  # the user has named it; else none need be there, as `photonfarm up` brings its own
-    waits: list[Wait]  # what waits for what
-    at_s: float  # when it was looked at, in seconds since 1970
-
-    @property
-    def activities(self) -> dict[str, Activity]:
-        """What workers are doing, by their names."""
-        return {} if isinstance(self.queue, NoQueue) else dict(self.queue.status.activities)
+READERS = 8
+"""The number of markers read at a time: a bucket takes milliseconds for each answer."""
 
 
 @dataclass(slots=True)
@@ -73,7 +46,30 @@ class _Seen:
 
     core_s: dict[int, float] = field(default_factory=dict)  # that committed jobs took, by their numbers
     size_bytes: int = 0
+    redrawn: int = 0
+    unreadable: int = 0  # markers; they count as free
+    error: StoreError | None = None  # of the first of these
     history: deque[tuple[float, int]] = field(default_factory=deque)  # when so many samples were rendered
+
+    def add(self, job: int, marker: dict[str, Any] | StoreError) -> None:
+        """Add a job's marker, or why it cannot be read."""
+        if isinstance(marker, StoreError):
+            if not isinstance(marker.__cause__, FileNotFoundError):  # else a repair has moved it since it was listed
+                self.core_s[job] = 0.0
+                self.unreadable += 1
+                self.error = self.error or marker
+            return
+        self.core_s[job] = marker["figures"]["core_s"]
+        self.redrawn += marker["figures"]["redrawn"]
+        self.size_bytes += sum(file["size"] for file in marker["files"].values())
+
+    def pace(self, now: float, rendered: int) -> float | None:
+        """Samples per second, over the last looks; None while they are too few, or nothing has been rendered."""
+        self.history.append((now, rendered))
+        while now - self.history[0][0] > WINDOW_S:
+            self.history.popleft()
+        began, first = self.history[0]
+        return (rendered - first) / (now - began) if now - began >= STEADY_S and rendered > first else None
 
 
 class FarmWatch:
@@ -85,90 +81,146 @@ class FarmWatch:
         redis_url: str,
         runs: Sequence[Path] = (),
         *,
+        scene_id: str | None = None,
         named_redis: bool = True,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Take what to look at. Unless a user has `named_redis`, a `photonfarm up` at work here tells its own."""
-        self._store, self._redis_url, self._named_redis, self._clock = store, redis_url, named_redis, clock
-        self._runs = [RunFolder(run) for run in runs]
-        self._seen: dict[str, _Seen] = {}
+        """Take what to look at, which may be one scene alone.
 
-    @property
-    def runs(self) -> list[RunFolder]:
-        """The runs' folders, with their logs as they were at the last look."""
-        return self._runs
+        Unless a user has `named_redis`, a `photonfarm up` at work here tells its own.
+        """
+        self._store, self._redis_url, self._named_redis, self._clock = store, redis_url, named_redis, clock
+        self._scene_id = scene_id
+        self.runs = [RunFolder(run) for run in runs]
+        self._seen: dict[str, _Seen] = {}
 
     def costs(self, scene_id: str) -> dict[int, float]:
         """The core-seconds that each committed job of a scene took, as far as it has been seen."""
         return self._seen[scene_id].core_s if scene_id in self._seen else {}
 
-    def look(self) -> FarmView:
+    def look(self) -> FarmProgress:
         """The farm now. Raises StoreError if the store is gone."""
         running = running_farm(self._store)
         url = self._redis_url if self._named_redis or running is None else running.redis_url
-        queue = queue_now(self._store, url)
-        if not self._runs and running is not None and running.run:
-            self._runs.append(RunFolder(Path(running.run)))
-        activities = [] if isinstance(queue, NoQueue) else list(queue.status.activities.values())
-        workers = 0 if isinstance(queue, NoQueue) else queue.status.workers
-        seen, failed = self._store.each(lambda scene: self._look_at(scene, activities, workers))
-        scenes = [*seen.values(), *(SceneView(name, "unreadable", error=str(why)) for name, why in failed.items())]
-        trainings = [run.look() for run in self._runs]
-        names = {scene.scene_id: scene.name for scene in scenes}
-        why = list(waits(queue, names, sum(scene.missing for scene in scenes), trainings))
-        by_id = sorted(scenes, key=lambda scene: scene.scene_id)
-        return FarmView(by_id, queue, trainings, running, self._named_redis, why, time.time())
-
-    def _look_at(self, scene: SceneStore, activities: Sequence[Activity], workers: int) -> SceneView:
-        seen = self._seen.setdefault(scene.scene_id, _Seen())
-        progress, committed = scene.progress(), scene.committed_jobs()
-        if seen.core_s.keys() - committed:  # a repair has removed some
-            seen = self._seen[scene.scene_id] = _Seen()
-        for job in sorted(committed - seen.core_s.keys()):
-            _add(scene, job, seen)
-        in_hand = sum(each.done for each in activities if _is_of(each, scene.scene_id))
-        in_hand = min(in_hand, progress.planned_samples - progress.committed_samples)  # a report may be seconds old
-        done = progress.committed_samples + in_hand
-        rate = self._pace(seen, done)
-        missing = progress.planned_samples - done
-        further = progress.committed_passes, progress.planned_passes
-        core_s = sum(seen.core_s.values())
-        left = missing / rate if rate else None
-        if left is None and workers and progress.committed_samples:
-            left = missing * core_s / progress.committed_samples / workers
-        return SceneView(
-            scene.scene_id,
-            scene.spec.name,
-            (progress.committed_samples - further[0], progress.planned_samples - further[1]),
-            further,
-            (len(committed), scene.jobs()),
-            in_hand,
-            seen.size_bytes,
-            core_s,
-            rate,
-            left if missing > 0 else None,
+        queue = read_queue(self._store, url)
+        if not self.runs and running is not None and running.run:
+            self.runs.append(RunFolder(Path(running.run)))
+        if self._scene_id is None:
+            scenes, failed = self._store.each(lambda scene: self._look_at(scene, queue))
+        else:
+            scenes, failed = {self._scene_id: self._look_at(self._store.scene(self._scene_id), queue)}, {}
+        for scene_id, error in failed.items():
+            scenes[scene_id] = SceneProgress(
+                SceneStatus(scene_id, "unreadable", 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error))
+            )
+        return FarmProgress(
+            [scenes[scene_id] for scene_id in sorted(scenes)],
+            queue,
+            [run.look() for run in self.runs],
+            running,
+            self._named_redis,
+            time.time(),
         )
 
-    def _pace(self, seen: _Seen, done: int) -> float | None:
-        """Samples per second, over the last looks; None while they are too few, or nothing has been rendered."""
-        now = self._clock()
-        seen.history.append((now, done))
-        while now - seen.history[0][0] > WINDOW_S:
-            seen.history.popleft()
-        began, first = seen.history[0]
-        return (done - first) / (now - began) if now - began >= STEADY_S and done > first else None
+    def _look_at(self, scene: SceneStore, queue: QueueProgress) -> SceneProgress:
+        progress, committed = scene.progress(), scene.committed_jobs()
+        jobs, withdrawn = scene.jobs(), scene.withdrawn_jobs()  # after the markers: each one's plan is there by now
+        seen = self._seen.get(scene.scene_id)
+        if seen is None or seen.core_s.keys() - committed:  # a repair has removed some
+            seen = self._seen[scene.scene_id] = _Seen()
+        new = sorted(committed - seen.core_s.keys())
+        with ThreadPoolExecutor(READERS) as readers:
+            for job, marker in zip(new, readers.map(partial(_read_marker, scene), new), strict=True):
+                seen.add(job, marker)
+        complete, planned = progress.committed_samples, progress.planned_samples
+        told = sum(each.done for each in queue.activities.values() if _is_of(each, scene.scene_id))
+        in_hand = min(told, planned - complete)  # a report may be seconds old
+        missing, core_s = planned - complete - in_hand, sum(seen.core_s.values(), 0.0)
+        rate, left_s = seen.pace(self._clock(), complete + in_hand), None
+        if rate:
+            left_s = missing / rate
+        elif queue.status and queue.status.workers and complete:
+            left_s = missing * core_s / complete / queue.status.workers
+        return SceneProgress(
+            SceneStatus(
+                scene.scene_id,
+                scene.spec.name,
+                planned,
+                complete,
+                jobs - len(withdrawn),
+                len(committed),
+                seen.size_bytes,
+                core_s,
+                seen.redrawn,
+                seen.unreadable,
+                str(seen.error) if seen.error else None,
+                sum(job >= jobs or job in withdrawn for job in committed),
+            ),
+            (progress.committed_passes, progress.planned_passes),
+            in_hand,
+            rate,
+            left_s if missing else None,
+        )
 
 
-def _add(scene: SceneStore, job: int, seen: _Seen) -> None:
-    """Add a job's marker; one that cannot be read counts as free."""
+def _read_marker(scene: SceneStore, job: int) -> dict[str, Any] | StoreError:
     try:
-        marker = scene.marker(job)
-    except StoreError:
-        seen.core_s[job] = 0.0
-        return
-    seen.core_s[job] = marker["figures"]["core_s"]
-    seen.size_bytes += sum(file["size"] for file in marker["files"].values())
+        return scene.marker(job)
+    except StoreError as error:
+        return error
 
 
 def _is_of(activity: Activity, scene_id: str) -> bool:
+    from photonfarm.queue import RenderArguments
+
     return activity.job is not None and RenderArguments.of(activity.job).scene_id == scene_id
+
+
+def read_queue(store: Store, redis_url: str) -> QueueProgress:
+    """The queue of a store, or why nothing is known of it; raises StoreError if the store is gone.
+
+    The queue's packages are loaded only where there is something to ask: they take as long as the rest of `status`.
+    """
+    if (refused := _why_refused(redis_url)) and not store.storage.names(FAILURES_FOLDER):
+        return QueueProgress(None, refused)
+    from photonfarm import queue
+
+    with store_errors("look for failures", store.storage.where):
+        kept = queue.read_kept_failures(store, lambda name: _is_missing(store, name))
+    try:
+        with queue.redis_errors("asked"), queue.connect(redis_url, only_s=ANSWER_S) as connection:
+            queue.check_served(connection, store)
+            found = queue.queue_status(connection)
+    except QueueError as error:
+        return QueueProgress(None, str(error), kept=queue.group_causes(kept))
+    failed = {name: failure for name, failure in found.failed.items() if _is_missing(store, name)}
+    unknown: dict[str, Failure] = {name: failure for name, failure in kept.items() if name not in failed}
+    return QueueProgress(found, causes=queue.group_causes(failed), kept=queue.group_causes(unknown))
+
+
+def _why_refused(redis_url: str) -> str | None:
+    """Why there is no Redis, if nothing listens at a port or socket of this machine; None if its client must tell."""
+    url = urlsplit(redis_url)
+    try:
+        if url.scheme == "unix" and not url.netloc:
+            where = url.path
+            with socket.socket(socket.AF_UNIX) as probe:
+                probe.connect(where)
+        elif url.scheme == "redis" and url.hostname in ("localhost", "127.0.0.1", "::1"):
+            where = f"{url.hostname}:{url.port or 6379}"
+            socket.create_connection((url.hostname, url.port or 6379), timeout=ANSWER_S).close()
+    except (ConnectionRefusedError, FileNotFoundError) as error:
+        return f"no Redis at {url.scheme}://{where}: {error.strerror}; `photonfarm redis` starts one"
+    except (OSError, ValueError):
+        pass
+    return None
+
+
+def _is_missing(store: Store, name: str) -> bool:
+    """Whether a job is one of this store's, and to be rendered; False for one whose scene is damaged."""
+    from photonfarm.queue import RenderArguments
+
+    job = RenderArguments.of(name)
+    with contextlib.suppress(CorruptError, IndexError):
+        return store.has_scene(job.scene_id) and store.scene(job.scene_id).is_to_do(job.job)
+    return False

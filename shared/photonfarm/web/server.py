@@ -20,7 +20,7 @@ from urllib.parse import urlsplit
 from photonfarm.core.errors import PhotonfarmError
 
 if TYPE_CHECKING:
-    from photonfarm.farm.watch import FarmView
+    from photonfarm.farm.progress import FarmProgress
     from photonfarm.web.farm_pages import FarmPages
     from photonfarm.web.metrics import FarmMetrics
 
@@ -70,7 +70,7 @@ def make_page_routes(pages: FarmPages) -> Routes:
     return routes + make_metric_routes(pages.view)
 
 
-def make_metric_routes(look: Callable[[], FarmView]) -> Routes:
+def make_metric_routes(look: Callable[[], FarmProgress]) -> Routes:
     """The metrics of a farm, by a function that gives it as it is now."""
 
     @cache

@@ -109,8 +109,7 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
     assert [job["command"] for job in cause["jobs"]] == [command, command[:-1] + "1"]
     status.callback(root, redis_server.url, as_json=False)
     shown = capfd.readouterr().out
-    assert "photonfarm submit --retry" in shown
-    assert f"2 × {cause['cause']}" in shown
+    assert f"2 jobs failed, 2 of them set aside until `photonfarm submit --retry`: {cause['cause']}" in shown
     assert command in shown
 
     analytic.AnalyticScene.broken = True

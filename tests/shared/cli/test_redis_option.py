@@ -6,7 +6,8 @@ from typing import Any
 import pytest
 
 from photonfarm.cli.main import main
-from photonfarm.farm import status
+from photonfarm.farm import watch
+from photonfarm.farm.progress import QueueProgress
 from photonfarm.queue import has_password
 from photonfarm.store import Store
 
@@ -27,7 +28,7 @@ WITHOUT = ["redis://h:1/0", "redis://ada@h:1/0", "unix:///run/redis", "redis://[
 def urls(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> list[str]:
     """The URLs that `status` is called with, in a folder of its own."""
     found: list[str] = []
-    monkeypatch.setattr(status, "queue_of", lambda _store, url: found.append(url) or status.NoQueue("not asked"))
+    monkeypatch.setattr(watch, "read_queue", lambda _store, url: found.append(url) or QueueProgress(None, "not asked"))
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.delenv("PHOTONFARM_REDIS_PASSWORD_FILE", raising=False)
     monkeypatch.chdir(tmp_path)

@@ -58,7 +58,7 @@ function progress(state) {
     const facts = [
       scene.rate && scene.missing ? perTime(scene.rate) : null,
       scene.left_s !== null && scene.missing ? `${span(scene.left_s)} left` : scene.missing ? null : "complete",
-      scene.jobs[1] ? `${count(scene.jobs[0])}/${count(scene.jobs[1])} jobs` : null,
+      scene.jobs_planned ? `${count(scene.jobs_committed)}/${count(scene.jobs_planned)} jobs` : null,
       scene.passes[1] ? `${count(scene.passes[0])}/${count(scene.passes[1])} further passes` : null,
       scene.core_s ? `${span(scene.core_s)} of a core` : null,
       `${(scene.size_bytes / 1e6).toFixed(1)} MB`,
@@ -82,17 +82,13 @@ function progress(state) {
 }
 
 function workers(state) {
-  const queue = state.queue ? `${state.queue.workers} workers, ${state.queue.queued} jobs queued, ${state.queue.running} running`
-    : state.scenes.some((scene) => scene.rate) ? "No queue is known here; workers without Redis are at work."
-    : "No farm is at work here. “photonfarm up”, or “photonfarm work” beside a Redis, goes on with what is missing.";
   const list = state.workers.map((worker) => h("div", { class: "worker" }, h("span", {}, worker.name),
     worker.total ? track(worker.done, worker.total) : h("span", { class: "figure" }, "…"),
     h("span", { class: "figure" }, worker.total ? `${worker.done}/${worker.total}` : ""),
     h("span", { class: "figure" }, worker.phase)));
   const waits = state.waits.map((wait) => h("li", {}, wait));
-  const failures = state.failed_before.map(({ cause, jobs }) =>
-    h("li", { class: "bad" }, `${jobs} job${jobs === 1 ? "" : "s"} failed before, and missing: ${cause}`));
-  return card("half", "Queue and workers", null, h("p", { class: "figure" }, queue), ...list,
+  const failures = state.failed_before.map((failure) => h("li", { class: "bad" }, `before: ${failure}`));
+  return card("half", "Queue and workers", null, h("p", { class: "figure" }, `queue: ${state.queue}`), ...list,
     waits.length + failures.length ? h("ul", { class: "plain" }, ...failures, ...waits) : null,
     list.length || waits.length || failures.length ? null : h("p", { class: "note" }, "Nothing waits for anything."));
 }

@@ -57,10 +57,10 @@ def test_the_last_line_is_the_complete_one_also_where_a_process_fails(
     trainer = subprocess.Popen([sys.executable, "-c", "raise SystemExit(8)"])
     worker = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     samples.commit_all(scene)
+    watch = FarmWatch(store, redis_server.url)
     trainer.wait()
     try:
-        with pytest.raises(IncompleteError), follow_up(store.root) as show:
-            watch = FarmWatch(store, redis_server.url)
+        with follow_up(store.root) as show, pytest.raises(IncompleteError):
             up._watch({"worker": worker, "trainer": trainer}, watch, redis_server, show, tmp_path)
     finally:
         worker.communicate(b"\n")

@@ -66,7 +66,8 @@ def test_progress_pace_and_time_left_are_of_what_workers_have_in_hand_too(
     assert found.left_s == pytest.approx(5 / found.rate)
     assert found.status.core_s == watch.costs(scene.scene_id)[0] == samples.FIGURES.core_s
     assert describe_farm(farm) == (
-        "small: samples 2/8 (+1 in hand), 9.0 samples/min, 33 s left  (ada renders samples 1/2; eve renders samples 5/9)"
+        "small: samples 2/8 (+1 in hand), 9.0 samples/min, 33 s left"
+        "  (ada renders samples 1/2; eve renders samples 5/9)"
     )
     for each in scene.missing_jobs()[:-1]:
         samples.commit(scene, each, samples.outputs(scene, each))

@@ -65,8 +65,8 @@ def measure_need(experiment: Experiment) -> Need:
 
 def count_operations(spec: SceneSpec, run: Run) -> float:
     """Floating-point operations of a run's convolutions and matrix products."""
+    from photonfarm.trainer.dry_run import summarise
     from photonfarm.trainer.networks import find_kind
-    from photonfarm.trainer.networks.summary import summarise
     from photonfarm.trainer.runs.settings import NetworkSettings, make_preset
 
     told = {key: value for key, value in run.train.items() if key != "preset"}

@@ -173,7 +173,7 @@ def timed(
             "copy": lambda: batch.to(device).for_training() if gradients else batch.to(device),
             "point branch": with_gradients(lambda: network.further(inputs)),
             "projection": with_gradients(lambda: [network.project(*told) for told in leaves]),
-            "photon map": lambda: network.gather_light(inputs) if isinstance(network, LightTransportPhotons) else None,
+            "photon map": lambda: network.photon_light(inputs) if isinstance(network, LightTransportPhotons) else None,
             "U-Net": with_gradients(lambda: [network.synthesise(channels)]),
             **({"optimiser": learner.optimiser.step} if gradients else {}),
         }

@@ -24,7 +24,7 @@ def frame_of(points: int) -> SceneFrame:
     appearance = np.concatenate([-position, np.full((points, 3), ALBEDO), np.zeros((points, 3))], axis=1)
     optics = Optics(16.0, 16, 16, 0.01, 10.0)
     centre, area = np.zeros(3, np.float32), 4 * math.pi
-    return SceneFrame(optics, centre, 1.0, position, appearance.astype(np.float32), 0, 0, 1.0, -1, area, 1.0)
+    return SceneFrame(optics, centre, 1.0, position, appearance.astype(np.float32), 0, 1.0, -1, area)
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import pytest
 import torch
 from read_batches import batch_of
 
-from photonfarm.scene.view import Camera
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.photon_map import WINDOWS, arrives_on_seen_side, gather_light, seen_area
@@ -71,7 +70,7 @@ def test_photons_of_longer_paths_than_the_images_have_are_left_out(make_source, 
     network, inputs = build(settings, frame, 0), batch_of(source, (0,), NEEDS).inputs
     inputs.photons.bounce.masked_fill_(inputs.photons.present, 2)
     with torch.no_grad():
-        assert any(found.any() for found in network.gather_light(inputs)) == counts
+        assert any(found.any() for found in network.photon_light(inputs)) == counts
 
 
 def box(pixels: int, beside: int) -> np.ndarray:
@@ -118,7 +117,7 @@ def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_
         inputs = batch_of(source, (row,), NEEDS).inputs
         with torch.no_grad():
             known = network.known(inputs, network.further(inputs))
-            torch.testing.assert_close(known, inputs.albedo * network.gather_light(inputs)[1])
+            torch.testing.assert_close(known, inputs.albedo * network.photon_light(inputs)[1])
         diffuse = inputs.albedo[0].sum(dim=-1).numpy() > 0
         found.append(known[0].numpy()[diffuse])
         wanted.append(source.spec.exposure * source.clean(row)[diffuse])
@@ -127,21 +126,13 @@ def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_
     assert np.mean((image - clean) ** 2) < 0.1 * np.mean(clean**2)
 
 
-@pytest.mark.parametrize(("photons", "gathers"), [("gathered", True), ("transport", False)])
-def test_demodulation_is_of_what_is_learned_and_not_of_the_photon_map(make_source, photons: str, gathers: bool) -> None:
+def test_demodulation_is_of_what_is_learned_and_not_of_the_photon_map(make_source) -> None:
     source = make_source(2, photons=256)
-    settings = NetworkSettings(width=4, architecture=ARCHITECTURE, photons=photons, demodulation=0.2)
+    settings = NetworkSettings(width=4, architecture=ARCHITECTURE, demodulation=0.2)
     network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
     inputs = batch_of(source, (0, 1), NEEDS).inputs
     with torch.no_grad():
         further = network.further(inputs)
         learned = network.synthesise(torch.cat([*further, network.image_space(inputs)], dim=-1))
-        known = network.gather_light(inputs)[1] * inputs.albedo if gathers else 0
+        known = network.photon_light(inputs)[1] * inputs.albedo
         torch.testing.assert_close(network(inputs), learned * (inputs.albedo + 0.2) + known)
-
-
-def test_the_camera_of_the_areas_is_that_of_the_rays(make_source) -> None:
-    """The third row of a transform is the forward axis."""
-    source = make_source(1)
-    camera = Camera.of(source.view(0), source.spec)
-    np.testing.assert_allclose(camera.world_to_camera[2, :3], camera.forward, rtol=1e-6)

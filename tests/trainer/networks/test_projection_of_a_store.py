@@ -19,13 +19,13 @@ from photonfarm.scene.view import Camera
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.inputs import PhotonInputs, PointInputs, SceneFrame
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 SIZE, POINTS = 32, 1024
 ROWS = (0, 3, 4)
-SETTINGS = NetworkSettings(width=4, architecture="light_transport_photons", photons="transport")
+SETTINGS = NetworkSettings(width=4, architecture="light_transport_photons")
 Mask = NDArray[np.bool_]
 
 
@@ -85,21 +85,20 @@ def test_the_store_tells_of_points_and_photons_what_the_oracle_sees(read: Read) 
 
 def test_a_pixel_of_what_is_projected_is_the_mean_over_the_points_that_the_oracle_sees_there(read: Read) -> None:
     inputs, network = read.batch.inputs, read.network
-    clouds: tuple[tuple[PointInputs | PhotonInputs, Mask], ...]
-    clouds = (inputs.points, read.points), (inputs.photons, read.photons)
     with torch.no_grad():
-        found = [image.numpy() for image in network.further(inputs)[:2]]  # the others are gathered
-        features = network.point_features(inputs.points).numpy(), network.photon_features(inputs.photons).numpy()
-    for image, feature, (cloud, truth) in zip(found, features, clouds, strict=True):
-        wanted = [
-            mean_by_pixel(camera, position, of[seen], seen)
-            for camera, position, of, seen in zip(read.cameras, cloud.position.numpy(), feature, truth, strict=True)
-        ]
-        close = np.isclose(image, wanted, atol=1e-5, rtol=1e-4).all(axis=-1)
-        hit = (image != 0).any(axis=-1)
-        assert hit.sum() > 50
-        assert (close & hit).sum() >= 0.98 * hit.sum()
-        assert close.mean() >= 0.999
+        image = network.further(inputs)[0].numpy()
+        features = network.point_features(inputs.points).numpy()
+    wanted = [
+        mean_by_pixel(camera, position, of[seen], seen)
+        for camera, position, of, seen in zip(
+            read.cameras, inputs.points.position.numpy(), features, read.points, strict=True
+        )
+    ]
+    close = np.isclose(image, wanted, atol=1e-5, rtol=1e-4).all(axis=-1)
+    hit = (image != 0).any(axis=-1)
+    assert hit.sum() > 50
+    assert (close & hit).sum() >= 0.98 * hit.sum()
+    assert close.mean() >= 0.999
 
 
 def mean_by_pixel(camera: Camera, position: F32, features: F32, seen: Mask) -> NDArray[np.float64]:

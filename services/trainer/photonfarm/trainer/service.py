@@ -28,7 +28,7 @@ from photonfarm.trainer.runs.user_code import name_in_errors
 if TYPE_CHECKING:
     from photonfarm.core.records import F32
     from photonfarm.scene.spec import SceneSpec
-    from photonfarm.trainer.dry_run.dry_run import DryRun
+    from photonfarm.trainer.dry_run import DryRun
     from photonfarm.trainer.runs.devices import TrainingGroup
 
 T = TypeVar("T")
@@ -191,8 +191,8 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
 
     Raises SpecError without a spec, unless the store has one scene.
     """
+    from photonfarm.trainer.dry_run import format_summary, summarise
     from photonfarm.trainer.networks import find_kind
-    from photonfarm.trainer.networks.summary import format_summary, summarise
 
     network = make_settings(preset_name, changes).network
     scene = _find_spec(spec, store)
@@ -214,7 +214,7 @@ def rehearse(
     unless the store has one scene, and in one of several processes.
     """
     from photonfarm.core.models import sentences
-    from photonfarm.trainer.dry_run.dry_run import rehearse
+    from photonfarm.trainer.dry_run import rehearse
     from photonfarm.trainer.runs.devices import count_processes
 
     if (size := count_processes()) > 1:

@@ -19,7 +19,7 @@ from photonfarm.core.waiting import SILENCE_S, Steps
 from photonfarm.trainer.runs import progress
 
 if TYPE_CHECKING:
-    from photonfarm.trainer.dry_run.dry_run import DryRun
+    from photonfarm.trainer.dry_run import DryRun
 
 
 def print_record(of: dict[str, Any]) -> None:
@@ -43,9 +43,9 @@ def print_record(of: dict[str, Any]) -> None:
 
 def print_dry_run(estimate: DryRun, as_json: bool) -> None:
     """Print the estimate of a training."""
-    from photonfarm.trainer.dry_run.dry_run import describe, format_dry_run
+    from photonfarm.trainer.dry_run import format_dry_run
 
-    click.echo(json.dumps(describe(estimate), indent=2) if as_json else format_dry_run(estimate))
+    click.echo(json.dumps(estimate.document(), indent=2) if as_json else format_dry_run(estimate))
 
 
 def _format_recovery(log_record: dict[str, Any]) -> str:

@@ -11,21 +11,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 from torch import Tensor
 
-from photonfarm.data.torch_dataset import GUIDES, IMAGES, PHOTONS, POINTS
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
-
-import math
-
-import numpy as np
-
 from photonfarm.core.records import F32, BasePointCloud, Geometry
+from photonfarm.data.torch_dataset import GUIDES, IMAGES, PHOTONS, POINTS
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks.projection import Optics
 from photonfarm.trainer.runs.settings import NetworkSettings
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -44,20 +40,13 @@ class SceneFrame:
     base: F32  # (P, 3) where each point is in the base configuration, world, scene units
     appearance: F32  # (P, 9) the constants of each point: normal, albedo, emission
     photon_paths: int  # light paths emitted in each configuration; 0: the scene has no photons
-    photon_depth: int  # most hits stored of each
     exposure: float  # the spec's factor on radiance
     max_depth: int  # edges of a path of the images; −1: no limit
     area: float  # of all surfaces, scene units²
-    photon_scale: float  # factor from a photon's power, over the number emitted, to a feature near 1
 
     @classmethod
     def of(cls, spec: SceneSpec, geometry: Geometry, cloud: BasePointCloud, settings: NetworkSettings) -> SceneFrame:
-        """The frame of a scene, for the first `settings.points` points of its cloud (uniform draws, as all are).
-
-        A photon's power is stored over the number emitted, so that more photons are weaker ones. Times that number it
-        is the flux that a single photon would carry, whatever their number; spread over a disc of the scene's radius,
-        and exposed, it is of the order of the scene's brightness under that light.
-        """
+        """The frame of a scene, for the first `settings.points` points of its cloud (uniform draws, as all are)."""
         low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
         used = slice(settings.points)
         emission = _normalise(cloud.emission[used])
@@ -72,11 +61,9 @@ class SceneFrame:
             base=cloud.position[used].astype(np.float32),
             appearance=appearance.astype(np.float32),
             photon_paths=spec.photons.paths,
-            photon_depth=spec.photons.depth,
             exposure=spec.exposure,
             max_depth=spec.transport.max_depth,
             area=float(geometry.areas().sum()),
-            photon_scale=spec.photons.paths * spec.exposure / (math.pi * scale**2),
         )
 
 

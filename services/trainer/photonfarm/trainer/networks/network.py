@@ -165,6 +165,5 @@ class Network(nn.Module):
 
     def project(self, features: Tensor, position: Tensor, present: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
         """Features of points at world positions, (B, P, C), as the mean in each pixel, (B, H, W, C)."""
-        view = inputs.world_to_camera, inputs.depth, inputs.normal
-        kept = footprint(position, present, seen, *view, self.optics)
+        kept = footprint(position, present, seen, inputs.world_to_camera, inputs.depth, self.optics)
         return project_mean(features, kept, self.optics.height, self.optics.width)

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from photonfarm.trainer.networks.inputs import Inputs, PhotonInputs, PointInputs, SceneFrame, require
+from photonfarm.trainer.networks.inputs import Inputs, PointInputs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network, make_descriptors
 from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
 from photonfarm.trainer.runs.settings import NetworkSettings
@@ -147,10 +147,6 @@ class LightTransportLayer(nn.Module):
         return torch.cat([local, shared[:, None].expand_as(local)], dim=-1)
 
 
-PHOTON_NUMBERS = 10
-"""The features of each photon beside its coordinates: direction 3, normal 3, power 3, bounce 1."""
-
-
 class LightTransport(Network):
     """The supplement's network without photons: "Ours (w/o photons)"."""
 
@@ -181,42 +177,19 @@ class LightTransport(Network):
 class LightTransportPhotons(LightTransport):
     """The supplement's network with photons of the current configuration, "Ours (w/ photons)"; the design is ours.
 
-    With `photons = gathered` its inputs include the light gathered from them in windows of the image; and that of the
-    widest window, times albedo, is the image that its output is added to. With `transport` a second PointNet of the
-    same kind over the photons is projected and averaged like the points. No input depends on the number of photons
-    except by its noise: not their power, which is normalised, nor a maximum or mean over them.
+    Its inputs include the light gathered from them in windows of the image; and that of the widest window, times
+    albedo, is the image that its output is added to. No input depends on the number of photons except by its noise.
     """
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
         photon_light = PhotonLight(frame, settings.architecture)
-        transported = settings.photons == "transport"
-        super().__init__(settings, frame, further=WIDTH + (WIDTH if transported else 3 * len(WINDOWS)))
+        super().__init__(settings, frame, further=WIDTH + 3 * len(WINDOWS))
         self.photon_light = photon_light
-        self.photon_depth, self.photon_scale = frame.photon_depth, frame.photon_scale
-        layer = LightTransportLayer(self.coordinate_count + PHOTON_NUMBERS, 0) if transported else None
-        self.photon_transport = layer
 
     def further(self, inputs: Inputs) -> list[Tensor]:
-        """The points' features, and log(1 + gathered light), (B, H, W, 3) each, or the photons' features, 64 wide."""
-        features, photons = super().further(inputs), require(inputs.photons)
-        if self.photon_transport is None:
-            return [*features, *(torch.log1p(radiance) for radiance in self.gather_light(inputs))]
-        where = photons.position, photons.present, photons.seen
-        return [*features, self.project(self.photon_features(photons), *where, inputs)]
+        """The points' features, and log(1 + light gathered in each window), (B, H, W, 3) each."""
+        return [*super().further(inputs), *(torch.log1p(radiance) for radiance in self.photon_light(inputs))]
 
-    def gather_light(self, inputs: Inputs) -> list[Tensor]:
-        """The light of all photons by `PhotonLight`, (B, H, W, 3) for each window."""
-        return self.photon_light(inputs)
-
-    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor | float:
+    def known(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
         """Albedo times the light of the widest window: the photon map's image of diffuse surfaces."""
-        return inputs.albedo * torch.expm1(further[-1]) if self.photon_transport is None else 0.0
-
-    def photon_features(self, photons: PhotonInputs) -> Tensor:
-        """The features of photons by their own layer, (B, K, 64), also of empty slots; ValueError without it."""
-        if self.photon_transport is None:
-            raise ValueError("photons = 'gathered': there is no layer for photons")
-        position, power = self.coordinates(photons.position), photons.power * self.photon_scale
-        bounce = photons.bounce[..., None] / self.photon_depth
-        numbers = torch.cat([position, photons.direction, photons.normal, power, bounce], dim=-1)
-        return self.photon_transport(numbers, numbers.new_zeros(numbers.shape[1], 0), photons.present)
+        return inputs.albedo * torch.expm1(further[-1])

@@ -38,11 +38,11 @@ class PhotonLight:
 
     def __call__(self, inputs: Inputs) -> list[Tensor]:
         """(B, H, W, 3) for each of `photon_map.WINDOWS`."""
-        photons, view = require(inputs.photons), (inputs.world_to_camera, inputs.depth, inputs.normal)
+        photons, view = require(inputs.photons), (inputs.world_to_camera, inputs.depth)
         on_side = arrives_on_seen_side(photons.position, photons.direction, photons.normal, inputs.world_to_camera)
         wanted = photons.present & on_side & (photons.bounce >= self._first) & (photons.bounce <= self._last)
         kept = footprint(photons.position, wanted, photons.seen, *view, self._optics)
-        return gather_light(photons.power * self._exposure, kept, seen_area(self._optics, *view))
+        return gather_light(photons.power * self._exposure, kept, seen_area(self._optics, *view, inputs.normal))
 
 
 WINDOWS = (0.07, 0.17)

@@ -26,7 +26,7 @@ class Optics:
     near: float  # scene units, near plane of window depth
     far: float
     occlusion: Occlusion = "exact"
-    tolerance: float = 1e-3  # ε of the rules on a depth buffer [supplement 1.2]
+    tolerance: float = 1e-3  # ε of the rule on window depth [supplement 1.2]
 
     @classmethod
     def of(cls, spec: SceneSpec, occlusion: Occlusion = "exact", tolerance: float = 1e-3) -> Optics:
@@ -53,82 +53,34 @@ class Footprint:
 
 @torch.no_grad()
 def footprint(
-    position: Tensor,
-    present: Tensor,
-    seen: Tensor,
-    world_to_camera: Tensor,
-    depth: Tensor,
-    normal: Tensor,
-    optics: Optics,
+    position: Tensor, present: Tensor, seen: Tensor, world_to_camera: Tensor, depth: Tensor, optics: Optics
 ) -> Footprint:
     """The kept points, and their pixels.
 
     position (B, P, 3) world, present and seen (B, P) bool, world_to_camera (B, 3, 4), depth (B, H, W) along the forward
-    axis, normal (B, H, W, 3) world. Image coordinates are floored. Points are dropped if they are flagged as absent,
-    behind the camera, outside the image, or occluded. By the rule "exact", points that are not `seen` are occluded,
-    whatever the depth; by the other rules, points that lie behind the rendered depth by more than the tolerance, seen
-    or not, and none where the depth is 0, as nothing was hit there.
+    axis. Image coordinates are floored. Points are dropped if they are flagged as absent, behind the camera, outside
+    the image, or occluded. By the rule "exact", points that are not `seen` are occluded, whatever the depth. By the
+    rule "window" [supplement 1.2], points that lie behind the rendered depth by more than the tolerance, seen or not,
+    and none where the depth is 0, as nothing was hit there.
+
+    Window depth is OpenGL's, w(z) = (1/near − 1/z) / (1/near − 1/far), 0 at the near plane and 1 at the far plane. The
+    supplement's ε = 1e-3 is only sensible there: on linear depth it removes points of slanted surfaces [method 2].
     """
-    in_camera = position @ world_to_camera[:, :, :3].mT + world_to_camera[:, None, :, 3]
-    kept = present & seen if optics.occlusion == "exact" else present
-    sample, point, u, v = _landing(in_camera, kept, optics)
-    if optics.occlusion != "exact":
-        at, surface = in_camera[sample, point], depth[sample, v, u]
-        if optics.occlusion == "surface":
-            facing = (world_to_camera[sample, :, :3] @ normal[sample, v, u, :, None]).squeeze(-1)
-            behind = _behind_surface(at, _through_centres(u.to(at), v.to(at), optics), surface, facing)
-        else:
-            behind = _behind_depth(at[:, 2], surface, optics)
-        in_sight = (surface == 0) | (behind <= optics.tolerance)
-        sample, point, u, v = (index[in_sight] for index in (sample, point, u, v))
-    return Footprint(point=sample * position.shape[1] + point, pixel=(sample * optics.height + v) * optics.width + u)
-
-
-def _landing(in_camera: Tensor, kept: Tensor, optics: Optics) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The kept points (B, P) that lie ahead and in the image: sample, point, column and row, (K,) each."""
-    x, y, z = in_camera.unbind(-1)
-    ahead = kept & (z > 0)
+    is_exact = optics.occlusion == "exact"
+    x, y, z = (position @ world_to_camera[:, :, :3].mT + world_to_camera[:, None, :, 3]).unbind(-1)
+    ahead = (present & seen if is_exact else present) & (z > 0)
     z = torch.where(ahead, z, 1)  # avoids division by zero; dropped below
     column = torch.floor(optics.focal_px * x / z + 0.5 * optics.width)
     row = torch.floor(optics.focal_px * y / z + 0.5 * optics.height)
     inside = ahead & (column >= 0) & (column < optics.width) & (row >= 0) & (row < optics.height)
     sample, point = inside.nonzero(as_tuple=True)
-    return sample, point, column[sample, point].long(), row[sample, point].long()
-
-
-def _behind_depth(z: Tensor, surface: Tensor, optics: Optics) -> Tensor:
-    """The distance of points at depth z behind the rendered surface, (K,); meaningless where the surface is 0.
-
-    Window depth is OpenGL's, w(z) = (1/near − 1/z) / (1/near − 1/far), 0 at the near plane and 1 at the far plane. The
-    supplement's ε = 1e-3 is only sensible there: on linear depth it removes points of slanted surfaces [method 2].
-    """
-    match optics.occlusion:
-        case "window":
-            return (1 / surface - 1 / z) / (1 / optics.near - 1 / optics.far)
-        case "linear":
-            return z - surface
-        case _:
-            return z / surface - 1
-
-
-def _through_centres(u: Tensor, v: Tensor, optics: Optics) -> Tensor:
-    """The points where rays through pixel centres cross depth 1, in camera coordinates, (K, 3)."""
-    x = (u + 0.5 - 0.5 * optics.width) / optics.focal_px
-    y = (v + 0.5 - 0.5 * optics.height) / optics.focal_px
-    return torch.stack([x, y, torch.ones_like(x)], dim=-1)
-
-
-def _behind_surface(point: Tensor, ray: Tensor, surface: Tensor, normal: Tensor) -> Tensor:
-    """The distance of points behind the plane of the rendered surface, over its depth, (K,); all (K, 3) in camera.
-
-    The depth of a pixel is that of its centre. Other points of the same plane in the pixel have another depth, which
-    differs more the more the plane slants, and yet distance 0 from it: so ε can be small, and does not depend on near
-    and far. Nor is a point occluded that is no farther away than the surface. Ours; docs/results/networks.md has
-    figures.
-    """
-    from_eye = (normal * ray).sum(dim=-1)  # < 0: the normal is on the eye's side
-    offset = ((point - ray * surface[:, None]) * normal).sum(dim=-1) * torch.sign(from_eye)
-    return torch.minimum(offset, point[:, 2] - surface) / surface
+    u, v = column[sample, point].long(), row[sample, point].long()
+    if not is_exact:
+        surface = depth[sample, v, u]
+        behind = (1 / surface - 1 / z[sample, point]) / (1 / optics.near - 1 / optics.far)
+        in_sight = (surface == 0) | (behind <= optics.tolerance)
+        sample, point, u, v = (index[in_sight] for index in (sample, point, u, v))
+    return Footprint(point=sample * position.shape[1] + point, pixel=(sample * optics.height + v) * optics.width + u)
 
 
 def project_mean(features: Tensor, kept: Footprint, height: int, width: int) -> Tensor:

@@ -93,7 +93,7 @@ def refuse_biasing(settings: Any) -> Any:
     return settings
 
 
-Occlusion = Literal["exact", "window", "linear", "relative", "surface"]
+Occlusion = Literal["exact", "window"]
 Architecture = Literal[
     "cnn",
     "feature_projection",
@@ -112,7 +112,6 @@ Architecture = Literal[
 Precision = Literal["float32", "tf32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
 EmissionScale = Literal["linear", "log"]
-PhotonUse = Literal["gathered", "transport"]
 Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 Compilation = Literal["off", "on", "graphs"]
@@ -152,11 +151,9 @@ class NetworkSettings(Frozen):
     # with which it takes fewer steps to learn what lights do
     emission: EmissionScale = "linear"  # of the points, over its root mean square; "log" (ours): its logarithm, so that
     # bright windows do not hide lamps from the maxima
-    photons: PhotonUse = "gathered"  # what light_transport_photons makes of them (ours, as it was not published):
-    # irradiance gathered in the image, or "transport": a second Light Transport Layer, over the photons
-    occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by a rule on the depth buffer, of which
-    # "window" is the supplement's; of what it keeps, 23 to 68 % is hidden (docs/results/networks.md)
-    occlusion_tolerance: Positive = 1e-3  # of those rules [S 1.2]
+    occlusion: Occlusion = "exact"  # which points are hidden: as rendered, or by the supplement's rule on the depth
+    # buffer, "window"; of what it keeps, 23 to 68 % is hidden (docs/results/networks.md)
+    occlusion_tolerance: Positive = 1e-3  # of that rule [S 1.2]
     precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case;
     # "tf32" is of NVIDIA's cards alone (docs/results/train_step.md)
     lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
@@ -167,8 +164,6 @@ class NetworkSettings(Frozen):
     def _fits_its_architecture(self) -> Self:
         if self.architecture == "feature_projection" and not self.descriptor:
             raise ValueError("has descriptor = 0; feature_projection projects descriptors, and at least 1 is needed")
-        if self.photons != "gathered" and self.architecture != "light_transport_photons":
-            raise ValueError(f"has photons = {self.photons!r}, which is for light_transport_photons alone")
         return self
 
 

@@ -3,34 +3,33 @@
 
     python experiments/figures.py [--rooms NAME ...] [--work build/experiments/small] [--out docs/results/figures]
 
-Reads WORK/NAME/report/ of experiments that have run. Of each static room it leaves NAME.png: what was trained on,
-prediction, reference and difference [S Figs. 3, 4]. Of the others it leaves NAME-time-METRIC.svg, error over the time
+Reads WORK/NAME/report/ of experiments that have run. Of each static room it leaves NAME.png: reference, prediction and
+difference [S Figs. 3, 4]. Of the others it leaves NAME-time-METRIC.svg, error over the time
 of a frame [S Figs. 5, 6], by MSE and MSSIM; NAME-predictions.png, predictions of several networks above their errors
 [S Fig. 7]; and NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not
-run or whose report is an earlier version's.
+run.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
 import shutil
 import sys
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
 
 from experiments.experiment import HERE, Experiment
 from photonfarm.core.errors import IncompleteError
-from photonfarm.core.pictures import Picture
-from photonfarm.trainer.compare.evaluation_page import COMPARISON, GAP, LINE
-from photonfarm.trainer.report.views import OVERVIEW, colour_difference
-from photonfarm.trainer.report.worst_cases import name_kinds as worst_view
+from photonfarm.core.pictures import GAP, LINE, Picture, draw_sheet
+from photonfarm.trainer.compare.evaluation_page import COMPARISON
+from photonfarm.trainer.report.views import colour_difference
+from photonfarm.trainer.report.worst_cases import name_kinds
 
 ROOMS = [
     "static-bathroom",
@@ -55,7 +54,7 @@ BEFORE, AFTER = "light_transport_photons", "guided_transport"
 VIEWS = 3  # at most, of the first ones
 SIZE = 256  # px of a tile
 COLOURS = 256  # of a figure, which takes a third of the bytes so
-TEXT, TEXT_LINE = 24, 30  # px of letters, and from one line of text to the next
+TEXT = 24  # px of letters
 REFERENCE = "reference"
 
 
@@ -63,18 +62,12 @@ class Report:
     """The pictures of a report: a tile (H, W, 3) for each predictor and each view that it shows, by the view's row."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises IncompleteError where there is no report, or one that does not say what its pictures are of."""
+        """Raises IncompleteError where there is no report."""
         self.folder = folder
         if not (folder / "report.json").is_file():
             raise IncompleteError(f"{folder}: holds no report; `make experiments-small` makes it")
         document = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        shown = document["evaluation"].get("shown")
-        if shown is None:
-            raise IncompleteError(
-                f"{folder}: an earlier version's report, which does not say of which views its pictures are; delete "
-                f"report.json, and `python experiments/run.py {folder.parent.name}` makes it anew "
-                "(runs of an earlier version are trained anew)"
-            )
+        shown = document["evaluation"]["shown"]
         names = [REFERENCE, *(row["name"] for row in document["evaluation"]["rows"])]
         sheet = np.asarray(Image.open(folder / COMPARISON))
         width = (sheet.shape[1] + GAP) // len(names) - GAP
@@ -106,16 +99,15 @@ def draw_error(tile: Picture, reference: Picture) -> Picture:
     return colour_difference(apart)
 
 
-def draw_predictions(report: Report) -> Picture:
-    """A column for the reference and one for each network, with the error below each image."""
-    names = [name for name in COMPARED if name in report.tiles]
+def draw_predictions(report: Report, names: list[str]) -> Picture:
+    """A column for the reference and one for each of some networks, with the error below each image."""
     blank = np.full((SIZE, SIZE, 3), 255, np.uint8)
     rows = []
     for view in report.first:
         reference, *shown = (report.tiles[name][view] for name in (REFERENCE, *names))
         rows.append([reference, *shown])
         rows.append([blank, *(draw_error(tile, reference) for tile in shown)])
-    return make_sheet([REFERENCE, *names], rows, [""] * len(rows))
+    return draw_sheet([REFERENCE, *names], rows, [""] * len(rows), TEXT)
 
 
 def draw_worst_cases(report: Report) -> Picture:
@@ -124,47 +116,19 @@ def draw_worst_cases(report: Report) -> Picture:
     for view in report.worst:
         reference, before, after = (report.tiles[name][view] for name in (REFERENCE, BEFORE, AFTER))
         rows.append([reference, before, draw_error(before, reference), after, draw_error(after, reference)])
-    captions = [worst_view(kinds) for kinds in report.worst.values()]
-    return make_sheet([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, captions)
-
-
-def make_sheet(heads: list[str], rows: list[list[Picture]], captions: list[str]) -> Picture:
-    """Tiles in rows, a head above each column and a caption above each row that has one."""
-    font = ImageFont.load_default(TEXT)
-    wrapped = [_wrap(head, font) for head in heads]
-    y = max(map(len, wrapped)) * TEXT_LINE + GAP
-    step = [SIZE + GAP + (TEXT_LINE if caption else 0) for caption in captions]
-    sheet = Image.new("RGB", (len(heads) * (SIZE + GAP) - GAP, y + sum(step) - GAP), "white")
-    draw = ImageDraw.Draw(sheet)
-    for column, lines in enumerate(wrapped):
-        text = "\n".join(lines)
-        draw.multiline_text((column * (SIZE + GAP), 0), text, fill="black", font=font, spacing=TEXT_LINE - TEXT)
-    for row, caption, height in zip(rows, captions, step, strict=True):
-        draw.text((0, y), caption, fill="black", font=font)
-        for column, tile in enumerate(row):
-            sheet.paste(Image.fromarray(tile), (column * (SIZE + GAP), y + height - SIZE - GAP))
-        y += height
-    return np.asarray(sheet)
-
-
-def _wrap(head: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont) -> list[str]:
-    """The lines of a head that are no wider than a tile, broken after underscores and blanks."""
-    lines = [""]
-    for part in re.findall("[^_ ]+[_ ]?", head):
-        if font.getlength(lines[-1] + part) > SIZE:
-            lines.append("")
-        lines[-1] += part
-    return lines
+    captions = [name_kinds(kinds) for kinds in report.worst.values()]
+    return draw_sheet([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, captions, TEXT)
 
 
 def make_figures(name: str, report: Report, out: Path) -> None:
     """The figures of one room."""
     if Experiment.load(name, "small").part == "static":
-        save(np.asarray(Image.open(report.folder / OVERVIEW)), out / f"{name}.png")
+        save(draw_predictions(report, [name for name in report.tiles if name != REFERENCE][:1]), out / f"{name}.png")
         return
     for metric in METRICS:
         shutil.copy(report.folder / f"time-{metric}.svg", out / f"{name}-time-{metric}.svg")
-    save(draw_predictions(report), out / f"{name}-predictions.png")
+    compared = [name for name in COMPARED if name in report.tiles]
+    save(draw_predictions(report, compared), out / f"{name}-predictions.png")
     save(draw_worst_cases(report), out / f"{name}-worst.png")
 
 

@@ -30,29 +30,12 @@ class Room:
 
     @classmethod
     def read(cls, experiment: Experiment, file: Path, commit: str) -> Self:
-        """Read a room from its report.json, at a commit. Raises IncompleteError for one of an earlier version."""
-        report = json.loads(file.read_text(encoding="utf-8"))
-        if "machine" not in report:
-            raise IncompleteError(
-                f"{file}: an earlier version's, which does not say what it was timed on; delete it, and "
-                f"`python experiments/run.py {experiment.name}` makes it anew"
-            )
-        room = cls.of(experiment, report, commit)
+        """Read a room from its report.json, at a commit. Raises IncompleteError if further seeds were not measured."""
+        room = cls.of(experiment, json.loads(file.read_text(encoding="utf-8")), commit)
         if again := experiment.again():
             evaluated = file.parents[1] / "runs" / again[0].name / EVALUATION
             room.document["further_seeds"] = _read_further_seeds(experiment, evaluated)
         return room
-
-    @classmethod
-    def kept(cls, experiment: Experiment, document: dict[str, Any], file: Path) -> Self:
-        """Read a room from what a tables.json has kept. Raises IncompleteError for what an earlier version kept."""
-        runs = document.get("runs", {}).values()
-        if not {"size", "machine", "commit"} <= document.keys() or not all("settings" in run for run in runs):
-            raise IncompleteError(
-                f"{file}: an earlier version kept {experiment.name}; delete that entry, and `python experiments/run.py "
-                f"{experiment.name}` makes its report anew"
-            )
-        return cls(experiment, document)
 
     @classmethod
     def of(cls, experiment: Experiment, report: Mapping[str, Any], commit: str) -> Self:

@@ -7,8 +7,7 @@ Reads WORK/SIZE/NAME/report/report.json of every experiment that has one, and le
 and tables.png, for the paper's size tables-paper.md and so on. Rooms that the JSON in OUT has, and that have no report
 here, stay, and are said on stderr: they may have run elsewhere. Delete a room's entry, and it goes. What was found out
 stands in experiments/findings.md, with which the page of the small size begins. Exit code 0, 3 where a report's views
-are not independent, or 7 where there is neither a report nor a room that stays, or one of either is of an earlier
-version.
+are not independent, or 7 where there is neither a report nor a room that stays.
 """
 
 from __future__ import annotations
@@ -187,7 +186,7 @@ def make_parser() -> argparse.ArgumentParser:
 def read_rooms(work: Path, size: SizeName, earlier: Path) -> list[Room]:
     """Those that have a report here, and those that an earlier page has.
 
-    Raises IncompleteError where none is, and for what an earlier version has left.
+    Raises IncompleteError where none is.
     """
     try:
         documents = json.loads(earlier.read_text(encoding="utf-8"))["rooms"] if earlier.is_file() else {}
@@ -199,7 +198,7 @@ def read_rooms(work: Path, size: SizeName, earlier: Path) -> list[Room]:
         if report.is_file():
             rooms.append(Room.read(experiment, report, results.commit()))
         elif name in documents:
-            rooms.append(Room.kept(experiment, documents[name], earlier))
+            rooms.append(Room(experiment, documents[name]))
             print(f"{name}: no report in {work}; its rows of {earlier} stay", file=sys.stderr)
     if not rooms:
         raise IncompleteError(f"{work}: holds no report; `make experiments-{size}` makes them")

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import fields
 from functools import partial
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +24,8 @@ from photonfarm.core.records import (
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
-from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
-from photonfarm.store.format.schema import RowKind, output_arrays
-from photonfarm.store.format.shards import NOISY_GUIDES, encode, round_to_8_bits
+from photonfarm.store import Figures, JobRows, SampleRow, SceneStore
+from photonfarm.store.format.schema import RowKind
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})
 
@@ -132,10 +130,6 @@ class Pool:
         self._dealt[what] += 1
         return self._of[what][self._dealt[what] % len(self._of[what])]
 
-    def count(self, what: str) -> int:
-        """How many different ones there are of a kind."""
-        return len(self._of[what])
-
     def save(self, path: Path) -> None:
         """Write all into one .npz file."""
         arrays = {f"halves/{i}": values for i, values in enumerate(self._of["halves"])}
@@ -190,67 +184,8 @@ def in_order(rows: JobRows) -> Iterator[tuple[RowKind, int, SampleRow]]:
                 yield kind, row, sample
 
 
-class EncodedPool:
-    """A pool's contents as they are stored: of each, the bytes of its row in every array, dealt in turn."""
-
-    def __init__(self, pool: Pool, spec: SceneSpec) -> None:
-        photons = [pool.photons() for _ in range(pool.count("photons"))]
-        rows: dict[RowKind, list[Mapping[str, Any]]] = {
-            "sample": [_radiance(pool.halves(), spec) for _ in range(pool.count("halves"))],
-            "view": [
-                view_row(pool.buffers(), pool.visibility()) | _guides(pool.guides())
-                for _ in range(pool.count("buffers"))
-            ],
-            "modification": [
-                {f"photon_{name}": values for name, values in arrays_of(record).items()} for record in photons
-            ],
-        }
-        arrays = output_arrays(spec)
-        self._of = {
-            kind: cycle([{name: encode(arrays[name], values) for name, values in row.items()} for row in of])
-            for kind, of in rows.items()
-        }
-
-    def next(self, kind: RowKind) -> Mapping[str, memoryview]:
-        """The next row of each array of a kind."""
-        return next(self._of[kind])
-
-
 def view_row(buffers: ViewBuffers, visibility: Visibility) -> dict[str, Any]:
     """What is stored of a view beside its guides, by array."""
     seen = {"point_seen": visibility.points, "photon_seen": visibility.photons}
     bits = {name: np.packbits(values, bitorder="little") for name, values in seen.items() if len(values)}
     return arrays_of(buffers) | bits
-
-
-def _guides(guides: Guides) -> dict[str, Any]:
-    return {
-        name: round_to_8_bits(values) if name in NOISY_GUIDES else values for name, values in arrays_of(guides).items()
-    }
-
-
-def _radiance(halves: F32, spec: SceneSpec) -> Mapping[str, F32]:
-    """Half-estimates as they are stored: scaled, where float16 can hold that."""
-    scaled = halves * np.float32(2.0**spec.radiance_exponent)
-    return {"radiance": scaled} if scaled.max() <= np.finfo(np.float16).max else {"radiance_wide": halves}
-
-
-class EncodedWriter(JobWriter):
-    """A JobWriter that is given rows as they are stored: what is left is to write them."""
-
-    def give(self, kind: RowKind, row: int, contents: Mapping[str, memoryview]) -> None:
-        """A row of each array of a kind; its values have been looked at by whoever encoded them."""
-        self._given[kind].add(row)
-        for name, content in contents.items():
-            self._waiting.put((name, row % self._plan.shard_rows, content))
-        self._raise_error()
-
-
-def commit_encoded(scene: SceneStore, job: int, contents: EncodedPool) -> None:
-    """What `commit` does, with rows encoded before."""
-    rows = scene.job_rows(job)
-    with EncodedWriter(scene, rows) as out:
-        for kind, row, _ in in_order(rows):
-            if kind != "modification" or scene.spec.photons.paths:
-                out.give(kind, row, contents.next(kind))
-        out.commit(FIGURES)

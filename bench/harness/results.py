@@ -8,13 +8,14 @@ import os
 import platform
 import re
 import shlex
-import statistics
 import subprocess
 import sys
 from collections.abc import Iterable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
+
+from photonfarm.core.formatting import format_markdown_table
 
 ROOT = Path(__file__).parents[2]
 FOLDER = ROOT / "docs/results"
@@ -97,10 +98,4 @@ def footer(name: str) -> str:
 
 def table(header: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """A Markdown table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(str(cell) for cell in line) + " |" for line in lines)
-
-
-def median_and_mean(values: Sequence[float], digits: int = 1) -> str:
-    """Two figures as "median (mean)"."""
-    return f"{statistics.median(values):.{digits}f} ({statistics.fmean(values):.{digits}f})"
+    return format_markdown_table(header, [[*map(str, row)] for row in rows])

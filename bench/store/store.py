@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from bench.harness import results
-from bench.harness.contents import Contents, EncodedPool, Pool, commit, commit_encoded
+from bench.harness.contents import Contents, Pool, commit
 from bench.harness.processes import Processes, answer
 from bench.harness.scenes import square
 from bench.store import bytes_per_sample
@@ -33,7 +33,6 @@ from bench.store import bytes_per_sample
 BATCH = 32
 VIEW = ("depth", "albedo", "normal", "point_seen", "photon_seen")
 READING = {"ours": "read {}", "checked": "memmaps, {} with checksums"}
-WRITING = {"ours": "write jobs", "encoded": "write jobs, encoded before"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +47,6 @@ class StoreSpeed:
     ratio_from: float
     ratio_to: float
     cpu_ratio: float  # of processor seconds, bare over ours: what the ratio would be if nothing waited for anything
-    cpu_s: float  # processor seconds of one run of one process, ours
 
 
 # -------------------------------------------------------------------------------------------------------- the processes
@@ -125,18 +123,14 @@ def draws(rows: Any, seed: int, batches: int) -> Iterator[list[int]]:
 
 
 def writing(store: Path, scene_id: str, bare: Path, pool: Path) -> dict[str, Callable[..., None]]:
-    """Ways to write a job: through the store, of values or of bytes, or the same sizes under the same names."""
+    """Ways to write a job: through the store, or the same sizes under the same names."""
     from photonfarm.store import Store
 
     scene, contents = Store(store).scene(scene_id), Pool.load(pool)
-    encoded_contents = EncodedPool(contents, scene.spec)
     noise = np.random.default_rng(os.getpid()).integers(0, 256, 1 << 27, np.uint8)  # more than any file
 
     def ours(job: int) -> None:
         commit(scene, job, contents)
-
-    def encoded(job: int) -> None:
-        commit_encoded(scene, job, encoded_contents)
 
     def bare_files(sizes: dict[str, int]) -> None:
         for name, size in sizes.items():
@@ -153,7 +147,7 @@ def writing(store: Path, scene_id: str, bare: Path, pool: Path) -> dict[str, Cal
             os.fsync(descriptor)
             os.close(descriptor)
 
-    return {"bare": bare_files, "ours": ours, "encoded": encoded}
+    return {"bare": bare_files, "ours": ours}
 
 
 # ------------------------------------------------------------------------------------------------------- the comparison
@@ -172,8 +166,7 @@ def row_of(
     ratios = sorted(b[0] / o[0] for b, o in zip(bare, ours, strict=True))
     one, other = (size * processes / 1e6 / statistics.median(wall for wall, _ in side) for side in (bare, ours))
     cpu = statistics.median(b[1] / o[1] for b, o in zip(bare, ours, strict=True))
-    cpu_s = statistics.median(cpu for _, cpu in ours) / processes
-    return StoreSpeed(what, processes, one, other, statistics.median(ratios), ratios[0], ratios[-1], cpu, cpu_s)
+    return StoreSpeed(what, processes, one, other, statistics.median(ratios), ratios[0], ratios[-1], cpu)
 
 
 def measure_reading(store: Path, scene_id: str, bare: Path, options: argparse.Namespace) -> list[StoreSpeed]:
@@ -211,19 +204,18 @@ def measure_writing(scene: Any, pool: Path, bare: Path, options: argparse.Namesp
     seconds(workers, [("ours", first)])
     for name in renamed(scene, first, first):
         (bare / name).parent.mkdir(parents=True, exist_ok=True)
-    found: dict[str, list[StoreSpeed]] = {way: [] for way in WRITING}
+    found: list[StoreSpeed] = []
     for processes in (1, 2):
-        times: dict[str, list[tuple[float, float]]] = {"bare": [], **{way: [] for way in WRITING}}
+        times: dict[str, list[tuple[float, float]]] = {"bare": [], "ours": []}
         for i in range(options.repetitions):
             for way in turned(list(times), i):
                 chosen = [next(jobs) for _ in range(processes)]
                 given = [renamed(scene, first, job) for job in chosen] if way == "bare" else chosen
                 times[way].append(seconds(workers, [(way, one) for one in given]))
         size = sum(renamed(scene, first, first).values())
-        for way, what in WRITING.items():
-            found[way].append(row_of(what, processes, size, times["bare"], times[way]))
+        found.append(row_of("write jobs", processes, size, times["bare"], times["ours"]))
     workers.end()
-    return [row for rows in found.values() for row in rows]
+    return found
 
 
 def renamed(scene: Any, done: int, job: int) -> dict[str, int]:
@@ -268,12 +260,6 @@ def cell(row: bytes_per_sample.StoreSize) -> str:
     return f"{row.bytes_per_sample / 1e3:.0f} kB (÷{row.saving:.1f}), {row.with_guides / 1e3:.0f} kB"
 
 
-def encoding_ms(speeds: list[StoreSpeed]) -> float:
-    """Processor time per sample of what is not there to do for rows encoded before, in one process."""
-    cpu_s = {row.what: row.cpu_s for row in speeds if row.processes == 1}
-    return 1e3 * (cpu_s[WRITING["ours"]] - cpu_s[WRITING["encoded"]]) / BATCH
-
-
 def page(
     speeds: list[StoreSpeed],
     sizes: tuple[list[bytes_per_sample.StoreSize], bytes_per_sample.Whole, int],
@@ -310,13 +296,10 @@ radiance (stored raw) with depth, albedo and normal (compressed).
 
 **Bare** writing: files of the same names and sizes as the job's, each written at once, synced and linked, then their
 folders synced; **store**: a job of {BATCH} samples from its first row to its marker, handed over as fast as it is
-taken. *Write jobs* is all that the store does: a thread checks, scales, rounds to
-float16 and compresses the rows, and another gives them checksums and writes them. *Encoded before* is what the second
-thread and the commit do, given rows whose bytes are ready. The difference, {encoding_ms(speeds):.1f} ms of processor
-time per sample, is the first thread's work; in a worker that is the thread that renders, and [farm.md](farm.md) has the
-share of its time that the store takes (store overhead). MB/s are those of the bytes on the disk, equal
-on all sides. {options.repetitions} runs by turns ({zarr_runs(options)} of zarr-python); medians; ratios of
-neighbouring runs: median (least … greatest).
+taken: it checks, scales, rounds to float16 and compresses the rows in one thread, in a worker the one that renders, and
+another gives them checksums and writes them. [farm.md](farm.md) has the share of a worker's time that the store takes
+(store overhead). MB/s are those of the bytes on the disk, equal on both sides. {options.repetitions} runs by turns
+({zarr_runs(options)} of zarr-python); medians; ratios of neighbouring runs: median (least … greatest).
 
 {results.table(header, lines)}
 
@@ -364,7 +347,7 @@ def run(folder: Path, options: argparse.Namespace) -> tuple[list[StoreSpeed], An
     scene = bytes_per_sample.filled(spec, pool, Request(modifications=options.samples), folder / "read")
     bare_arrays(folder / "read", scene.scene_id, folder / "bare")
     speeds = measure_reading(folder / "read", scene.scene_id, folder / "bare", options)
-    request = Request(modifications=BATCH * (9 * options.repetitions + 1), seed=1)
+    request = Request(modifications=BATCH * (6 * options.repetitions + 1), seed=1)
     scene = bytes_per_sample.planned(spec, request, folder / "write")
     speeds += measure_writing(scene, folder / "pool.npz", folder / "bare-write", options)
     return speeds, sizes, spec

@@ -39,12 +39,6 @@ def test_a_family_that_takes_longer_has_no_error_at_that_time() -> None:
     assert equal_time._format_ratio(placed(50, 0.1), FAMILY) == "all take longer, from 100 ms"
 
 
-def test_one_that_takes_longer_and_is_worse_changes_nothing() -> None:
-    found = interpolate([placed(100, 0.01), placed(200, 0.09)], 150)
-    assert found is not None
-    assert found.first is found.second
-
-
 def test_what_views_share_is_not_in_the_interval() -> None:
     _, low, high = measure_ratio(placed(100, 0.03), interpolate(FAMILY, 100))  # type: ignore[arg-type]
     assert low == pytest.approx(high)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import shutil
+from itertools import product
 from pathlib import Path
 from typing import Any, get_args
 
@@ -13,7 +13,7 @@ import pytest
 
 from experiments import experiment, run
 from experiments.dry_run import Need
-from experiments.experiment import Experiment, SizeName, list_names, merge
+from experiments.experiment import Experiment, Size, SizeName, list_names, merge
 from experiments.paper_tables import format_errors
 from experiments.rooms import Room, format_rooms
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
@@ -29,12 +29,13 @@ EXPECTED += ["night-dining-room", "night-living-room", "night-living-room-2"]
 EXPECTED += ["static-ablation", "static-bathroom", "static-kitchen", "vanishing-living-room-2"]
 
 
-def test_the_experiments_are_all_there() -> None:
+def test_the_experiments_are_all_there_and_others_are_refused() -> None:
     assert list_names() == EXPECTED
+    with pytest.raises(SpecError, match="fixed-dining-room"):
+        Experiment.load("kitchen-sink", "small")
 
 
-@pytest.mark.parametrize("size", get_args(SizeName))
-@pytest.mark.parametrize("name", EXPECTED)
+@pytest.mark.parametrize(("name", "size"), [*product(EXPECTED, get_args(SizeName))])
 def test_an_experiment_s_file_is_right_in_both_sizes(name: str, size: SizeName) -> None:
     found = Experiment.load(name, size)
     runs = {run.name: run.train for run in found.trained()}
@@ -63,11 +64,6 @@ def test_tables_are_merged_as_deep_as_they_go_and_lists_are_replaced() -> None:
         "e": 3,
     }
     assert below["a"]["c"] == {"d": 2}
-
-
-def test_an_unknown_experiment_is_refused_with_those_that_there_are() -> None:
-    with pytest.raises(SpecError, match="fixed-dining-room"):
-        Experiment.load("kitchen-sink", "small")
 
 
 TINY = """
@@ -126,9 +122,6 @@ def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> Non
     assert need.pass_hours == pytest.approx(2 * (3 + 2 * 0.5) / 3600)
     longer = Need.of(with_size(tiny, train={**tiny.size.train, "max_steps": 6}), SampleCosts("0" * 32, 1, 1, 1, 1, 0))
     assert longer.operations == pytest.approx(2 * need.operations)
-    assert need.describe().startswith(
-        "tiny: 12 samples 0.0 core-h; 2 further passes for references 0.0 core-h; 3 runs "
-    )
 
 
 def reports(stages: Stages) -> list[int]:
@@ -186,18 +179,11 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
 
 
 @pytest.mark.parametrize(
-    ("since", "done"),
-    [
-        ("nothing", True),
-        ("it did not end", False),
-        ("other arguments", False),
-        ("an output is missing", False),
-        ("a source is newer", False),
-        ("a source is as old", False),
-    ],
+    "since",
+    ["nothing", "it did not end", "other arguments", "an output is missing", "a source is newer", "a source is as old"],
 )
 def test_a_verb_is_done_until_its_arguments_what_it_is_made_of_or_what_it_made_change(
-    tmp_path: Path, since: str, done: bool
+    tmp_path: Path, since: str
 ) -> None:
     end, *made = (tmp_path / name for name in ("end", "made", "made too"))
     of = [tmp_path / name for name in ("old", "older")]
@@ -211,7 +197,8 @@ def test_a_verb_is_done_until_its_arguments_what_it_is_made_of_or_what_it_made_c
     elif since.startswith("a source"):
         second = end.stat().st_mtime + (since == "a source is newer")
         os.utime(of[1], (second, second))
-    assert _is_done(end, "otherwise" if since == "other arguments" else "as told", made, of) is done
+    asked = "otherwise" if since == "other arguments" else "as told"
+    assert _is_done(end, asked, made, of) is (since == "nothing")
 
 
 def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment, tmp_path: Path) -> None:
@@ -233,16 +220,6 @@ def test_kept_pixels_are_asked_for_with_denoisers_that_come_ready_alone(
     Stages(with_size(tiny, untrained=untrained), tmp_path / "work", workers=1).report()
     assert asked[0] == "report"
     assert ("--kept" in asked) is ("--denoiser" in asked) is kept
-
-
-def test_training_without_a_sample_in_its_time_ends_a_stage(tiny: Experiment, tmp_path: Path) -> None:
-    brief = with_size(
-        tiny, train={**tiny.size.train, "max_seconds": 0.1}, architectures=("light_transport",), seeds=(0,)
-    )
-    stages = Stages(brief, tmp_path / "work", workers=1)
-    stages.write_spec()
-    with pytest.raises(StageError, match="exit code 7"):
-        stages.train()
 
 
 def test_training_that_ends_early_without_an_error_is_not_taken_for_done(
@@ -274,7 +251,6 @@ def trained(experiment: Experiment, folder: Path, step: int) -> Stages:
     ("changes", "said"),
     [
         ({"train": {"decay": 0.5}}, r"decay = 0\.99, and 0\.5"),
-        ({"train": {"max_steps": 4}}, "max_steps = 3, and 4"),
         ({"train": {"preset": "paper-static"}}, "batch = 2, and 128"),
         ({"hold_out": 0.3}, r"hold_out = 0\.4, and 0\.3"),
         ({"changes": {"points": 512}}, "scene_id = "),
@@ -286,16 +262,9 @@ def test_a_run_of_other_settings_is_refused_with_its_folder(
     tiny = with_size(tiny, architectures=("light_transport",), seeds=(0,))
     trained(tiny, tmp_path / "work", step=3).train()
     assert not (tmp_path / "work" / "logs").exists()  # nothing had to be done
-    other = with_size(
-        tiny,
-        **{
-            key: merge(getattr(tiny.size, key), value) if isinstance(value, dict) else value
-            for key, value in changes.items()
-        },
-    )
-    with pytest.raises(StageError, match=said) as refused:
+    other = tiny.model_copy(update={"size": Size.model_validate(merge(tiny.size.model_dump(), changes))})
+    with pytest.raises(StageError, match=rf"work/runs/light_transport was trained with .*{said}"):
         Stages(other, tmp_path / "work", workers=1).train()
-    assert str(tmp_path / "work" / "runs" / "light_transport") in str(refused.value)
 
 
 def test_a_run_keeps_every_commit_that_it_was_trained_at_and_the_report_tells_them(
@@ -312,35 +281,10 @@ def test_a_run_keeps_every_commit_that_it_was_trained_at_and_the_report_tells_th
     stages._tell_commits(report)
     told = json.loads(report.read_text())
     assert told == {"edit_seconds": 0.1, "trained_at": {first.name: ["1234567", "89abcde"], again.name: []}}
-    written = report.stat().st_mtime_ns
-    stages._tell_commits(report)
-    assert report.stat().st_mtime_ns == written
 
 
-def test_a_write_of_commits_or_report_that_is_cut_leaves_what_was_there(
-    tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    stages = Stages(with_size(tiny, architectures=("light_transport",)), tmp_path / "work", workers=1)
-    first, report = stages._runs()[0], tmp_path / "report.json"
-    stages._keep_commit(first)
-    report.write_text(json.dumps({"edit_seconds": 0.1}))
-    files = {file: file.read_bytes() for file in (tmp_path / "work/runs" / first.name / COMMITS, report)}
-    monkeypatch.setattr("bench.harness.results.commit", lambda: "89abcde")
-
-    def cut(file: Path, *_: Any, **__: Any) -> None:
-        file.write_bytes(b"[")
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(Path, "write_text", cut)
-    for write in (lambda: stages._keep_commit(first), lambda: stages._tell_commits(report)):
-        with pytest.raises(OSError, match="No space"):
-            write()
-    assert {file: file.read_bytes() for file in files} == files
-
-
-@pytest.mark.parametrize("workers", ["0", "-1", "two"])
-def test_a_number_of_workers_that_cannot_be_is_wrong_usage(workers: str, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("workers", ["0", "two"])
+def test_a_number_of_workers_that_cannot_be_is_wrong_usage(workers: str) -> None:
     with pytest.raises(SystemExit) as ended:
         run.make_parser().parse_args([f"--workers={workers}"])
     assert ended.value.code == 2
-    assert f"{workers!r} is no number of processes" in capsys.readouterr().err

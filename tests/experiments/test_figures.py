@@ -65,32 +65,13 @@ def test_a_tile_is_that_of_its_row_also_where_a_worst_view_is_among_the_first(fo
             np.testing.assert_allclose(linear(tile), grey(row, column)[0, 0, 0], atol=0.005)
 
 
-def test_the_worst_views_are_captioned_by_what_they_are_the_worst_of(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    laid = []
-    monkeypatch.setattr(figures, "make_sheet", lambda *told: laid.append(told))
-    figures.draw_worst_cases(Report(folder))
-    ((heads, rows, captions),) = laid
-    assert heads == [REFERENCE, BEFORE, "its error", AFTER, "its error"]
-    assert captions == [
-        "worst view of mirrors and clear glass and all pixels",
-        "worst view of specular surfaces",
-        "worst view of near surfaces",
-    ]
-    assert [linear(row[0]).mean() for row in rows] == pytest.approx([0.064, 0.305, 0.022], abs=0.005)
-
-
-def test_a_sheet_has_a_row_of_errors_below_each_of_at_most_three_views(folder: Path) -> None:
-    sheet = figures.draw_predictions(Report(folder))
-    tile = figures.SIZE + figures.GAP
+def test_sheets_have_a_row_for_each_view_and_below_predictions_one_of_errors(folder: Path) -> None:
+    sheet, tile = figures.draw_predictions(Report(folder), list(PREDICTORS)), figures.SIZE + figures.GAP
     assert sheet.shape[1] == (1 + len(PREDICTORS)) * tile - figures.GAP
     assert sheet.shape[0] // tile == 2 * figures.VIEWS
+    assert figures.draw_worst_cases(Report(folder)).shape[0] // tile == 3
 
 
-def test_a_report_that_does_not_say_what_its_pictures_are_of_is_refused(folder: Path) -> None:
-    document = json.loads((folder / "report.json").read_text())
-    del document["evaluation"]["shown"]
-    (folder / "report.json").write_text(json.dumps(document))
-    with pytest.raises(IncompleteError, match="does not say of which views its pictures are"):
-        Report(folder)
+def test_a_folder_without_a_report_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(IncompleteError, match="holds no report"):
+        Report(tmp_path)

@@ -1,14 +1,53 @@
-"""The Markdown page of all scenes measured."""
+"""The Markdown page of all scenes measured: efficiencies, what the chosen settings gain, and details of each scene."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from bench.harness.results import table
 from bench.renderer.peers.chosen import words
-from bench.renderer.peers.plans import BASELINE, PLAN_SECONDS
-from bench.renderer.peers.verdict import verdict
-from bench.renderer.peers.wording import LABELS, SAME_SCENE, Z_LIMIT, figure, mark
+from bench.renderer.peers.plans import BASELINE, FIXED, PEERS, PLAN_SECONDS
+from photonfarm.core.formatting import format_count
+
+Z_LIMIT = 3.5
+SAME_SCENE = 0.05
+LABELS = {
+    "path": "`path`",
+    "path-multijitter": "`path`, multijitter",
+    "ptracer": "`ptracer`",
+    "bdpt-eye": "`bdpt` (0, 0)",
+    "bdpt": "`bdpt` (1, 1)",
+    "chosen": "`bdpt`, chosen",
+    "pyluxcore": "pyluxcore BIDIR",
+}
+
+
+def mark(method: str, row: dict[str, Any]) -> str:
+    """' ‡' where the mean is off beyond chance, ' §' where pyluxcore renders another scene, else nothing."""
+    off, z = abs(row["mean_ratio"]["value"] - 1), abs(row["mean_ratio"]["z"])
+    if not row["finite"]:
+        return " (not finite)"
+    if method == "pyluxcore":
+        return " §" if z > Z_LIMIT and off > SAME_SCENE else ""
+    return " ‡" if z > Z_LIMIT and off > 1e-3 else ""
+
+
+def figure(estimate: dict[str, float]) -> str:
+    """'1.23 ± 0.04', or a dash where there is none: the reference's noise hides the error."""
+    value, error = estimate["value"], estimate["standard_error"]
+    if not math.isfinite(value):
+        return "–"
+    return number(value, 3) + (f" ± {number(error, 1)}" if math.isfinite(error) else "")
+
+
+def number(value: float, digits: int) -> str:
+    """Significant digits without exponents from 0.001 on."""
+    if value == 0 or abs(value) < 1e-3:
+        return f"{value:.{digits}g}"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{round(value, decimals):.{max(0, decimals)}f}"
+
 
 EXPLANATION = """\
 One image of each method at the same {clock} time, {seconds:g} s on {threads}, at {size}² pixels; samples per
@@ -56,7 +95,7 @@ def page(results: list[dict[str, Any]], settings: dict[str, Any], machine: str) 
         pilot=pilot,
         clock=settings["clock"],
         seconds=settings["seconds"],
-        threads=plural(settings["threads"], "thread"),
+        threads=format_count(settings["threads"], "thread"),
         size=settings["size"],
         seeds=settings["seeds"],
         luxcore=settings["versions"].get("pyluxcore", "(absent)"),
@@ -68,11 +107,6 @@ def page(results: list[dict[str, Any]], settings: dict[str, Any], machine: str) 
     measured = f"Measured on {machine}; {versions}; made at commit {commits}.\n"
     parts = [head + text, measured, *summary(results), *verdict(results), *scenes(results)]
     return "\n".join(parts + [line for result in results for line in details(result)])
-
-
-def plural(count: int, noun: str) -> str:
-    """'1 thread', '2 threads'."""
-    return f"{count} {noun}" + ("" if count == 1 else "s")
 
 
 def summary(results: list[dict[str, Any]]) -> list[str]:
@@ -127,3 +161,55 @@ def details(result: dict[str, Any]) -> list[str]:
 def was_piloted(result: dict[str, Any]) -> bool:
     """Whether a pilot chose, which has compiled what it chose."""
     return bool(result["chosen"] and result["chosen"]["pilot_wall_s"] > 0)
+
+
+# ------------------------------------------------------------------------- what the chosen settings gain
+
+PEERS_EXPLAINED = f"""\
+(relMSE × time) of the peer over that of `bdpt`, chosen, above 1 `bdpt` is better; ± as above. The best peer is the one
+over which it gains least, of {"; ".join(LABELS[peer] for peer in PEERS)}; one whose mean is marked as off,
+‡ or §, is left out.
+"""
+
+
+def verdict(results: list[dict[str, Any]]) -> list[str]:
+    """What *chosen* gains over the best unbiased peer, scene by scene, and where it loses to fixed settings."""
+    compared = [result for result in results if result["gains"]]
+    if not compared:
+        return []
+    lines = []
+    for result in compared:
+        best = [best_peer(result, kind) for kind in ("full", "trimmed")]
+        cells = [
+            f"{figure(result['gains'][peer][kind])} ({LABELS[peer]})" if peer else "–"
+            for peer, kind in zip(best, ("full", "trimmed"), strict=True)
+        ]
+        lines.append((result["line"], *cells))
+    won = table(("scene", "all pixels", "trimmed"), lines)
+    return ["## `bdpt`, chosen, over the best unbiased peer\n", won, "", PEERS_EXPLAINED, *losses(compared)]
+
+
+def best_peer(result: dict[str, Any], kind: str) -> str | None:
+    """The peer over which *chosen* gains least, of those whose mean is not marked as off."""
+    gains = {
+        peer: gain["value"]
+        for peer in PEERS
+        if (gain := result["gains"].get(peer, {}).get(kind))
+        and math.isfinite(gain["value"])
+        and not mark(peer, result["rows"][peer])
+    }
+    return min(gains, key=lambda peer: gains[peer], default=None)
+
+
+def losses(results: list[dict[str, Any]]) -> list[str]:
+    """A sentence for each scene and fixed setting of `bdpt` that beats *chosen* by more than the standard error."""
+    lines = []
+    for result in results:
+        for fixed, gains in ((name, gains) for name, gains in result["gains"].items() if name in FIXED):
+            if any(gain["value"] + gain["standard_error"] < 1 for gain in gains.values()):
+                picked = words(result["chosen"])
+                lines.append(
+                    f"- In {result['line']} *chosen*, {picked}, is worse than {LABELS[fixed]}: it has "
+                    f"{figure(gains['full'])} of its efficiency in all pixels, {figure(gains['trimmed'])} trimmed."
+                )
+    return [*lines, ""] if lines else ["No fixed setting of `bdpt` beats *chosen* by more than its error.\n"]

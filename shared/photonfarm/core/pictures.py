@@ -99,11 +99,12 @@ def _bytes(unit: NDArray[np.floating]) -> Picture:
 
 
 GAP = 8  # px between the pictures of a sheet
-LEADING = 4  # px from a line of text to the next, beside the height of its letters
+TEXT, LEADING = 14, 4  # px of letters, and between two lines of them
+LINE = TEXT + LEADING  # px of a line of text
 
 
 def draw_sheet(
-    heads: Sequence[str], rows: Sequence[Sequence[Picture]], captions: Sequence[str], text: int = 14
+    heads: Sequence[str], rows: Sequence[Sequence[Picture]], captions: Sequence[str], text: int = TEXT
 ) -> Picture:
     """Pictures of one size in rows, a head above each column and a caption above each row; letters of `text` px.
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import threading
-import time
 
 import pytest
 
@@ -34,20 +33,6 @@ def test_the_account_is_of_the_jobs_after_the_first() -> None:
     assert found.writer_cpu_s == pytest.approx(0.2)
     assert found.queue_shares == pytest.approx([0.1 / 11.6] * 3)
     assert found.share("rows", "commit") == pytest.approx(1.0 / 11.6)
-
-
-def test_the_ledger_adds_up_what_it_watches() -> None:
-    class Sleeper:
-        def sleep(self, seconds: float) -> str:
-            time.sleep(seconds)
-            return "slept"
-
-    ledger, sleeper = Ledger(), Sleeper()
-    ledger.watch(sleeper, "sleep", "asleep")
-    assert [sleeper.sleep(0.02), sleeper.sleep(seconds=0.03)] == ["slept", "slept"]
-    ledger.copy()
-    assert 0.05 <= ledger.copies[0]["asleep"] < 5.0
-    assert ledger.copies[0]["asleep, cpu"] < 0.05
 
 
 def test_the_ledger_counts_threads_by_their_names(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,11 +75,6 @@ def test_ratios_are_of_neighbouring_runs() -> None:
     assert (found.one, found.two) == (2.0, 3.8)
     assert (found.ratio, found.ratio_from, found.ratio_to) == pytest.approx((1.8, 1.5, 1.9))
     assert found.cpu_ratio == pytest.approx(1.5)
-
-
-def test_processor_time_is_compared_for_the_same_jobs() -> None:
-    one, two = ConcurrentWork(1.0, {1: 4.0, 2: 10.0, 3: 6.0}), ConcurrentWork(2.0, {2: 11.0, 3: 7.0, 4: 100.0})
-    assert pairs.cost_of_company(one, two) == pytest.approx(18 / 16)
 
 
 def test_the_page_has_the_figures_and_their_targets() -> None:

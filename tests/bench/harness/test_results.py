@@ -30,26 +30,13 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_a_footer_names_the_commit(checkout: Path) -> None:
+def test_a_footer_names_the_commit_and_whether_more_is_changed_than_results(checkout: Path) -> None:
     head = git(checkout, "rev-parse", "--short", "HEAD")
+    (checkout / "docs" / "results" / "cost.md").write_text("# Cost\n")
     assert results.commit() == head
     assert f"at commit {head} (" in results.footer("cost")
-
-
-def test_changes_that_are_not_committed_are_told(checkout: Path) -> None:
     (checkout / "code.py").write_text("a = 2\n")
     assert results.commit().endswith(" with uncommitted changes")
-
-
-def test_results_that_are_being_written_are_no_changes(checkout: Path) -> None:
-    (checkout / "docs" / "results" / "cost.md").write_text("# Cost\n")
-    assert results.commit() == git(checkout, "rev-parse", "--short", "HEAD")
-
-
-def test_without_a_repository_the_commit_is_unknown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(results, "FOLDER", tmp_path / "docs" / "results")
-    (tmp_path / "docs" / "results").mkdir(parents=True)
-    assert results.commit() == "unknown"
 
 
 def test_tables_are_written_under_the_name_of_their_page(checkout: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from argparse import Namespace
-
 import numpy as np
 import pytest
 
@@ -29,11 +27,3 @@ def test_a_dark_block_fails() -> None:
     dark = images(1.0, 0.05, 1)
     dark[:, :2, :2] *= 0.8
     assert compare_with_path.verdict(block_z_test(dark, images(1.0, 0.05, 2), blocks=16)) == "FAIL (block)"
-
-
-def test_a_row_has_its_figures() -> None:
-    row = compare_with_path.PathComparison(
-        "glass_caustic", 48, 16, 32768, 8192, 1, 1.0, 8, 3.33, 0.9993, 0.0007, 204.0, "pass"
-    )
-    text = compare_with_path.page([row], Namespace(connections=1, light_ratio=1.0))
-    assert "| glass_caustic | 48² | 16 | 32768 / 8192 | 3.33 | 0.9993 ± 0.0007 | 204 | pass |" in text

@@ -1,6 +1,5 @@
 """Metrics of pairs of images: the metric space, MSE, MSSIM, FLIP, intervals."""
 
-import itertools
 import math
 
 import numpy as np
@@ -38,13 +37,6 @@ def test_the_metric_space_is_clipped_exposed_radiance_to_the_power_of_1_over_2_2
     shown = metric_space(exposed.reshape(1, 1, 2, 3))
     assert shown.dtype == torch.float32
     assert torch.allclose(shown.flatten(), torch.tensor([0, 0, 0.25 ** (1 / 2.2), 1, 1, 1]))
-
-
-def test_arrays_that_may_not_be_written_and_tensors_that_are_learned_are_shown_alike() -> None:
-    grey = np.broadcast_to(np.float32(0.5), (2, 4, 5, 3))
-    learned = torch.full((2, 4, 5, 3), 0.5, requires_grad=True)
-    assert torch.equal(metric_space(grey), metric_space(learned))
-    assert not metric_space(learned).requires_grad
 
 
 def test_what_is_not_a_number_has_no_error_and_is_named() -> None:
@@ -94,7 +86,7 @@ def test_images_are_taken_a_few_at_a_time_and_all_of_them() -> None:
 # --------------------------------------------------------------------------------------------------------- intervals
 
 
-@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 7, 10, 30, 100, 10_000])
+@pytest.mark.parametrize("freedom", [1, 2, 3, 5, 10, 100, 10_000])
 def test_the_quantile_of_students_t_is_that_of_scipy_within_two_thousandths(freedom: int) -> None:
     assert t_975(freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=2e-3)
 
@@ -113,31 +105,6 @@ def test_an_interval_is_students_and_needs_two_groups() -> None:
 # ------------------------------------------------------------------------------------------------------------- MSSIM
 
 
-def _ssim_by_hand(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:
-    """Wang et al. 2004, eq. 13, window by window: (H, W) each."""
-    offset = np.arange(11) - 5
-    weight = np.exp(-(offset[:, None] ** 2 + offset**2) / (2 * 1.5**2))
-    weight /= weight.sum()
-    found = []
-    for top, left in itertools.product(range(x.shape[0] - 10), range(x.shape[1] - 10)):
-        a, b = (image[top : top + 11, left : left + 11] for image in (x, y))
-        mean_a, mean_b = (weight * a).sum(), (weight * b).sum()
-        var_a, var_b = (weight * (a - mean_a) ** 2).sum(), (weight * (b - mean_b) ** 2).sum()
-        both = (weight * (a - mean_a) * (b - mean_b)).sum()
-        luminance = (2 * mean_a * mean_b + 1e-4) / (mean_a**2 + mean_b**2 + 1e-4)
-        found.append(luminance * (2 * both + 9e-4) / (var_a + var_b + 9e-4))
-    return float(np.mean(found))
-
-
-def test_mssim_is_the_formula_window_by_window() -> None:
-    clean = metric_space(_pictures(2, (17, 23), 7))
-    other = metric_space(_noisy(_pictures(2, (17, 23), 7), 0.3, 8))
-    x, y = clean.double().numpy(), other.double().numpy()
-    expected = [np.mean([_ssim_by_hand(a[..., c], b[..., c]) for c in range(3)]) for a, b in zip(x, y, strict=True)]
-    assert mssim(clean, other) == pytest.approx(expected, abs=1e-12)
-    assert min(expected) < 0.9
-
-
 def test_mssim_agrees_with_scikit_image_to_five_digits() -> None:
     metrics = pytest.importorskip("skimage.metrics")
     clean, other = metric_space(_pictures(2, (40, 31), 9)), metric_space(_noisy(_pictures(2, (40, 31), 9), 0.5, 10))
@@ -147,13 +114,6 @@ def test_mssim_agrees_with_scikit_image_to_five_digits() -> None:
         for x, y in zip(clean.numpy(), other.numpy(), strict=True)
     ]
     assert mssim(clean, other) == pytest.approx(expected, abs=1e-5)
-
-
-def test_mssim_agrees_with_pytorch_msssim_to_five_digits() -> None:
-    package = pytest.importorskip("pytorch_msssim")
-    clean, other = metric_space(_pictures(2, (40, 31), 9)), metric_space(_noisy(_pictures(2, (40, 31), 9), 0.5, 10))
-    expected = package.ssim(clean.movedim(-1, 1), other.movedim(-1, 1), data_range=1, size_average=False)
-    assert mssim(clean, other) == pytest.approx(expected.numpy(), abs=1e-5)
 
 
 def test_mssim_is_1_for_equal_images_and_needs_room_for_a_window() -> None:
@@ -182,11 +142,6 @@ def test_flip_is_that_of_a_viewer_who_sees_67_pixels_per_degree() -> None:
     viewer = {"vc": [0.7, 3840.0, 0.7]}
     expected = evaluate(wanted[0].numpy(), shown[0].numpy(), "LDR", applyMagma=False, parameters=viewer)[1]
     assert flip(shown, wanted) == pytest.approx([expected], rel=1e-6)
-
-
-def test_flip_of_black_against_white_is_nearly_1() -> None:
-    black, white = torch.zeros(1, 16, 16, 3), torch.ones(1, 16, 16, 3)
-    assert flip(black, white)[0] > 0.9
 
 
 @pytest.mark.parametrize("metric", [mse, mssim, flip])

@@ -1,27 +1,97 @@
-"""Runs to report on."""
+"""A store with references and runs to report on, made once; tests that change something take a copy."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import pytest
+from analytic_room import analytic_base, analytic_spec
+from analytic_room_samples import commit_job
 
+from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
-from photonfarm.store import SceneReader
+from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.read.find import Query
 from photonfarm.store.read.merge import merge_views
+from photonfarm.trainer.predictors.trained import TrainedRun
+from photonfarm.trainer.report import write_report
+from photonfarm.trainer.report.contents import ReportContents, gather_contents
+from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.loop import train
 
+HOLD_OUT = 0.4
 
-@pytest.fixture
-def measured(scene, commit, tiny, tmp_path):
-    """A store of 16 configurations of two passes, references of all views, and two runs."""
+
+@dataclass(frozen=True)
+class Measured:
+    """16 configurations of two passes of one view, references of all views, and two runs."""
+
+    scene: SceneStore
+    store: Path
+    references: Path
+    runs: Sequence[Path]  # light_transport, denoise_4
+
+    def reader(self) -> SceneReader:
+        """A fresh reader of the scene."""
+        reader = SceneReader(self.store, self.scene.scene_id)
+        reader.refresh()
+        return reader
+
+    def held_out(self, share: float = HOLD_OUT) -> list[int]:
+        """The rows that this share holds out; the two passes of a view follow each other."""
+        reader = self.reader()
+        rows = reader.rows.tolist()
+        return [row for row, held in zip(rows, rows_held_out(reader, rows, share), strict=True) if held]
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory, tiny, filled) -> Callable[..., TrainedRun]:
+    """A run of a few steps with some changes of the settings; equal changes give the same one."""
+    known: dict[str, TrainedRun] = {}
+
+    def make(**changes: Any) -> TrainedRun:
+        if (name := repr(changes)) not in known:
+            folder = tmp_path_factory.mktemp("runs") / changes.get("network", {}).get("architecture", "run")
+            settings: TrainSettings = tiny(**{"max_steps": 4, "hold_out": HOLD_OUT, **changes})
+            train(SceneReader(filled.folder.parent.parent, filled.scene_id), settings, folder)
+            known[name] = TrainedRun.load(folder)
+        return known[name]
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> SceneStore:
+    """The scene of `measured`."""
+    scene = Store(tmp_path_factory.mktemp("measured") / "store", create=True).add(analytic_spec(16, 256))
+    scene.write_base(*analytic_base(scene.spec))
     scene.plan(Request(modifications=16, passes=2), shard_rows=8)
     for job in range(scene.jobs()):
-        commit(scene, job)
-    store, references = scene.folder.parent.parent, tmp_path / "references"
+        commit_job(scene, job)
+    return scene
+
+
+@pytest.fixture(scope="session")
+def measured(filled: SceneStore, trained) -> Measured:
+    store = filled.folder.parent.parent
+    references = store.parent / "references"
     references.mkdir()
-    for key, merged in merge_views(scene, Query()):
+    for key, merged in merge_views(filled, Query()):
         merged.write(references / f"{key}.npz")
-    runs = []
-    for architecture in ("light_transport", "denoise_4"):
-        settings = tiny(max_steps=4, hold_out=0.4, network={"width": 4, "architecture": architecture})
-        train(SceneReader(store, scene.scene_id), settings, tmp_path / architecture)
-        runs.append(tmp_path / architecture)
-    return store, runs, references
+    runs = [trained(network={"width": 4, "architecture": name}) for name in ("light_transport", "denoise_4")]
+    return Measured(filled, store, references, [run.folder for run in runs])
+
+
+@pytest.fixture(scope="session")
+def reported(measured: Measured, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
+    """A report of both runs and a denoiser against references, without times: its figures and its folder."""
+    out, asked = tmp_path_factory.mktemp("report"), {"references": measured.references, "timed": False}
+    return write_report(measured.store, measured.runs, out, denoisers=[("fill-in", 4)], **asked), out
+
+
+@pytest.fixture(scope="session")
+def contents(measured: Measured) -> ReportContents:
+    """Of one run, without references."""
+    first = [TrainedRun.load(measured.runs[0])]
+    return gather_contents(measured.store, first, [], references=None, inception=None, timed=False)

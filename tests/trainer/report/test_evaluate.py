@@ -15,11 +15,11 @@ from PIL import Image
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.core.pictures import display
-from photonfarm.plan.hold_out import are_held_out, rows_held_out
+from photonfarm.plan.hold_out import are_held_out
 from photonfarm.plan.request import Request
 from photonfarm.scene.modification import sample_modification
-from photonfarm.store import SceneReader, SceneStore
-from photonfarm.store.read.merge import MergedView, merge_view
+from photonfarm.store import SceneStore
+from photonfarm.store.read.merge import MergedView
 from photonfarm.trainer.compare.evaluate import compare
 from photonfarm.trainer.compare.evaluation_page import (
     COMPARISON,
@@ -43,83 +43,50 @@ from photonfarm.trainer.predictors.evaluation import (
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.training.loop import train
 
-
-@pytest.fixture
-def store(scene: SceneStore, commit) -> Path:
-    """16 configurations of two passes of one view."""
-    scene.plan(Request(modifications=16, views_per_modification=1, passes=2), shard_rows=8)
-    for job in range(scene.jobs()):
-        commit(scene, job)
-    return scene.folder.parent.parent
+QUICK = {"without_inception": True}
 
 
-@pytest.fixture
-def trained(scene: SceneStore, store: Path, tiny, tmp_path: Path):
-    """Function (name, changes of the settings) → a run of three steps."""
-
-    def make(name: str, **changes) -> TrainedRun:
-        source = SceneReader(store, scene.scene_id)
-        train(source, tiny(**{"max_steps": 3, "hold_out": 0.4, **changes}), tmp_path / name)
-        return TrainedRun.load(tmp_path / name)
-
-    return make
-
-
-@pytest.fixture
-def references(scene: SceneStore, store: Path, tmp_path: Path) -> Path:
-    """All views merged, as `photonfarm store merge` does; of the analytic noise, and far from converged."""
-    reader, folder = SceneReader(store, scene.scene_id), tmp_path / "references"
-    folder.mkdir()
-    for row in reader.refresh().tolist():
-        merge_view(reader, reader.view_row(row)).write(folder / f"{reader.view_key(row).hex()}.npz")
-    return folder
-
-
-def held_out(store: Path, scene: SceneStore, share: float) -> list[int]:
-    source = SceneReader(store, scene.scene_id)
-    rows = source.refresh().tolist()
-    return [row for row, held in zip(rows, rows_held_out(source, rows, share), strict=True) if held]
-
-
-def test_a_network_is_measured_once_on_each_view_that_is_held_out_by_its_first_sample(
-    scene: SceneStore, store: Path, trained, references: Path
-) -> None:
-    run, rows = trained("run"), held_out(store, scene, 0.4)
-    found = compare(store, [run], references=references)
+def test_a_network_is_measured_once_on_each_view_that_is_held_out_by_its_first_sample(measured, trained) -> None:
+    run, rows = trained(), measured.held_out()
+    found = compare(measured.store, [run], references=measured.references)
     (row,) = found.rows
     assert found.measured == tuple(rows[::2]), "the two passes of a view follow each other"
     assert found.samples == len(rows) // 2 == len(row.held_out.per_sample) == len(row.held_out.units)
     assert found.units == row.held_out.error.count == row.metrics.images == len(rows) // 2
-    assert found.references == References(len(rows) // 2, 2 * 2 * scene.spec.transport.half_spp, 1 / 4)
+    half_spp = measured.scene.spec.transport.half_spp
+    assert found.references == References(len(rows) // 2, 2 * 2 * half_spp, 1 / 4)
     assert (row.metrics.fid is None) == (find_weights() is None)
     assert row.metrics.flip.estimate.mean > 0
     assert 0 < row.seconds.low <= row.seconds.median <= row.seconds.high < 10
     assert found.document()["rows"][0]["network_seconds_range"] == [row.seconds.low, row.seconds.high]
 
 
-def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(
-    scene: SceneStore, store: Path, trained, references: Path
-) -> None:
+def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(measured, trained) -> None:
     """What is shown as it is, against references read by hand."""
-    reader = SceneReader(store, scene.scene_id)
-    reader.refresh()
-    found = compare(store, [trained("run")], [("none", 1)], references=references, most=3)
-    rows = held_out(store, scene, 0.4)[::2][:3]
-    exposure = scene.spec.exposure
-    images = [exposure * reader.read(row).radiance[0] for row in rows]
-    wanted = [MergedView.read(references / f"{reader.view_key(row).hex()}.npz") for row in rows]
-    halves = (np.array([exposure * getattr(of, half) for of in wanted], np.float32) for half in ("half_a", "half_b"))
+    found = compare(measured.store, [trained()], [("none", 1)], references=measured.references, most=3, **QUICK)
+    reader, rows = measured.reader(), measured.held_out()[::2][:3]
+    images = [reader.read(row).radiance[0] for row in rows]
+    wanted = [MergedView.read(measured.references / f"{reader.view_key(row).hex()}.npz") for row in rows]
+    halves = (np.array([getattr(of, half) for of in wanted], np.float32) for half in ("half_a", "half_b"))
     expected = mse(metric_space(np.array(images, np.float32)), *map(metric_space, halves), having_seen_a=True)
+    assert reader.spec.exposure == 1
     assert found.rows[1].name == "none 1/1"
     assert found.rows[1].metrics.mse.values == pytest.approx(expected.tolist(), rel=1e-5)
 
 
-def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
-    store: Path, trained, references: Path, tmp_path: Path
-) -> None:
+def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured, trained, tmp_path: Path) -> None:
     pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
-    runs = [trained("one", network={"width": 4, "architecture": "denoise_4"}), trained("two", seed=1)]
-    named = ["--store", store, "--references", references, "--run", runs[0].folder, "--run", runs[1].folder]
+    runs = [TrainedRun.load(measured.runs[1]), trained(seed=1)]
+    named = [
+        "--store",
+        measured.store,
+        "--references",
+        measured.references,
+        "--run",
+        runs[0].folder,
+        "--run",
+        runs[1].folder,
+    ]
     arguments = ["evaluate", *named, "--denoiser", "oidn", "--denoiser", "fill-in", "--kept", 4, "--samples", 3]
     result = CliRunner().invoke(umbrella, [str(a) for a in (*arguments, "--inception", tmp_path / "none")])
     assert isinstance(result.exception, StoreError), "weights that are named must be there"
@@ -145,30 +112,25 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(
     assert np.array_equal(*pictures)
 
 
-def test_without_inception_all_else_is_measured(store: Path, trained, references: Path) -> None:
-    run = trained("run").folder
-    arguments = ["evaluate", "--store", store, "--references", references, "--run", run, "--samples", 5]
-    both = []
-    for more in ([], ["--without-inception"]):
-        CliRunner().invoke(umbrella, [*map(str, arguments), *more], catch_exceptions=False)
-        (row,) = json.loads((run / EVALUATION).read_text())["rows"]
-        both.append(row["metric_space"])
-    full, quick = both
-    assert quick["fid"] is None
-    assert quick["kid"] is None
-    assert {name: full[name] for name in ("mse", "mssim")} == {name: quick[name] for name in ("mse", "mssim")}
+def test_without_inception_all_else_is_measured(measured, trained) -> None:
+    full, quick = (
+        compare(measured.store, [trained()], references=measured.references, most=5, **how).rows[0].metrics
+        for how in ({}, QUICK)
+    )
+    assert quick.fid is quick.kid is quick.feature_l1 is None
+    assert (full.mse, full.mssim) == (quick.mse, quick.mssim)
 
 
-def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references: Path) -> None:
+def test_the_foot_says_what_the_figures_cannot(measured) -> None:
     """One half A of a view of 2 passes is a quarter of its reference."""
-    runs = [trained("run", network={"width": 4, "architecture": "denoise_4"})]
-    found = compare(store, runs, references=references, most=4)
-    foot = format_evaluation(found).split("\n\n")[-1]
+    runs = [TrainedRun.load(measured.runs[1])]
+    found = compare(measured.store, runs, references=measured.references, most=4)
+    head, _, foot = format_evaluation(found).split("\n\n")
+    assert head.startswith("analytic: 4 held-out views of 4 configurations, one sample of each; noise")
     assert f"references: of {found.references.views} views, of {found.references.spp} samples per pixel" in foot
     assert f"or more; intervals over their {found.units} configurations; of so few they are wide" in foot
     assert "not converged, which takes 4096" in foot
     assert "denoisers: up to 25.0% of a reference is the half A that they were given" in foot
-    assert "which flatters them in the columns from MSSIM on; out of both MSE it is taken" in foot
     assert "nor is rendering the 1/k of the pixels that denoisers are given" in foot
     if find_weights() is not None:
         assert f"FID of {found.references.views} images: below 2048" in foot
@@ -177,19 +139,13 @@ def test_the_foot_says_what_the_figures_cannot(store: Path, trained, references:
     assert "no weights of the Inception network are installed" in list_notes(bare)[-1]
     converged = replace(found, references=replace(found.references, spp=4096))
     assert list_notes(converged)[1].endswith("; converged")
-    head = format_evaluation(found).split("\n\n")[0]
-    assert head.startswith("analytic: 4 held-out views of 4 configurations, one sample of each; noise")
 
 
-def test_the_pictures_stand_side_by_side_in_one_exposure(
-    scene: SceneStore, store: Path, trained, references: Path
-) -> None:
+def test_the_pictures_stand_side_by_side_in_one_exposure(measured, trained) -> None:
     """Each 256 pixels wide, 8 apart, below a line of text of 18: the target, then what was given as it is."""
-    reader = SceneReader(store, scene.scene_id)
-    reader.refresh()
-    run = trained("run")
-    for folder, first in ((None, "radiance"), (references, "reference")):
-        found = compare(store, [run], [("none", 1)], references=folder, most=5)
+    reader, run = measured.reader(), trained()
+    for folder, first in ((None, "radiance"), (measured.references, "reference")):
+        found = compare(measured.store, [run], [("none", 1)], references=folder, most=5, **QUICK)
         sheet = draw_comparison(found)
         assert sheet.shape[1] == 3 * 256 + 2 * 8
         assert len({reader.modification_key(target.row) for target in found.shown}) == len(found.shown) == 4
@@ -199,24 +155,20 @@ def test_the_pictures_stand_side_by_side_in_one_exposure(
             radiance = reader.read(target.row).radiance
             wanted = radiance.mean(axis=0)
             if first == "reference":
-                wanted = MergedView.read(references / f"{reader.view_key(target.row).hex()}.npz").mean
+                wanted = MergedView.read(measured.references / f"{reader.view_key(target.row).hex()}.npz").mean
             for picture, image in zip(shown, (wanted, radiance[0]), strict=True):
-                assert np.abs(picture.astype(int) - display(image, scene.spec.exposure)).max() <= 1
+                assert np.abs(picture.astype(int) - display(image, reader.spec.exposure)).max() <= 1
 
 
-def test_a_chosen_row_is_shown_once_and_the_document_says_which_row_each_picture_is_of(
-    scene: SceneStore, store: Path, trained, references: Path
-) -> None:
-    run = trained("run")
-    first = compare(store, [run], references=references, without_inception=True).document()["shown"]
-    other = next(row for row in held_out(store, scene, 0.4)[::2] if row not in first)
+def test_a_chosen_row_is_shown_once_and_the_document_says_which_row_each_picture_is_of(measured, trained) -> None:
+    how = {"references": measured.references, **QUICK}
+    first = compare(measured.store, [trained()], **how).document()["shown"]
+    other = next(row for row in measured.held_out()[::2] if row not in first)
     chosen = [first[1], other, first[0], other]
-    found = compare(store, [run], references=references, without_inception=True, choose=lambda *_: chosen)
+    found = compare(measured.store, [trained()], choose=lambda *_: chosen, **how)
     assert found.document()["shown"] == [*first, other]
-    assert (
-        draw_comparison(found).shape[0]
-        == draw_comparison(replace(found, shown=found.shown[:4])).shape[0] + 256 + 18 + 8
-    )
+    fewer = draw_comparison(replace(found, shown=found.shown[:4]))
+    assert draw_comparison(found).shape[0] == fewer.shape[0] + 256 + 18 + 8
 
 
 def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
@@ -249,12 +201,12 @@ def test_predictors_are_timed_by_turns_after_rounds_that_do_not_count(make_sourc
         def images(inputs) -> torch.Tensor:
             calls.append(name)
             number = calls.count(name)
-            time.sleep(slower + (0.3 if number <= WARM_ROUNDS or number == WARM_ROUNDS + 5 else 0.01))
+            time.sleep(slower + (0.2 if number <= WARM_ROUNDS or number == WARM_ROUNDS + 5 else 0.005))
             return inputs.albedo
 
         return DevicePredictor(images, torch.device("cpu"))
 
-    predictors = [predictor("a", 0.0), predictor("b", 0.05)]
+    predictors = [predictor("a", 0.0), predictor("b", 0.03)]
     with Feed(make_source(3), tiny(), needs=Needs(points=False)) as feed:
         batch = next(read_batches(feed, [0], 1))
         pairs = [(predict, predict.of_its_own(batch.inputs)) for predict in predictors]
@@ -263,12 +215,12 @@ def test_predictors_are_timed_by_turns_after_rounds_that_do_not_count(make_sourc
         assert torch.equal(pairs[0][1].albedo, kept), "the feed's memory is used again"
     a, b = time_by_turns(pairs)
     assert calls == ["a", "b"] * (WARM_ROUNDS + TIMED_ROUNDS)
-    assert 0.01 <= a.low <= a.median <= a.high < 0.3
-    assert 0.06 <= b.low <= b.median <= b.high < 0.35
+    assert 0.005 <= a.low <= a.median <= a.high < 0.2
+    assert 0.035 <= b.low <= b.median <= b.high < 0.23
 
 
-def test_without_references_only_the_linear_error_is_given(store: Path, trained) -> None:
-    found = compare(store, [trained("run")], most=3)
+def test_without_references_only_the_linear_error_is_given(measured, trained) -> None:
+    found = compare(measured.store, [trained()], most=3)
     assert found.samples == 3
     assert found.references is found.rows[0].metrics is None
     assert "MSSIM" not in format_evaluation(found)
@@ -276,56 +228,51 @@ def test_without_references_only_the_linear_error_is_given(store: Path, trained)
     assert found.document()["rows"][0]["metric_space"] is None
 
 
-def test_how_far_a_row_is_behind_the_first_is_taken_in_pairs(store: Path, trained) -> None:
+def test_how_far_a_row_is_behind_the_first_is_taken_in_pairs(measured, trained) -> None:
     """A run has no difference at all from itself; in general it is that of the means."""
-    run = trained("run")
-    first, same, other = compare(store, [run, run], [("none", 4)]).rows
+    run = trained()
+    first, same, other = compare(measured.store, [run, run], [("none", 4)]).rows
     assert (same.behind(first).mean, same.behind(first).standard_error) == (0, 0)
     assert other.behind(first).mean == pytest.approx(other.held_out.error.mean - first.held_out.error.mean)
     assert other.behind(first).count == first.held_out.error.count
 
 
-def test_a_configuration_file_may_name_one_run_or_several(store: Path, trained, tmp_path: Path) -> None:
-    runs = [str(trained(name).folder) for name in ("one", "two")]
+def test_a_configuration_file_may_name_one_run_or_several(measured, trained, tmp_path: Path) -> None:
+    runs = [str(trained(**changes).folder) for changes in ({}, {"seed": 1})]
     file = tmp_path / "photonfarm.toml"
     for value, wanted in ((json.dumps(runs[0]), 1), (json.dumps(runs), 2)):
         file.write_text(f'run = {value}\n[evaluate]\nkept = 4\ndenoiser = "none"\n')
-        result = CliRunner().invoke(
-            umbrella, ["--config", str(file), "evaluate", "--store", str(store), "--json"], catch_exceptions=False
-        )
-        assert [row["predictor"].split(" (")[0] for row in json.loads(result.stdout)["rows"]] == [
-            *["light_transport"] * wanted,
-            "none 1/4",
-        ]
+        arguments = ["--config", str(file), "evaluate", "--store", str(measured.store), "--json"]
+        result = CliRunner().invoke(umbrella, arguments, catch_exceptions=False)
+        names = [row["predictor"].split(" (")[0] for row in json.loads(result.stdout)["rows"]]
+        assert names == [*["light_transport"] * wanted, "none 1/4"]
 
 
-def test_runs_with_different_shares_are_measured_on_what_none_has_seen(scene: SceneStore, store: Path, trained) -> None:
-    runs = [trained("more", hold_out=0.6), trained("fewer", hold_out=0.3)]
-    fewer, more = (len(held_out(store, scene, share)) // 2 for share in (0.3, 0.6))
-    assert compare(store, runs).samples == fewer < more
+def test_runs_with_different_shares_are_measured_on_what_none_has_seen(measured, trained) -> None:
+    runs = [trained(hold_out=0.6), trained(hold_out=0.3)]
+    fewer, more = (len(measured.held_out(share)) // 2 for share in (0.3, 0.6))
+    assert compare(measured.store, runs).samples == fewer < more
 
 
-def test_what_cannot_be_compared_is_refused(
-    scene: SceneStore, store: Path, trained, references: Path, make_source, tiny, tmp_path: Path
-) -> None:
-    run = trained("run")
+def test_what_cannot_be_compared_is_refused(measured, trained, make_source, tiny, tmp_path: Path) -> None:
     train(make_source(12, moving=False), tiny(max_steps=1), tmp_path / "static")
     static = TrainedRun.load(tmp_path / "static")
-    (tmp_path / "empty").mkdir()
-    for file in references.iterdir():
-        MergedView(1, *np.zeros((4, 8, 8, 3))).write(file)
+    for folder in ("empty", "small"):
+        (tmp_path / folder).mkdir()
+    for file in measured.references.iterdir():
+        MergedView(1, *np.zeros((4, 8, 8, 3))).write(tmp_path / "small" / file.name)
     refused: list[tuple[str, dict[str, Any]]] = [
-        (static.scene_id, {"runs": [run, static]}),
+        (static.scene_id, {"runs": [trained(), static]}),
         ("300", {"denoisers": [("none", 300)]}),
         ("device = 'cuda:99'", {"device": "cuda:99"}),
-        (r"\(8, 8, 3\)", {"references": references}),
+        (r"\(8, 8, 3\)", {"references": tmp_path / "small"}),
     ]
     for named, asked in refused:
         with pytest.raises(SpecError, match=named):
-            compare(store, **{"runs": [run], **asked})
+            compare(measured.store, **{"runs": [trained()], **asked})
     for folder in ("missing", "empty"):
         with pytest.raises(StoreError, match=f"{folder}: "):
-            compare(store, [run], references=tmp_path / folder)
+            compare(measured.store, [trained()], references=tmp_path / folder)
 
 
 def test_a_store_with_nothing_held_out_says_so(scene: SceneStore, commit, make_source, tiny, tmp_path: Path) -> None:

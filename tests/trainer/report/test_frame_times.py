@@ -7,20 +7,19 @@ import pytest
 
 from photonfarm.core.archives import PARTS, FrameCosts, Seconds
 from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
-from photonfarm.trainer.report import write_report as report_of
+from photonfarm.trainer.report import write_report
 from photonfarm.trainer.report.frame_times import assemble_frame_time, count_points
 
 
 def test_frames_are_timed_where_the_renderer_can_and_else_it_is_said_why(measured, tmp_path) -> None:
     """The renderer does not know the analytic scene, and ends with an error."""
-    store, runs, _ = measured
-    figures = report_of(store, runs[:1], tmp_path / "out")
+    figures = write_report(measured.store, measured.runs[:1], tmp_path / "out")
     assert figures["evaluation"]["rows"][0]["frame_seconds"] is None
-    assert "`photonfarm measure-frames` ended with exit code" in (tmp_path / "out/report.md").read_text()
+    assert "`photonfarm measure-frames` ended with exit code" in (tmp_path / "out/report.html").read_text()
 
 
 def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measured) -> None:
-    _, (transport, denoiser), _ = measured
+    transport, denoiser = measured.runs
     parts = {name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 1.6, 0.2, 0.4, 0.8), strict=True)}
     surface = np.zeros((1, 8, 8), np.uint8)
     kept = np.array([1, 4])
@@ -44,7 +43,7 @@ def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measur
 
 
 def test_points_are_charged_as_many_as_a_network_uses(measured) -> None:
-    _, (transport, denoiser), _ = measured
+    transport, denoiser = measured.runs
     runs = [TrainedRun.load(transport), TrainedRun.load(denoiser)]
     assert count_points(runs) is count_points(runs[1:]) is None, "it uses all, or there is none that uses any"
 

@@ -145,7 +145,7 @@ def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: 
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @json_option
 def report(store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, as_json: bool, **asked: Any) -> None:
-    """Write report.html, report.md and report.json: what was learned, at which cost, with pictures.
+    """Write report.html and report.json: what was learned, at which cost, with pictures.
 
     Runs and denoisers are measured as by `evaluate`. Where the renderer is installed, the time of a frame is measured
     from the scene to the image; with references, the worst cases of the first run are found and shown.

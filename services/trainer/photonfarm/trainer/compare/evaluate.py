@@ -27,10 +27,10 @@ from photonfarm.trainer.metrics import (
     Features,
     ImageMetrics,
     Inception,
-    compute_features,
     confidence_interval,
     load_inception,
     measure_images,
+    metric_space,
 )
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.predictors.evaluation import (
@@ -174,14 +174,20 @@ def compare(
     references_by_row = {} if references is None else read_references(references, samples)
     shown = samples.to_show(references_by_row)
     network = load_inception(inception, str(place)) if references_by_row and not without_inception else None
-    test = _Test(store, samples, references_by_row, shown, network, str(place), on_progress or (lambda *_: None))
+    test = _Test(store, samples, references_by_row, network, str(place), on_progress or (lambda *_: None))
     ready = [ReadyPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
+    predictors: list[TrainedRun | ReadyPredictor] = [*runs, *ready]
     test.on_progress("networks are loaded and timed", 0, 0)
-    leading, *others = test.time_by_turns([*runs, *ready])
-    first_of_all = test.measure_one(leading)
-    if choose:
-        shown += [row for row in dict.fromkeys(choose(first_of_all.images, references_by_row)) if row not in shown]
-    rows = [first_of_all.row(shown), *(test.measure_one(other).row(shown) for other in others)]
+    calls = [test.load(predictor) for predictor in predictors]
+    times, predicts = time_by_turns(calls), [predict for predict, _ in calls]
+    del calls  # with the inputs on the device
+    rows: list[PredictorRow] = []
+    for predictor, predict, seconds in zip(predictors, predicts, times, strict=True):
+        held_out, metrics, images = test.measure(predictor, predict, {*references_by_row, *shown})
+        if choose and not rows:
+            shown += [row for row in dict.fromkeys(choose(images, references_by_row)) if row not in shown]
+        kept_images = {row: images[row] for row in shown if row in images}
+        rows.append(PredictorRow(predictor.name, predictor.needs.kept, held_out, seconds, metrics, kept_images))
     return Evaluation(
         scene=spec.name,
         scene_id=first.scene_id,
@@ -197,66 +203,13 @@ def compare(
 
 def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
     first = runs[0]
-    for run in runs:
-        if run.scene_id != first.scene_id:
-            raise SpecError(
-                f"{run.folder}: was trained on scene {run.scene_id}, and {first.folder} on {first.scene_id}; "
-                "runs of one scene can be compared"
-            )
-        if run.exposure != first.exposure:
-            raise SpecError(
-                f"{run.folder}: was trained with exposure {run.exposure:g}, and {first.folder} with "
-                f"{first.exposure:g}; runs of one exposure can be compared"
-            )
-
-
-# --------------------------------------------------------------------------------------------------------- predictors
-
-
-@dataclass(slots=True)
-class _Watched:
-    """A predictor whose images of some rows are kept."""
-
-    predict: Predictor
-    wanted: set[int]
-    on_progress: Callable[[int], object]  # called with the number of samples so far
-    images: dict[int, F32] = field(default_factory=dict)
-    units: dict[int, Key] = field(default_factory=dict)  # of the rows whose images are kept
-    samples: int = 0
-
-    def __call__(self, batch: TrainingBatch) -> F32:
-        images = self.predict(batch)
-        for row, unit, image in zip(batch.rows, batch.units, images, strict=True):
-            if row in self.wanted:
-                self.images[row], self.units[row] = image.copy(), unit
-        self.samples += len(batch.rows)
-        self.on_progress(self.samples)
-        return images
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Timed:
-    """A loaded predictor, and the time it takes for one image."""
-
-    predictor: TrainedRun | ReadyPredictor
-    predict: DevicePredictor
-    seconds: Seconds
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Measured:
-    """A measured predictor, with its images of all rows that may be shown."""
-
-    timed: _Timed
-    held_out: HeldOutErrors
-    metrics: ImageMetrics | None
-    images: dict[int, F32]
-
-    def row(self, shown: Sequence[int]) -> PredictorRow:
-        """Its results, with the images of some rows of the store."""
-        images = {row: self.images[row] for row in shown if row in self.images}
-        predictor, seconds = self.timed.predictor, self.timed.seconds
-        return PredictorRow(predictor.name, predictor.needs.kept, self.held_out, seconds, self.metrics, images)
+    for key in ("scene_id", "exposure"):
+        for run in runs:
+            if getattr(run, key) != getattr(first, key):
+                raise SpecError(
+                    f"{run.folder}: was trained with {key} {getattr(run, key)}, and {first.folder} with "
+                    f"{getattr(first, key)}; runs of one scene and exposure can be compared"
+                )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -266,39 +219,59 @@ class _Test:
     store: str | Path
     samples: HeldOutSamples
     references: Mapping[int, Reference]  # by row
-    shown: list[int]  # rows
     inception: Inception | None
     device: str
     on_progress: MeasureProgress
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def time_by_turns(self, predictors: Sequence[TrainedRun | ReadyPredictor]) -> list[_Timed]:
-        """Load all predictors, and time them by turns on the first sample."""
-        calls = [self._call(predictor) for predictor in predictors]
-        ready = zip(predictors, calls, time_by_turns(calls), strict=True)
-        return [_Timed(predictor, predict, seconds) for predictor, (predict, _), seconds in ready]
-
-    def _call(self, predictor: TrainedRun | ReadyPredictor) -> tuple[DevicePredictor, Inputs]:
+    def load(self, predictor: TrainedRun | ReadyPredictor) -> tuple[DevicePredictor, Inputs]:
+        """Load a predictor, and the inputs of the first sample, on which it is timed."""
         with self._feed(predictor, batch=1) as feed:
             predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
             for batch in read_batches(feed, self.samples.rows, 1):
                 return predict, predict.of_its_own(batch.inputs)
         raise IncompleteError(NONE_COMPLETE)
 
-    def measure_one(self, timed: _Timed) -> _Measured:
-        """Measure a predictor on all samples."""
-        predictor, rows, size = timed.predictor, self.samples.rows, timed.predictor.settings.batch
+    def measure(
+        self, predictor: TrainedRun | ReadyPredictor, predict: Predictor, kept: set[int]
+    ) -> tuple[HeldOutErrors, ImageMetrics | None, dict[int, F32]]:
+        """Measure a predictor on all samples; also returns its images of the `kept` rows."""
+        rows, size = self.samples.rows, predictor.settings.batch
+        images: dict[int, F32] = {}
+        units: dict[int, Key] = {}
+        done = 0
+
+        def watch(batch: TrainingBatch) -> F32:
+            nonlocal done
+            predicted = predict(batch)
+            for row, unit, image in zip(batch.rows, batch.units, predicted, strict=True):
+                if row in kept:
+                    images[row], units[row] = image.copy(), unit
+            done += len(batch.rows)
+            self.on_progress(predictor.name, done, len(rows))
+            return predicted
+
         with self._feed(predictor, batch=size) as feed:
-            watched = _Watched(
-                timed.predict,
-                {*self.references, *self.shown},
-                lambda done: self.on_progress(predictor.name, done, len(rows)),
-            )
-            held_out = measure(watched, read_batches(feed, rows, size))
+            held_out = measure(watch, read_batches(feed, rows, size))
         if self.references:
             self.on_progress(f"{predictor.name} is compared with the references", 0, 0)
-        metrics = self._metrics(watched, having_seen_a=predictor.needs.kept is not None)
-        return _Measured(timed, held_out, metrics, watched.images)
+        compared = [row for row in images if row in self.references]
+        if not compared:
+            return held_out, None, images
+        a, b, mean = (
+            np.stack([getattr(self.references[row], image) for row in compared])
+            for image in ("half_a", "half_b", "mean")
+        )
+        metrics = measure_images(
+            np.stack([images[row] for row in compared]),
+            mean,
+            self.inception,
+            [units[row] for row in compared],
+            (a, b),
+            having_seen_a=predictor.needs.kept is not None,
+            wanted_features=self._features(tuple(compared), mean),
+        )
+        return held_out, metrics, images
 
     def _feed(self, predictor: TrainedRun | ReadyPredictor, *, batch: int) -> Feed:
         settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
@@ -306,27 +279,8 @@ class _Test:
         source = SceneReader(self.store, spec.scene_id, exposure=spec.exposure)
         return Feed(source, settings, needs=predictor.needs)
 
-    def _metrics(self, watched: _Watched, *, having_seen_a: bool) -> ImageMetrics | None:
-        rows = [row for row in watched.images if row in self.references]
-        if not rows:
-            return None
-        mean, *halves = (
-            np.stack([getattr(self.references[row], image) for row in rows]) for image in ("mean", "half_a", "half_b")
-        )
-        images, units = np.stack([watched.images[row] for row in rows]), [watched.units[row] for row in rows]
-        known = None if self.inception is None else self._features(tuple(rows), mean, self.inception)
-        return measure_images(
-            images,
-            mean,
-            self.inception,
-            units,
-            (halves[0], halves[1]),
-            having_seen_a=having_seen_a,
-            wanted_features=known,
-        )
-
-    def _features(self, rows: tuple[int, ...], references: F32, inception: Inception) -> Features:
+    def _features(self, rows: tuple[int, ...], references: F32) -> Features | None:
         """The features of the references of some rows, which are the same for almost all predictors."""
-        if rows not in self.known:
-            self.known[rows] = compute_features(references, inception)
-        return self.known[rows]
+        if self.inception and rows not in self.known:
+            self.known[rows] = self.inception.features(metric_space(references))
+        return self.known.get(rows)

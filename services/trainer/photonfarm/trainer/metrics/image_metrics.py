@@ -46,6 +46,15 @@ class PerImage:
         return cls(estimate, confidence_interval(estimate), tuple(values.tolist()))
 
 
+def format_with_interval(estimate: Estimate | None, digits: int) -> str:
+    """Mean and 95 % interval, as far as they are known."""
+    if estimate is None:
+        return NOT_AVAILABLE
+    interval = confidence_interval(estimate)
+    reach = "" if interval is None else f" ({interval[0]:.{digits}f} … {interval[1]:.{digits}f})"
+    return f"{estimate.mean:.{digits}f}{reach}"
+
+
 def confidence_interval(estimate: Estimate) -> tuple[float, float] | None:
     """The two-sided 95 % interval of an estimate's mean; None if the standard error is unknown."""
     if estimate.standard_error is None:
@@ -107,12 +116,9 @@ HEADLINE_BLOCK = 3
 """The block of the tables' column; Fig. 5 shows all four."""
 
 
-def feature_l1(predictions: Features, references: Features) -> tuple[NDArray[np.float64], ...]:
+def feature_l1(predictions: Features, references: Features) -> list[NDArray[np.float64]]:
     """Mean |f − g| over the C spatially averaged features of each pair of images: (N,) for each of the four blocks."""
-    return tuple(
-        np.abs(f.astype(np.float64) - g).mean(axis=1)
-        for f, g in zip(predictions.blocks, references.blocks, strict=True)
-    )
+    return [np.abs(f.astype(np.float64) - g).mean(axis=1) for f, g in zip(predictions, references, strict=True)]
 
 
 def flip(predictions: Tensor, references: Tensor) -> NDArray[np.float64]:
@@ -222,16 +228,6 @@ class ImageMetrics:
         estimates |= {"fid": Estimate(self.fid.value, None, self.fid.predictions)} if self.fid else {}
         return estimates | ({"kid": self.kid} if self.kid else {})
 
-    def columns(self) -> dict[str, str]:
-        """Column heads and their entries, `n/a` for a metric that is not available."""
-        estimates = self.estimates()
-        heads = {"mse": ("MSE", 5), "mssim": ("MSSIM", 4), "fid": ("FID", 2), "kid": ("KID", 5)}
-        heads |= {HEADLINE: ("Feature L1", 4), "flip": ("FLIP", 4)}
-        return {
-            head: f"{estimates[name].mean:.{digits}f}" if name in estimates else NOT_AVAILABLE
-            for name, (head, digits) in heads.items()
-        }
-
 
 def measure_images(
     predictions: F32 | Tensor,
@@ -248,7 +244,7 @@ def measure_images(
     With two independent `halves` of the references, 2 × (N, H, W, 3), their noise is taken out of the MSE, also for
     predictions that depend on a part of the first; it remains in all other metrics, which have no such estimate.
     Intervals are over images, or over `groups` of them such as configurations, if one is named per image.
-    `wanted_features` are those of the references, if they are known (`compute_features`). Raises ValueError for
+    `wanted_features` are `Inception.features` of the references in the metric space, if known. Raises ValueError for
     shapes that do not match, SpecError for values that are not numbers.
     """
     shown, wanted = metric_space(predictions), metric_space(references)
@@ -263,19 +259,11 @@ def measure_images(
     of_images = each(partial(mse, having_seen_a=having_seen_a), a, b), each(mssim, wanted), each(flip, wanted)
     if inception is None:
         return ImageMetrics(len(shown), *of_images, None, None, None, None)
-    of_shown = inception.features(shown, CHUNK)
-    of_wanted = inception.features(wanted, CHUNK) if wanted_features is None else wanted_features
-    blocks = tuple(PerImage.of(values, groups) for values in feature_l1(of_shown, of_wanted))
-    sets = _measure_sets(of_shown, of_wanted)
+    features = inception.features(shown, CHUNK)
+    if wanted_features is None:
+        wanted_features = inception.features(wanted, CHUNK)
+    blocks = tuple(PerImage.of(values, groups) for values in feature_l1(features, wanted_features))
+    last = features[-1], wanted_features[-1]
+    few = len(shown) < FEWEST
+    sets = None if few else fid(*last), None if few else kid(*last)
     return ImageMetrics(len(shown), *of_images, blocks, *sets, inception.weights)
-
-
-def compute_features(references: F32 | Tensor, inception: Inception) -> Features:
-    """The features that `image_metrics` needs of references (N, H, W, 3), whatever they are compared with."""
-    return inception.features(metric_space(references), CHUNK)
-
-
-def _measure_sets(predictions: Features, references: Features) -> tuple[Fid | None, Estimate | None]:
-    if len(predictions.pool3) < FEWEST:
-        return None, None
-    return fid(predictions.pool3, references.pool3), kid(predictions.pool3, references.pool3)

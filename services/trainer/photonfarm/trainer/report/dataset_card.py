@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ class PlanTotals:
 
     planned: int  # rows
     rows: int  # of committed jobs
-    core_s: float  # processor time of these jobs
+    core_seconds: float  # processor time of these jobs
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -74,7 +74,19 @@ class DatasetCard:
     @property
     def core_s_per_sample(self) -> float:
         """The processor time of a sample of a new view, with buffers, guides and photons; 0 without one."""
-        return self.samples.core_s / self.samples.rows if self.samples.rows else 0.0
+        return self.samples.core_seconds / self.samples.rows if self.samples.rows else 0.0
+
+    @property
+    def source(self) -> str:
+        """Where the scene's description is from."""
+        return self.spec.scene.file or f"built-in {self.spec.scene.builtin}"
+
+    @property
+    def kind(self) -> str:
+        """The variable parts of the scene, in words."""
+        counts = {"objects": len(self.spec.objects), "lights": len(self.spec.lights)}
+        movable = " and ".join(f"{count} {name}" for name, count in counts.items() if count)
+        return f"dynamic: {movable} move" if movable else "static: views alone differ"
 
     def document(self) -> dict[str, Any]:
         """Its part of report.json."""
@@ -83,8 +95,8 @@ class DatasetCard:
             "scene": spec.name,
             "scene_id": spec.scene_id,
             "credits": None if spec.credits is None else spec.credits.model_dump(),
-            "source": spec.scene.file or f"built-in {spec.scene.builtin}",
-            "kind": describe_kind(spec),
+            "source": self.source,
+            "kind": self.kind,
             "width": spec.film.width,
             "height": spec.film.height,
             "exposure": spec.exposure,
@@ -98,10 +110,7 @@ class DatasetCard:
             "requests": list(self.requests),
             "bytes": status.size_bytes,
             "core_seconds": status.core_s,
-            "spent": {
-                kind: {"planned": spent.planned, "rows": spent.rows, "core_seconds": spent.core_s}
-                for kind, spent in self.spent.items()
-            },
+            "spent": {kind: asdict(spent) for kind, spent in self.spent.items()},
             "core_seconds_per_sample": self.core_s_per_sample,
             "redrawn": status.redrawn,
             "workers": self.workers,
@@ -119,16 +128,6 @@ def _sum_by_kind(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanT
         totals[plan.request.kind] = PlanTotals(
             before.planned + plan.samples,
             before.rows + sum(int(used[job - plan.first_job]) for job in done),
-            before.core_s + sum(core_s[job] for job in done),
+            before.core_seconds + sum(core_s[job] for job in done),
         )
     return {kind: spent for kind, spent in totals.items() if spent.rows}
-
-
-def describe_kind(spec: SceneSpec) -> str:
-    """The variable parts of a scene, in words."""
-    if not spec.groups:
-        return "static: views alone differ"
-    movable = [
-        f"{len(groups)} {name}" for name, groups in (("objects", spec.objects), ("lights", spec.lights)) if groups
-    ]
-    return f"dynamic: {' and '.join(movable)} move"

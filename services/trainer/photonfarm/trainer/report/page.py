@@ -1,6 +1,6 @@
-"""The report as one HTML file that needs nothing else, and as Markdown with its plots and pictures in files beside it.
+"""The report as one HTML file that needs nothing else.
 
-Both begin with the verdict: what the first predictor has learned, in words, from numbers alone.
+It begins with the verdict: what the first predictor has learned, in words, from numbers alone.
 
 Shape letters: H W image.
 """
@@ -14,24 +14,19 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonfarm.core.formatting import format_count, format_markdown_table
+from photonfarm.core.formatting import format_count
 from photonfarm.core.page import render_page
 from photonfarm.core.pictures import reduce_image
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page
-from photonfarm.trainer.compare.evaluation_samples import References
-from photonfarm.trainer.metrics import ImageMetrics, confidence_interval
-from photonfarm.trainer.predictors.evaluation import BLOCK, HeldOutErrors
+from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
-from photonfarm.trainer.report.plots import Plot, group_by_kind
-from photonfarm.trainer.report.tables import Table, list_facts, make_tables
+from photonfarm.trainer.report.plots import PlotGroup
+from photonfarm.trainer.report.tables import list_facts, make_tables
 from photonfarm.trainer.report.views import ShownView, write_legend
-
-LARGE = 10  # times less error: from here on it is said as a fraction, below in percent
-
 
 Kind = Literal["better", "mixed", "worse"]
 """Than the mean colour; "mixed": in the mean over all, but not in most configurations, or only by light above white."""
@@ -48,19 +43,18 @@ class Verdict:
     @classmethod
     def of(cls, contents: ReportContents) -> Verdict:
         """The verdict on the first entry, against the mean colour and against the network before its first step."""
-        evaluation, first = contents.evaluation, contents.entries[0]
-        errors, constant = first.row.held_out, contents.baselines.mean_colour
+        entry, colour, unit = contents.entries[0], contents.baselines.mean_colour, contents.evaluation.unit
+        errors, start = entry.row.held_out, contents.baselines.untrained.error.mean
         shown = _compare_shown(errors, contents.baselines.mean_shown_colour)
+        better = group_means(errors.per_sample, errors.units) < group_means(colour.per_sample, colour.units)
+        kind, sentence = _judge(entry.name, errors.error.mean / colour.error.mean, shown, float(better.mean()), unit)
+        learned = f"from {start:.3g} before the first step to {errors.error.mean:.3g}"
         further = (
-            _describe_wins(errors, constant, shown, evaluation.unit),
-            _describe_references(evaluation.references, first.row.metrics),
+            f"Training took its error {learned}; it is below the mean colour’s in {better.sum()} of "
+            f"{format_count(len(better), unit)} that no training saw.",
+            _describe_references(contents),
         )
-        kind, sentence = _judge(first.name, errors, constant, shown, evaluation.unit)
-        return cls(
-            kind,
-            f"{sentence} {_describe_progress(errors.error.mean, contents.baselines.untrained.error.mean)}",
-            further,
-        )
+        return cls(kind, sentence, further)
 
 
 def _compare_shown(errors: HeldOutErrors, constant: HeldOutErrors) -> float:
@@ -69,22 +63,21 @@ def _compare_shown(errors: HeldOutErrors, constant: HeldOutErrors) -> float:
     return max(own, 0.0) / colour if colour > 0 else 0.0
 
 
-def _judge(name: str, errors: HeldOutErrors, constant: HeldOutErrors, shown: float, unit: str) -> tuple[Kind, str]:
-    """The verdict's kind and sentence.
+def _judge(name: str, ratio: float, shown: float, wins: float, unit: str) -> tuple[Kind, str]:
+    """The verdict's kind and sentence, from ratios to the mean colour's error and the share of units that are better.
 
     Of the two ratios it says the larger one: a lamp in view makes the mean colour so wrong that all else looks good.
     """
-    error, colour, better = errors.error.mean, constant.error.mean, _find_better(errors, constant)
-    if error <= 0:
+    if ratio <= 0:
         return "better", f"{name} predicts unseen {unit}s with no error that these views can show."
-    if error >= colour:
-        times = f"{error / colour:.3g} times that of one colour for every pixel"
+    if ratio >= 1:
+        times = f"{ratio:.3g} times that of one colour for every pixel"
         return "worse", f"{name} is worse than the mean colour: on unseen {unit}s its error is {times}."
     if shown >= 1:
-        over_all = f"over all pixels it has {_format_share(error / colour)} that error"
+        over_all = f"over all pixels it has {_format_share(ratio)} that error"
         return "mixed", f"{name} is worse than the mean colour where no light is above white; {over_all}."
-    share = _format_share(max(error / colour, shown))
-    if 2 * better.sum() < len(better):
+    share = _format_share(max(ratio, shown))
+    if wins < 0.5:
         mean = f"only in the mean over all has it {share} that error"
         return "mixed", f"{name} is worse than the mean colour in most unseen {unit}s; {mean}."
     return "better", f"{name} predicts unseen {unit}s with {share} the mean colour’s error."
@@ -92,89 +85,36 @@ def _judge(name: str, errors: HeldOutErrors, constant: HeldOutErrors, shown: flo
 
 def _format_share(ratio: float) -> str:
     """A ratio below 1 as people say it: "1/18 of", "37 % of"."""
-    return f"1/{1 / ratio:.0f} of" if ratio <= 1 / LARGE else f"{100 * ratio:.0f} % of"
+    return f"1/{1 / ratio:.0f} of" if ratio <= 0.1 else f"{100 * ratio:.0f} % of"
 
 
-def _find_better(errors: HeldOutErrors, constant: HeldOutErrors) -> NDArray[np.bool_]:
-    """Whether the error is below the mean colour’s, for each configuration, or view of a static scene."""
-    own, other = (group_means(of.per_sample, of.units) for of in (errors, constant))
-    return own < other
-
-
-def _describe_wins(errors: HeldOutErrors, constant: HeldOutErrors, shown: float, unit: str) -> str:
-    better, ratio = _find_better(errors, constant), errors.error.mean / constant.error.mean
-    units = format_count(len(better), unit)
-    won = f"Its error is below the mean colour’s in {better.sum()} of {units} that no training saw"
-    if not 0 < ratio < 1 or shown == 0:
-        return f"{won}."
-    cut = f"{_format_share(shown)} that of one colour" if shown < 1 else "not below that of one colour"
-    blocks = f"over blocks of {BLOCK} × {BLOCK} pixels and without light above white, such as lamps in view, {cut}"
-    return f"{won}; over all pixels it is {_format_share(ratio)} that error, {blocks}."
-
-
-def _describe_progress(error: float, start: float) -> str:
-    if error <= 0:
-        return f"Before its first step its error was {start:.3g}."
-    if error >= start:
-        return "Training has not lowered its error: it was no larger before the first step."
-    return f"Training has lowered its error to {_format_share(error / start)} what it was before the first step."
-
-
-def _describe_references(references: References | None, metrics: ImageMetrics | None) -> str:
+def _describe_references(contents: ReportContents) -> str:
     """The sentence on references: what the images are compared with, and what came of it."""
+    references, metrics = contents.evaluation.references, contents.entries[0].row.metrics
     if references is None or metrics is None:
         return (
             "There are no references, such as “photonfarm up --reference-views 6” renders: pictures stand beside the "
             "mean of both noisy halves, and the paper’s columns are empty."
         )
-    mse, mssim = metrics.mse.estimate.mean, metrics.mssim.estimate.mean
     return (
-        f"As a display shows it, its MSE against {format_count(references.views, 'reference')} is {mse:.4f}, and its "
-        f"MSSIM {mssim:.3f}."
+        f"As a display shows it, its MSE against {format_count(references.views, 'reference')} is "
+        f"{metrics.mse.estimate.mean:.4f}, and its MSSIM {metrics.mssim.estimate.mean:.3f}."
     )
 
 
 def list_headline(contents: ReportContents) -> list[tuple[str, str]]:
     """Figures of the data and of the first entry, each with what it is."""
-    card, evaluation = contents.card, contents.evaluation
-    error = contents.entries[0].row.held_out.error
+    card, error = contents.card, contents.entries[0].row.held_out.error
     reach = confidence_interval(error)
     spread = "" if reach is None else f" (95 %: {reach[0]:.2g} … {reach[1]:.2g})"
-    rate = 1 / card.core_s_per_sample if card.core_s_per_sample else None
+    rate = f"{1 / card.core_s_per_sample:.1f}" if card.core_s_per_sample else "–"
     return [
         (f"{error.mean:.3g}", f"held-out error{spread}"),
         (f"{contents.baselines.mean_colour.error.mean:.3g}", "error of the mean colour"),
-        (f"{evaluation.noise_floor:.3g}", "noise of the targets, which is not in these errors"),
+        (f"{contents.evaluation.noise_floor:.3g}", "noise of the targets, which is not in these errors"),
         (f"{card.samples.rows}", f"samples of {card.samples.planned} planned, held-out ones among them"),
-        ("–" if rate is None else f"{rate:.1f}", "samples rendered per core-second"),
+        (rate, "samples rendered per core-second"),
     ]
-
-
-def format_markdown(contents: ReportContents, verdict: Verdict, drawn: list[Plot], pictures: str) -> str:
-    """The page; `pictures` is the file of the held-out views, beside it as the plots NAME.svg are."""
-    first, *others = make_tables(contents)
-    card = "\n".join(f"- **{name}**: {value}" for name, value in list_facts(contents))
-    shown = "Targets and predictions, as clip(exposure · I, 0, 1)^(1/2.2)."
-    blocks = [
-        f"# {contents.card.spec.name}",
-        " ".join((f"**{verdict.sentence}**", *verdict.further)),
-        _format_table(first),
-        *(_format_plots(*kind) for kind in group_by_kind(drawn)),
-        f"## Held-out views\n\n{shown}\n\n![targets and predictions]({pictures})",
-        *map(_format_table, others),
-        f"## The data\n\n{card}",
-    ]
-    return "\n\n".join(blocks) + "\n"
-
-
-def _format_plots(title: str, explanation: str, drawn: list[Plot]) -> str:
-    images = "\n".join(f"![{plot.about}]({plot.name}.svg)" for plot in drawn)
-    return f"## {title}\n\n{explanation}\n\n{images}"
-
-
-def _format_table(table: Table) -> str:
-    notes = "".join(f"\n- {note}." for note in table.notes)
-    return f"## {table.title}\n\n{format_markdown_table(table.head, table.rows)}\n{notes}".rstrip()
 
 
 TEMPLATE = Path(__file__).with_name("report.html.j2")
@@ -188,7 +128,9 @@ MOST_LIGHT = 1_600_000
 LARGEST_HALF = np.float32(np.finfo(np.float16).max)
 
 
-def format_page(contents: ReportContents, verdict: Verdict, views: Sequence[ShownView], drawn: list[Plot]) -> str:
+def format_page(
+    contents: ReportContents, verdict: Verdict, views: Sequence[ShownView], plots: Sequence[PlotGroup]
+) -> str:
     """The report's HTML."""
     return render_page(
         TEMPLATE,
@@ -201,7 +143,7 @@ def format_page(contents: ReportContents, verdict: Verdict, views: Sequence[Show
         legend=write_legend(contents),
         light=encode_light(views),
         viewer=VIEWER.read_text(),
-        plots=group_by_kind(drawn),
+        plots=plots,
         tables=make_tables(contents),
         facts=list_facts(contents),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -22,8 +21,6 @@ if TYPE_CHECKING:
 FEW = 3  # places along an axis: fewer show no curve
 FAR_BELOW = 4  # a level so many times below all curves is not drawn: it would press them together
 LINEAR = ("mssim", "kid")  # the metrics whose axes are linear
-NARROW = 20  # times the least value: axes of less have ticks at round numbers…
-TIGHT = 2.5  # …and of less than this at equal distances
 SIZE = (4.6, 4.2)  # inches, of 72 CSS pixels and a third each; the legend's rows are in it
 STYLE: dict[Any, Any] = {  # names of matplotlib
     "svg.fonttype": "none",  # letters stay letters: small files, and the reader's own font
@@ -60,25 +57,22 @@ class Plot:
     svg: bytes
 
 
-CURVES, TIMES = "curve-", "time-"
-"""The beginnings of the names of both kinds of plots."""
+@dataclass(frozen=True, slots=True)
+class PlotGroup:
+    """The plots of one kind, at least one, with what they show."""
 
-OF_CURVES = (
-    "Held-out error of linear radiance × exposure, the targets' noise taken out, over what had been spent by then. "
-    "Hollow points were measured on fewer held-out samples than the last: the others had not been rendered."
-)
-
-
-def group_by_kind(drawn: Sequence[Plot]) -> list[tuple[str, str, list[Plot]]]:
-    """The title, an explanation, and the plots of each kind, without empty kinds."""
-    kinds = (("Metrics over the time of a frame", OF_TIME, TIMES), ("Learning", OF_CURVES, CURVES))
-    groups = [(title, text, [plot for plot in drawn if plot.name.startswith(kind)]) for title, text, kind in kinds]
-    return [each for each in groups if each[2]]
+    title: str
+    explanation: str
+    plots: tuple[Plot, ...]
 
 
-def draw_plots(contents: ReportContents) -> list[Plot]:
+def draw_plots(contents: ReportContents) -> list[PlotGroup]:
     """Learning curves, then each metric over the time of a frame if that is known."""
-    return [*_draw_curves(contents), *_draw_over_time(contents)]
+    groups = [
+        PlotGroup("Learning", OF_CURVES, tuple(_draw_curves(contents))),
+        PlotGroup("Metrics over the time of a frame", OF_TIME, tuple(_draw_over_time(contents))),
+    ]
+    return [group for group in groups if group.plots]
 
 
 def _draw(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
@@ -89,14 +83,33 @@ def _draw(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
     with mpl.rc_context(STYLE):
         figure = Figure(SIZE, layout="constrained")
         FigureCanvasSVG(figure)
-        draw(figure.add_subplot())
+        axes = figure.add_subplot()
+        draw(axes)
+        _set_plain_ticks(axes)
         figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=2)
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     return Plot(name, about, stream.getvalue())
 
 
+def _set_plain_ticks(axes: Axes) -> None:
+    """Write round numbers in full on logarithmic axes of a range so small that few powers of ten lie in it."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
+
+    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
+        if axis.get_scale() == "log" and high < 20 * low:
+            few = high < 2.5 * low
+            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]) if few else LogLocator(subs=(1, 2, 3, 5, 7)))
+            axis.set_major_formatter(lambda value, _: f"{value:g}")
+            axis.set_minor_locator(NullLocator())
+
+
 # -------------------------------------------------------------------------------------------------------------- curves
+
+OF_CURVES = (
+    "Held-out error of linear radiance × exposure, the targets' noise taken out, over what had been spent by then. "
+    "Hollow points were measured on fewer held-out samples than the last: the others had not been rendered."
+)
 
 
 def _draw_curves(contents: ReportContents) -> Iterator[Plot]:
@@ -104,48 +117,52 @@ def _draw_curves(contents: ReportContents) -> Iterator[Plot]:
     on_gpu = " (a GPU's: wall seconds)" if any(story.on_gpu for story in contents.stories) else ""
     axes: tuple[tuple[str, str, Callable[[RunStory, CurvePoint], float]], ...] = (
         ("samples", "samples drawn, repeats counted", lambda _, point: point.draws),
-        ("rendering", "core-seconds of rendering", lambda _, point: point.core_s(per_sample)),
         (
             "all",
             f"core-seconds of rendering and of training{on_gpu}",
-            lambda story, point: point.core_s(per_sample) + story.step_core_s(point),
+            lambda story, point: point.used * per_sample + story.step_core_s(point),
         ),
     )
     for name, label, x in axes:
-        if max(len({x(story, point) for point in story.curve}) for story in contents.stories) < FEW:
-            continue  # everything was rendered before the first validation
-        about = f"Held-out error over {label}"
-        yield _draw(f"{CURVES}{name}", about, partial(_plot_curve, contents=contents, x=x, label=label))
+        if max(len({x(story, point) for point in story.curve}) for story in contents.stories) >= FEW:
+            draw = partial(_plot_curve, contents=contents, x=x, label=label)
+            yield _draw(f"curve-{name}", f"Held-out error over {label}", draw)
 
 
 def _plot_curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, CurvePoint], float], label: str) -> None:
     for story, colour in zip(contents.stories, cycle(COLOURS), strict=False):
         shown = [point for point in story.curve if point.error > 0]
-        places = [(x(story, point), point.error) for point in shown]
-        whole = [place for place, point in zip(places, shown, strict=True) if point.held_out == shown[-1].held_out]
-        axes.plot(
-            *_place_columns(places), color=colour, linewidth=1.2, marker="o", markersize=4, markerfacecolor="white"
-        )
-        axes.plot(*_place_columns(whole), "o", markersize=4, color=colour, label=story.name)
+        whole = [point for point in shown if point.held_out == shown[-1].held_out]
+        for points, look in ((shown, {"linewidth": 1.2, "markerfacecolor": "white"}), (whole, {"linestyle": "none"})):
+            places = [x(story, point) for point in points], [point.error for point in points]
+            named = story.name if points is whole else None
+            axes.plot(*places, marker="o", markersize=4, color=colour, label=named, **look)
     axes.set_yscale("log")
     lowest = axes.get_ylim()[0]
-    levels = {
-        "mean colour": contents.baselines.mean_colour.error.mean,
-        "noise of the targets": contents.evaluation.noise_floor,
-    }
-    for (name, value), style in zip(levels.items(), ("--", ":"), strict=True):
+    levels = (
+        ("mean colour", contents.baselines.mean_colour.error.mean, "--"),
+        ("noise of the targets", contents.evaluation.noise_floor, ":"),
+    )
+    for name, value, style in levels:
         if value > lowest / FAR_BELOW:
             axes.axhline(value, linestyle=style, color="#555555", linewidth=1, label=name)
-    axes.set_xlabel(label)
-    axes.set_ylabel("held-out squared error, linear")
-    _set_plain_ticks(axes)
-
-
-def _place_columns(places: Sequence[tuple[float, float]]) -> tuple[list[float], list[float]]:
-    return [x for x, _ in places], [y for _, y in places]
+    axes.set(xlabel=label, ylabel="held-out squared error, linear")
 
 
 # ------------------------------------------------------------------------------------------------------ over frame time
+
+GROUPS = {
+    "networks": ("D", "none"),
+    "denoisers, trained": ("o", "-"),
+    "denoisers, not trained on the scene": ("s", "--"),
+}
+"""The kinds of predictors, each with its marker and the line that joins them; `OF_TIME` explains them."""
+
+OF_TIME = (
+    "Diamonds are networks, circles denoisers that were trained on the scene, squares denoisers that nobody trained on "
+    "it; bars are 95 % intervals, which FID has none of. Less is better, but for MSSIM. All axes are logarithmic but "
+    "those of MSSIM and KID; bars that would reach below half the least value end at the axis."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,18 +184,8 @@ def _draw_over_time(contents: ReportContents) -> Iterator[Plot]:
             if entry.time is not None and name in entry.estimates
         ]
         if len(points) > 1:
-            about = f"{title} over the time of a frame"
-            yield _draw(f"{TIMES}{name}", about, partial(_scatter, metric=name, points=points))
-
-
-GROUPS = {"networks": ("D", ""), "denoisers, trained": ("o", "-"), "denoisers, not trained on the scene": ("s", "--")}
-"""The kinds of predictors, each with its marker and the line that joins them; `OF_TIME` explains them."""
-
-OF_TIME = (
-    "Diamonds are networks, circles denoisers that were trained on the scene, squares denoisers that nobody trained on "
-    "it; bars are 95 % intervals, which FID has none of. Less is better, but for MSSIM. All axes are logarithmic but "
-    "those of MSSIM and KID; bars that would reach below half the least value end at the axis."
-)
+            draw = partial(_scatter, metric=name, points=points)
+            yield _draw(f"time-{name}", f"{title} over the time of a frame", draw)
 
 
 def _name_group(entry: ReportEntry) -> str:
@@ -189,22 +196,17 @@ def _name_group(entry: ReportEntry) -> str:
 
 
 def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> None:
-    least = min(point.value.mean for point in points)
-    logarithmic = metric not in LINEAR and least > 0
-    floor = least / 2 if logarithmic else -math.inf
-    lowest = math.inf
+    logarithmic = metric not in LINEAR and min(p.value.mean for p in points) > 0
     for name, (marker, line) in GROUPS.items():
         members = sorted((p for p in points if p.group == name), key=lambda p: (p.milliseconds, p.name))
-        places = _place_columns([(p.milliseconds, p.value.mean) for p in members])
-        axes.plot(*places, linestyle=line or "none", color="#999999", linewidth=1)
+        places = [p.milliseconds for p in members], [p.value.mean for p in members]
+        axes.plot(*places, linestyle=line, color="#999999", linewidth=1)
         for p in members:
-            mean = p.value.mean
-            low, high = confidence_interval(p.value) or (mean, mean)
-            lowest = min(lowest, low)
+            reach = p.value.mean - (confidence_interval(p.value) or (p.value.mean,))[0]
             axes.errorbar(
                 p.milliseconds,
-                mean,
-                [[mean - max(low, floor)], [high - mean]],
+                p.value.mean,
+                reach,
                 fmt=marker,
                 color=p.colour,
                 label=p.name,
@@ -213,33 +215,8 @@ def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> Non
             )
     axes.set_xscale("log")
     if logarithmic:
-        axes.set_yscale("log")
-        if lowest < floor:
-            axes.set_ylim(bottom=floor)
-    _set_plain_ticks(axes)
-    axes.set_xlabel("time per frame, ms")
-    axes.set_ylabel(TITLES[metric])
-
-
-# ---------------------------------------------------------------------------------------------------------------- axes
-
-
-def _set_plain_ticks(axes: Axes) -> None:
-    """Write round numbers in full on logarithmic axes of a range so small that few powers of ten lie in it."""
-    from matplotlib.ticker import FixedLocator, MaxNLocator, NullLocator
-
-    for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        if axis.get_scale() == "log" and high < NARROW * low:
-            axis.set_major_locator(
-                MaxNLocator(5, steps=[1, 2, 5, 10])
-                if high < TIGHT * low
-                else FixedLocator(_choose_round_numbers(low, high))
-            )
-            axis.set_major_formatter(lambda value, _: f"{value:g}")
-            axis.set_minor_locator(NullLocator())
-
-
-def _choose_round_numbers(low: float, high: float) -> list[float]:
-    """The numbers 1, 2, 3, 5 and 7, times powers of ten, that lie between two values."""
-    decades = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
-    return [number for decade in decades for one in (1, 2, 3, 5, 7) if low <= (number := one * 10.0**decade) <= high]
+        axes.set_yscale("log", nonpositive="clip")
+        least = min(p.value.mean for p in points)
+        if axes.get_ylim()[0] < least / 2:
+            axes.set_ylim(bottom=least / 2)
+    axes.set(xlabel="time per frame, ms", ylabel=TITLES[metric])

@@ -40,10 +40,6 @@ class CurvePoint:
     error: float  # on held-out samples, noise removed
     held_out: int  # the number of these samples
 
-    def core_s(self, per_sample: float) -> float:
-        """The core-seconds to render the samples used by then, at `per_sample` each."""
-        return self.used * per_sample
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunStory:

@@ -5,7 +5,7 @@ Supplement Figs. 6 to 8. Shape letters: H W image.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +14,7 @@ from photonfarm.core.pictures import Picture, display, display_values, draw_albe
 from photonfarm.core.records import F32, Guides
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
-from photonfarm.trainer.report.worst_cases import ALL, WorstCase
-from photonfarm.trainer.report.worst_cases import name_kinds as worst_view
+from photonfarm.trainer.report.worst_cases import ALL, WorstCase, name_kinds
 
 LARGEST = 0.25  # difference in the metric space that is drawn brightest
 
@@ -63,9 +62,11 @@ def choose_views(contents: ReportContents) -> list[ShownView]:
     """The views with an image by the first predictor: that of median error first, so that no choice flatters."""
     there = contents.entries[0].row.shown
     views = [_make_view(contents, target) for target in contents.evaluation.shown if target.row in there]
-    median = sorted(views, key=lambda view: view.mse)[(len(views) - 1) // 2 :][:1]
-    first = [replace(view, caption=write_caption(contents.worst, view.row, is_median=True)) for view in median]
-    return [*first, *(view for view in views if view not in median)]
+    if not views:
+        return []
+    median = sorted(views, key=lambda view: view.mse)[(len(views) - 1) // 2]
+    first = replace(median, caption=write_caption(contents.worst, median.row, is_median=True))
+    return [first, *(view for view in views if view is not median)]
 
 
 def _make_view(contents: ReportContents, target: Target) -> ShownView:
@@ -87,10 +88,10 @@ def _make_view(contents: ReportContents, target: Target) -> ShownView:
     return ShownView(target.row, write_caption(contents.worst, target.row), against, tuple(images), inputs, mse)
 
 
-def write_caption(worst: Sequence[WorstCase], row: int, *, is_median: bool = False) -> str:
+def write_caption(worst: tuple[WorstCase, ...], row: int, *, is_median: bool = False) -> str:
     """What a view is shown for, and its row; one of median error may still be the worst of some kinds of pixels."""
     kinds = [case.kind for case in worst if case.row == row and not (is_median and case.kind == ALL)]
-    parts = ["view of median error"] * is_median + ([worst_view(kinds)] if kinds else []) + [f"row {row}"]
+    parts = ["view of median error"] * is_median + ([name_kinds(kinds)] if kinds else []) + [f"row {row}"]
     text = "; ".join(parts)
     return text[0].upper() + text[1:]
 
@@ -112,25 +113,21 @@ def make_light_layer(name: str, caption: str, exposed: F32) -> Layer:
 
 
 def _list_inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
-    if row not in contents.inputs:
-        return
     buffers, guides = contents.inputs[row]
     yield Layer("albedo", "albedo", draw_albedo(buffers.albedo))
     yield Layer("normal", "normal", draw_normal(buffers.normal))
     yield Layer("depth", "depth", draw_depth(buffers.depth))
     if guides is not None:
-        yield from _list_guides(guides, contents.card.spec.exposure)
+        yield from _list_guides(guides, np.float32(contents.card.spec.exposure))
 
 
-def _list_guides(guides: Guides, exposure: float) -> Iterator[Layer]:
+def _list_guides(guides: Guides, exposure: np.float32) -> Iterator[Layer]:
     for field, name in OF_GUIDES.items():
         values: F32 = getattr(guides, field)
         if field in RADIANCE:
-            layer = make_light_layer(name, name, np.float32(exposure) * values)
+            layer = make_light_layer(name, name, exposure * values)
         else:
-            layer = Layer(
-                name, name, draw_albedo(values if values.ndim == 3 else np.repeat(values[..., None], 3, axis=2))
-            )
+            layer = Layer(name, name, draw_albedo(np.broadcast_to(np.atleast_3d(values), (*values.shape[:2], 3))))
         if layer.picture.std() > VARIED:
             yield layer
 
@@ -152,39 +149,3 @@ def colour_difference(difference: F32) -> Picture:
     shades = mpl.colormaps["magma"](np.clip(difference / LARGEST, 0, 1), bytes=True)
     picture: Picture = np.ascontiguousarray(shades[..., :3])
     return picture
-
-
-OVERVIEW = "overview.png"
-WIDTH = 192  # px, of each picture
-GAP = 6  # px between them
-TITLE = 26  # px, the height of the line above them
-LAYERS = 4  # of each view: noisy half, prediction, target, difference
-
-
-def draw_overview(views: Sequence[ShownView]) -> Picture:
-    """The views as rows, best first, with titles above; small images are enlarged by Lanczos' filter."""
-    ordered = sorted(views, key=lambda view: view.mse)
-    lines = [np.concatenate([_add_frame(layer.picture) for layer in view.images[:LAYERS]], axis=1) for view in ordered]
-    sheet = np.concatenate(lines)[:-GAP, :-GAP]
-    return np.concatenate([_draw_titles([layer.name for layer in ordered[0].images[:LAYERS]], sheet.shape[1]), sheet])
-
-
-def _draw_titles(titles: Sequence[str], width: int) -> Picture:
-    """A line of titles, each at the left of its column."""
-    from PIL import Image, ImageDraw, ImageFont
-
-    line = Image.new("RGB", (width, TITLE), "white")
-    for column, title in enumerate(titles):
-        left = column * (width + GAP) // len(titles)
-        ImageDraw.Draw(line).text((left, 3), title, "#222222", ImageFont.load_default(size=16))
-    return np.asarray(line)
-
-
-def _add_frame(picture: Picture) -> Picture:
-    """The picture at the width of the columns, with a white margin to the right and below."""
-    from PIL import Image
-
-    height = round(WIDTH * picture.shape[0] / picture.shape[1])
-    scaled = Image.fromarray(picture).resize((WIDTH, height), Image.Resampling.LANCZOS)
-    framed: Picture = np.pad(np.asarray(scaled), ((0, GAP), (0, GAP), (0, 0)), constant_values=255)
-    return framed

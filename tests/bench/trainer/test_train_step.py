@@ -8,7 +8,7 @@ from photonfarm.trainer.runs.settings import make_preset
 
 
 def test_every_network_takes_its_steps_and_its_parts_are_timed(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train_step, "SAMPLES", 16)
+    monkeypatch.setattr(train_step, "SAMPLES", 32)
     where = tmp_path, filled(resized(16, 64), tmp_path)
     settings = make_preset("small", network={"width": 4, "points": 64})
     chosen = ("light_transport_photons", "guided_transport_photons", "denoise_4")

@@ -35,20 +35,24 @@ def decode(data: bytes, what: str, *, raw: bool = False) -> Image:
     is_light = data.startswith(_OF_FLOATS)
     try:
         if is_light or (data.startswith(b"\x89PNG") and data[24:25] == b"\x10"):
-            values = _by_mitsuba(data)  # of which Pillow keeps 8 bits
+            values = _decode_by_mitsuba(data)  # of which Pillow keeps 8 bits
         else:
             with Pillow.open(io.BytesIO(data)) as image:
-                values, is_light = _by_pillow(image), image.mode == "F"
+                is_light = image.mode == "F"
+                values = np.asarray(image if image.mode[0] in "IF" else image.convert("RGBA"), np.float32)
+                values = values / np.float32({"F": 1, "I": 65535}.get(image.mode[0], 255))
     except (UnidentifiedImageError, RuntimeError) as error:  # which name addresses in memory and temporary files
         raise SpecError(f"{what}: is not a readable image: its format is not known, or it is cut off") from error
     except (OSError, ValueError, SyntaxError) as error:
         raise SpecError(f"{what}: is not a readable image: {error}") from error
+    if values.ndim == 2:
+        values = np.dstack([values, values, values, np.ones_like(values)])
     if is_light and not raw:
         values[..., :3] = encode(values[..., :3])
     return values
 
 
-def _by_mitsuba(data: bytes) -> Image:
+def _decode_by_mitsuba(data: bytes) -> Image:
     from photonfarm.renderer.scene.loading import threads_to_read_with
 
     with tempfile.NamedTemporaryFile() as file, threads_to_read_with():  # its streams of memory have no end
@@ -57,13 +61,6 @@ def _by_mitsuba(data: bytes) -> Image:
         image = mi.Bitmap(mi.FileStream(file.name))
         made = image.convert(mi.Bitmap.PixelFormat.RGBA, mi.Struct.Type.Float32, image.srgb_gamma())
     return np.array(made, np.float32)
-
-
-def _by_pillow(image: Pillow.Image) -> Image:
-    if image.mode[0] not in "IF":
-        return np.asarray(image.convert("RGBA"), np.float32) / np.float32(255)
-    grey = np.asarray(image, np.float32) / np.float32(1 if image.mode == "F" else 65535)
-    return np.dstack([grey, grey, grey, np.ones_like(grey)])
 
 
 def linear(encoded: Image) -> Image:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from photonfarm.renderer.tools.importing.changes import Changes
@@ -32,15 +33,9 @@ class Mesh:
     def part(self, faces: NDArray[np.bool_]) -> Mesh:
         """The mesh of some of its faces, a mask (F,)."""
         used, corner = np.unique(self.faces[faces], return_inverse=True)
-        return self._take(used, faces, corner.reshape(-1, 3))
-
-    def _take(self, vertices: NDArray[Any], faces: NDArray[np.bool_], corners: NDArray[Any]) -> Mesh:
-        """The mesh of some vertices and faces; `corners` are the faces, by the numbers that vertices have then."""
-        normals, uv = (None if values is None else values[vertices] for values in (self.normals, self.uv))
-        attributes = {
-            name: values[faces if name.startswith("face_") else vertices] for name, values in self.attributes.items()
-        }
-        return Mesh(self.vertices[vertices], corners.astype(np.uint32), normals, uv, attributes)
+        normals, uv = (None if values is None else values[used] for values in (self.normals, self.uv))
+        attributes = {name: of[faces if name.startswith("face_") else used] for name, of in self.attributes.items()}
+        return Mesh(self.vertices[used], corner.reshape(-1, 3).astype(np.uint32), normals, uv, attributes)
 
     def transform(self, matrix: Floats) -> Mesh:
         """The mesh under an affine map (4, 4); where that mirrors, faces turn so that their fronts stay fronts."""
@@ -52,8 +47,8 @@ class Mesh:
     def usable(self, what: str, changes: Changes, *, smooth: bool = True) -> Mesh:
         """What of the mesh renders, without normals unless `smooth`; what was wrong with it is said of `what`.
 
-        Faces without an area or with corners that are no numbers are left out. Where a normal is zero or no number,
-        its faces get their own.
+        Faces without an area or with corners that are no numbers are left out. Normals that are zero or no numbers
+        become those of the faces around them.
         """
         across = self._across()
         known = np.asarray(np.isfinite(across).all(axis=1))
@@ -67,24 +62,21 @@ class Mesh:
         if mesh.normals is None or not smooth:
             return replace(mesh, normals=None)
         length = np.linalg.norm(mesh.normals, axis=1)
-        bad = ~(np.isfinite(length) & (length > 1e-6))[mesh.faces].all(axis=1)
-        if bad.all():
-            mesh = replace(mesh, normals=None)
-        elif bad.any():
-            mesh = mesh._separate_normals(bad)
+        usable = np.isfinite(length) & (length > 1e-6)
+        bad = ~usable[mesh.faces].all(axis=1)
         if bad.any():
             meaning = "faces whose normals are zero or no numbers get their own"
             changes.note(meaning, f"{what}: {bad.sum()} of {len(bad)}")
+            normals = np.where(usable[:, None], mesh.normals, mesh._around())
+            mesh = replace(mesh, normals=None if bad.all() else normals)
         return mesh
 
-    def _separate_normals(self, flat: NDArray[np.bool_]) -> Mesh:
-        """The mesh with corners of their own, and the face's normal on them, for some faces, a mask (F,)."""
-        count, every, corners = len(self.vertices), np.ones(len(self.faces), np.bool_), self.faces.copy()
-        corners[flat] = count + np.arange(3 * flat.sum()).reshape(-1, 3)
-        mesh = self._take(np.concatenate([np.arange(count), self.faces[flat].ravel()]), every, corners)
-        if mesh.normals is not None:
-            mesh.normals[count:] = np.repeat(unit(self._across()[flat]), 3, axis=0)
-        return mesh.part(every)
+    def _around(self) -> Floats:
+        """The mean normals of the faces around each vertex (V, 3), by their areas."""
+        made = np.zeros_like(self.vertices)
+        for corner in range(3):
+            np.add.at(made, self.faces[:, corner], self._across())
+        return unit(made)
 
     def _across(self) -> Floats:
         """The normals of faces as modelled (F, 3), as long as twice their areas."""
@@ -95,21 +87,12 @@ class Mesh:
 
     def encloses(self) -> bool:
         """Whether the mesh closes in a volume and faces away from it, so that nobody sees its back."""
-        _, vertex = np.unique(self.vertices, axis=0, return_inverse=True)
-        corner = vertex.reshape(-1)[self.faces].astype(np.int64)
-        edges = np.concatenate([corner[:, [0, 1]], corner[:, [1, 2]], corner[:, [2, 0]]])
-        key, back = edges[:, 0] * len(self.vertices) + edges[:, 1], edges[:, 1] * len(self.vertices) + edges[:, 0]
-        middle = self.vertices.mean(axis=0)
-        volume = ((self.vertices[self.faces[:, 0]] - middle) * self._across()).sum()
-        return bool(np.array_equal(np.sort(key), np.sort(back)) and volume > 0)
+        return bool(trimesh.Trimesh(self.vertices, self.faces).is_volume)
 
     def back(self) -> Mesh:
         """A sheet that faces the other way, behind this one."""
-        away = np.zeros_like(self.vertices)
-        for corner in range(3):
-            np.add.at(away, self.faces[:, corner], self._across())
         gap = max(GAP * np.linalg.norm(np.ptp(self.vertices, axis=0)), LEAST_GAP * np.abs(self.vertices).max())
-        return replace(self, vertices=self.vertices - gap * unit(away), faces=self.faces[:, ::-1])
+        return replace(self, vertices=self.vertices - gap * self._around(), faces=self.faces[:, ::-1])
 
 
 def unit(vectors: Floats) -> Floats:

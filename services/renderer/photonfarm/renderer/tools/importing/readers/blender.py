@@ -2,37 +2,50 @@
 
 Blender is GPL and large, so it is no part of photonfarm. It is the program `blender`, or a Python that has its wheel
 `bpy`: one of its own, as `bpy` needs an older numpy than the store.
+
+Lamps and the sky go round the GLB, by the units of Cycles: watts, and watts per square metre for suns. The radiance of
+an area A is P / (π·A), that of a sphere P / (4·π²·r²), and P / π for lamps that are not normalized; a point is the
+limit r → 0. Objects scale areas and the cones of spots, not radii. All of it is measured on Cycles.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element, SubElement
+
+import numpy as np
 
 from photonfarm.core.errors import BackendError, SpecError
 from photonfarm.core.waiting import Log
-from photonfarm.renderer.tools.importing.changes import Changes
+from photonfarm.renderer.tools.importing import elements
+from photonfarm.renderer.tools.importing.elements import WIDEST, Profile, cone_image, put_cone
 from photonfarm.renderer.tools.importing.imported import ImportedScene
+from photonfarm.renderer.tools.importing.meshes import Floats, unit
 from photonfarm.renderer.tools.importing.readers import gltf
-from photonfarm.renderer.tools.importing.readers.blender_lamps import Lamps
-
-_NAMES = {
-    "KHR_materials_anisotropy": "Anisotropic",
-    "KHR_materials_clearcoat": "Coat Weight",
-    "KHR_materials_sheen": "Sheen Weight",
-    "KHR_materials_specular": "Specular Tint",
-    "KHR_materials_transmission": "Transmission Weight",
-    "clearcoatNormalTexture": "Coat Normal",
-    "emissiveTexture": "Emission Color",
-}
-"""What Blender calls that which glTF has of its surfaces."""
 
 VARIABLE = "PHOTONFARM_BLENDER"
 """The variable that names Blender, or a Python that has `bpy`."""
+
+Lamp = dict[str, Any]
+"""The numbers that Blender has of a lamp, its `strength` as a colour, and its `matrix` in its world."""
+
+AXES = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""The map of Blender's coordinates, z up, to glTF's, y up."""
+
+TURN, NOWHERE = np.array([-1.0, 1, -1]), np.zeros(3)
+"""What turns the axes of a lamp, which shines along −z, to those of a light of Mitsuba's, which shines along +z."""
+
+PARTS = 16
+"""Spots with a radius, and areas of a small spread, become so many spots, which have no extent in Mitsuba."""
+
+SHARP = math.radians(1.0)
+"""A sun that is wider is said to lose its soft shadows."""
 
 _SCRIPT = Path(__file__).with_name("blender_export.py")
 
@@ -43,15 +56,12 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     out = scratch / "exported.glb"
     log(f"{path.name}: Blender opens it")
     _run([*command, str(path.resolve()), str(out)], path, out)
+    scene = ImportedScene()
+    scene.changes.note("Blender's (x, y, z) is (x, z, −y) here")
     try:
-        scene = gltf.read(out, scratch, log)
+        gltf.read(out, scratch, log, scene)
     except SpecError as error:
         raise SpecError(str(error).replace(str(out), str(path))) from error
-    changes, scene.changes = scene.changes, Changes()
-    scene.changes.note("Blender's (x, y, z) is (x, z, −y) here")
-    for change in changes:
-        for place in change.places or [""]:
-            scene.changes.say(change.effect, _NAMES.get(change.name, change.name), change.meaning, place)
     beside: dict[str, Any] = json.loads(out.with_suffix(".json").read_text(encoding="utf-8"))
     scene.objects = {made: beside["owners"].get(owner, owner) for made, owner in scene.objects.items()}
     for each in beside["said"]:
@@ -71,9 +81,9 @@ def _run(command: list[str], path: Path, out: Path) -> None:
     if made.returncode == 0 and out.with_suffix(".json").is_file():
         return
     lines = [line.strip() for line in (made.stdout + made.stderr).splitlines() if line.strip()]
-    for line in lines:
-        if line.startswith("fault: "):
-            raise SpecError(f"{path}: {line.removeprefix('fault: ')[:300]}")
+    faults = [line.removeprefix("fault: ")[:300] for line in lines if line.startswith("fault: ")]
+    if faults:
+        raise SpecError(f"{path}: {faults[0]}")
     said = ([line for line in lines if "rror" in line] or lines or ["it said nothing"])[-1][:300]
     raise SpecError(f"{path}: Blender cannot read it: {said}")
 
@@ -92,3 +102,139 @@ def blender_command(path: Path) -> list[str]:
     if Path(program).name.startswith("python"):
         return [program, str(_SCRIPT)]
     return [program, "--background", "--factory-startup", "--python-exit-code", "1", "--python", str(_SCRIPT), "--"]
+
+
+class Lamps:
+    """Puts lamps into a scene; images go into the folder `scratch`."""
+
+    def __init__(self, scene: ImportedScene, scratch: Path) -> None:
+        self._scene, self._scratch = scene, scratch
+
+    def put(self, lamp: Lamp) -> None:
+        """Add a lamp: the numbers that Blender has of it, its `strength` as a colour, and its `matrix` in its world."""
+        strength, matrix = np.array(lamp["strength"]), AXES @ np.array(lamp["matrix"])
+        if strength.min() < 0:
+            self._scene.changes.lose("light", "energy", "is negative, which no light is here", f"lamp {lamp['name']!r}")
+        kinds = {"SUN": self._put_sun, "SPOT": self._put_spot, "POINT": self._put_point, "AREA": self._put_area}
+        if strength.max() > 0:
+            kinds[lamp["kind"]](lamp, np.maximum(strength, 0), matrix)
+
+    def put_sky(self, sky: list[float] | str) -> None:
+        """Surround the scene by a radiance, or by an image of all directions with Blender's +y in the middle."""
+        if isinstance(sky, str):
+            image = self._emitter("envmap", "sky")
+            elements.put_value(image, "filename", sky)
+            _place(image, np.diag([-1, 1, -1]))
+        elif max(sky) > 0:
+            elements.put_value(self._emitter("constant", "sky"), "radiance", sky)
+
+    def _put_sun(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
+        sine = math.sin(min(lamp["angle"], math.pi) / 2)
+        if lamp["angle"] > SHARP:
+            self._scene.changes.lose("light", "angle", "shadows of suns are sharp here", f"lamp {lamp['name']!r}")
+        sun = self._emitter("directional", lamp["name"])
+        flux = strength * (math.pi * sine**2 if sine and not lamp["normalize"] else 1.0)
+        elements.put_value(sun, "irradiance", flux.tolist())
+        _place(sun, _frame(matrix) * TURN)
+
+    def _put_point(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
+        radius, intensity = float(lamp["shadow_soft_size"]), _intensity(lamp, strength)
+        if radius == 0:
+            point = self._emitter("point", lamp["name"])
+            elements.put_value(point, "intensity", intensity.tolist())
+            _place(point, np.eye(3), matrix[:3, 3])
+        else:
+            sphere = self._shape("sphere", lamp["name"], intensity / (math.pi * radius**2))
+            _place(sphere, radius * np.eye(3), matrix[:3, 3])
+
+    def _put_spot(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
+        """Add a spot: Cycles' cone is that of an object without scale, squeezed by its scale."""
+        scale = np.linalg.norm(matrix[:3, :3], axis=0)
+        half, blend = min(lamp["spot_size"] / 2, WIDEST), max(lamp["spot_blend"], 1e-4)
+        cut = min(math.atan(math.tan(half) * max(scale[:2]) / scale[2]), WIDEST)
+
+        def profile(x: Floats, y: Floats) -> Floats:
+            cosine = 1 / np.sqrt(1 + (x * scale[2] / scale[0]) ** 2 + (y * scale[2] / scale[1]) ** 2)
+            t = np.clip((cosine - math.cos(half)) / (blend * (1 - math.cos(half))), 0, 1)
+            return t * t * (3 - 2 * t)
+
+        places = lamp["shadow_soft_size"] * (_spread_over("DISK") if lamp["shadow_soft_size"] else np.zeros((1, 2)))
+        self._put_cones(lamp, _intensity(lamp, strength), matrix, places @ _frame(matrix)[:, :2].T, cut, profile)
+
+    def _put_area(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
+        """Add an area that shines along −z; one whose light is spread less than by a cosine becomes cones."""
+        is_round, is_square = lamp["shape"] in ("DISK", "ELLIPSE"), lamp["shape"] in ("SQUARE", "DISK")
+        sides = matrix[:3, :2] * (lamp["size"] / 2, lamp["size" if is_square else "size_y"] / 2)
+        area = float(np.linalg.norm(np.cross(*sides.T))) * (math.pi if is_round else 4.0)
+        if area == 0:
+            return
+        radiance = strength / (math.pi * (area if lamp["normalize"] else 1.0))
+        half = max(lamp["spread"] / 2, math.radians(0.5))
+        if half >= WIDEST:
+            shape = self._shape("disk" if is_round else "rectangle", lamp["name"], radiance)
+            sides[:, 0] *= -np.copysign(1, np.linalg.det(matrix[:3, :3]))  # the axes are right-handed then
+            _place(shape, np.column_stack([sides, -_frame(matrix)[:, 2]]), matrix[:3, 3])
+            return
+        tangent = math.tan(half)
+
+        def profile(x: Floats, y: Floats) -> Floats:
+            return np.maximum(1 - np.hypot(x, y) / tangent, 0) / np.sqrt(1 + x * x + y * y)
+
+        on_axis = radiance * area * tangent / (tangent - half)
+        self._put_cones(lamp, on_axis, matrix, _spread_over(lamp["shape"]) @ sides.T, half, profile)
+
+    def _put_cones(
+        self, lamp: Lamp, intensity: Floats, matrix: Floats, places: Floats, cut: float, profile: Profile
+    ) -> None:
+        """Add spots at offsets (N, 3) that share an intensity; `profile`: its share at tangents (x, y) off the axis."""
+        spots = [self._emitter("spot", lamp["name"]) for _ in places]
+        file = cone_image(profile, cut, self._scratch / f"{spots[0].get('id')}.png")
+        for spot, place in zip(spots, places, strict=True):
+            elements.put_value(spot, "intensity", (intensity / len(places)).tolist())
+            _place(spot, _frame(matrix) * TURN, matrix[:3, 3] + place)
+            put_cone(spot, cut, file)
+        if len(places) > 1:
+            meaning = f"became {PARTS} spots, whose shadows are as soft, for its radius or its spread"
+            self._scene.changes.note(meaning, f"lamp {lamp['name']!r}")
+
+    def _emitter(self, kind: str, name: str) -> Element:
+        return SubElement(self._scene.root, "emitter", type=kind, id=self._scene.ids.make(name, "lamp"))
+
+    def _shape(self, kind: str, name: str, radiance: Floats) -> Element:
+        """Add a black shape that emits."""
+        made = SubElement(self._scene.root, "shape", type=kind, id=self._scene.ids.make(name, "lamp"))
+        elements.put_value(SubElement(made, "bsdf", type="diffuse"), "reflectance", (0.0, 0.0, 0.0))
+        elements.put_value(SubElement(made, "emitter", type="area"), "radiance", radiance.tolist())
+        self._scene.objects[made.get("id", "")] = name
+        self._scene.changes.note("cameras see it, which they do in Blender only if told to", f"lamp {name!r}")
+        return made
+
+
+def _intensity(lamp: Lamp, strength: Floats) -> Floats:
+    """The radiant intensity of a point, and of a sphere of the lamp's radius."""
+    if lamp["normalize"]:
+        return strength / (4 * math.pi)
+    return strength * (lamp["shadow_soft_size"] ** 2 or 1 / math.pi)
+
+
+def _frame(matrix: Floats) -> Floats:
+    """The rotation (3, 3) of a matrix; its columns are the lamp's axes."""
+    z = unit(matrix[:3, 2])
+    y = unit(matrix[:3, 1] - z * (z @ matrix[:3, 1]))
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+def _place(light: Element, axes: Floats, place: Floats = NOWHERE) -> None:
+    """Put a light at a place, with its axes as columns (3, 3)."""
+    elements.put_matrix(light, "to_world", [*np.column_stack([axes, place]).tolist(), (0, 0, 0, 1)])
+
+
+def _spread_over(shape: str) -> Floats:
+    """Places (PARTS, 2) spread evenly over a shape within [−1, 1]²."""
+    if shape in ("DISK", "ELLIPSE"):
+        k = np.arange(PARTS) + 0.5
+        radius, angle = np.sqrt(k / PARTS), k * math.pi * (3 - math.sqrt(5))
+        return np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
+    side = round(math.sqrt(PARTS))
+    grid = (np.arange(side) + 0.5) * 2 / side - 1
+    return np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2)

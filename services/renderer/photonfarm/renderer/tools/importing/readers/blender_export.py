@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import sys
 from collections import Counter
 from functools import partial
@@ -27,21 +26,13 @@ from blender_materials import DULL, prepare, source  # type: ignore[import-not-f
 OLDEST = (4, 5)
 """The first Blender whose lamps have an exposure, a temperature and `normalize`."""
 
-_NO_MESHES = {
-    "CURVES": "hair",
-    "HAIR": "particles",
-    "POINTCLOUD": "points",
-    "VOLUME": "a volume",
-    "GREASEPENCIL": "drawn lines",
-}
+_NO_MESHES = ("CURVES", "HAIR", "POINTCLOUD", "VOLUME", "GREASEPENCIL")
 _RAYS = dict.fromkeys(("camera", "diffuse", "glossy", "transmission"), True)
 _LIT = dict.fromkeys(("visible_diffuse", "visible_glossy", "visible_transmission", "visible_shadow"), True)
 _SEEN = {"visible_camera": True, **_LIT, "is_holdout": False, "is_shadow_catcher": False}
 """Flags of worlds, lamps and surfaces, as all rays take them here."""
 
 _OF_LAMPS = ("normalize", "shadow_soft_size", "angle", "spot_size", "spot_blend", "shape", "size", "size_y", "spread")
-_AREA_IN_FBX = re.compile(rb"LightType.{15,30}?(I\x03\0\0\0|,\s*3\b)", re.DOTALL)
-"""A light that is an area, in a binary file or in one of text."""
 
 SKY = (2048, 1024)
 """The size of an image of the sky; the sun of a sky is three of its pixels across."""
@@ -91,34 +82,20 @@ def _open(file: str) -> None:
             return
         bpy.ops.wm.read_factory_settings(use_empty=True)
         if suffix == ".fbx":
-            say(None, ".fbx", "has no sky and no unit for lights; they are as bright as Blender takes them to be")
-            if _AREA_IN_FBX.search(Path(file).read_bytes()):
-                say("light", "LightType", "Blender makes points of its areas")
+            say(None, ".fbx", "has no sky and no unit for lights; those that are areas become points in Blender")
             bpy.ops.wm.fbx_import(filepath=file)
-        else:
-            _open_usd(file)
+            return
+        say(None, suffix, "lights that are cylinders, meshes or portals become points in Blender")
+        world = bpy.context.scene.world = bpy.data.worlds.new("World")  # which its sky goes into
+        world.use_nodes = True
+        source(world.node_tree.get_output_node("CYCLES").inputs["Surface"]).inputs["Color"].default_value = (0, 0, 0, 1)
+        bpy.ops.wm.usd_import(filepath=file, merge_parent_xform=False)
+        held = Counter(each.parent for each in bpy.data.objects)
+        alone = [each for each in bpy.data.objects if each.type != "EMPTY" and each.parent and held[each.parent] == 1]
+        Drawn.names = {each.name: each.parent.name.partition(".")[0] for each in alone}  # Blender's dots number copies
     except RuntimeError as error:
         why = str(error).splitlines()[0].removeprefix("Error: ").replace(file, Path(file).name)
         sys.exit(f"fault: is no {suffix} file that Blender {bpy.app.version_string} reads: {why}")
-
-
-def _open_usd(file: str) -> None:
-    """Open a USD file: with a world, which its sky goes into, and with each prim as an object, for their names."""
-    world = bpy.context.scene.world = bpy.data.worlds.new("World")
-    world.use_nodes = True
-    background = source(world.node_tree.get_output_node("CYCLES").inputs["Surface"])
-    background.inputs["Color"].default_value = (0, 0, 0, 1)
-    bpy.ops.wm.usd_import(filepath=file, merge_parent_xform=False)
-    held = Counter(each.parent for each in bpy.data.objects)
-    alone = [each for each in bpy.data.objects if each.type != "EMPTY" and each.parent and held[each.parent] == 1]
-    Drawn.names = {each.name: each.parent.name.partition(".")[0] for each in alone}  # Blender's dots number copies
-    bpy.utils.expose_bundled_modules()
-    from pxr import Usd  # type: ignore[import-not-found]
-
-    stage = Usd.Stage.Open(file)  # which its prims do not keep
-    for prim in stage.Traverse():
-        if prim.GetTypeName() in ("CylinderLight", "GeometryLight", "PortalLight"):
-            say("light", str(prim.GetTypeName()), "becomes a point in Blender", str(prim.GetPath()))
 
 
 class Drawn(bpy.types.RenderEngine):
@@ -134,10 +111,9 @@ class Drawn(bpy.types.RenderEngine):
         """Collect what is drawn."""
         for instance in depsgraph.object_instances:
             drawn, kind = instance.object, instance.object.type
-            settings = [system.settings for system in drawn.particle_systems]
-            strands = {each.type for each in settings if each.render_type == "PATH"}
-            for missing in {kind, *strands} & _NO_MESHES.keys():
-                say("geometry", missing, f"is missing: {_NO_MESHES[missing]}", f"object {drawn.name!r}")
+            strands = {"HAIR" for system in drawn.particle_systems if system.settings.render_type == "PATH"}
+            for missing in ({kind} | strands) & set(_NO_MESHES):
+                say("geometry", missing, "is no mesh, and is missing", f"object {drawn.name!r}")
             if kind == "LIGHT" and instance.show_self and not drawn.data.cycles.is_portal:
                 self.lamps.append(_lamp(drawn, [list(row) for row in instance.matrix_world]))
             elif kind == "MESH" and instance.show_self and len(drawn.data.polygons):
@@ -205,26 +181,11 @@ def _colour_of_nodes(tree: Any, place: str) -> list[float]:
     if shader.type != "EMISSION":
         say("light", shader.bl_label, "is not carried over", place)
         return [1.0, 1.0, 1.0]
-    colour, strength = (_constant(shader.inputs[name], place) for name in ("Color", "Strength"))
-    return [part * strength[0] for part in colour]
-
-
-def _constant(part: Any, place: str) -> list[float]:
-    """The value of an input as three numbers."""
-    node = source(part)
-    kind = node.type if node else ""
-    if kind == "BLACKBODY" and not node.inputs[0].is_linked:
-        lamp = bpy.data.lights.new("", "POINT")
-        lamp.temperature = node.inputs[0].default_value
-        return list(lamp.temperature_color)
-    if kind in ("RGB", "VALUE"):
-        part = node.outputs[0]
-    elif kind == "LIGHT_FALLOFF" and part.links[0].from_socket == node.outputs[0]:
-        part = node.inputs["Strength"]
-    elif node is not None:
-        say("light", node.bl_label, f"{node.name!r} is not carried over", place)
-    value = part.default_value
-    return list(value)[:3] if part.type == "RGBA" else [value] * 3
+    for name in ("Color", "Strength"):
+        if (node := source(shader.inputs[name])) is not None:
+            say("light", node.bl_label, f"{node.name!r} is not carried over", place)
+    strength = shader.inputs["Strength"].default_value
+    return [part * strength for part in shader.inputs["Color"].default_value[:3]]
 
 
 def _sky(world: Any, file: str) -> list[float] | str:
@@ -285,7 +246,7 @@ def _replace_objects(scene: Any) -> dict[str, str]:
     for each in list(bpy.data.objects):
         bpy.data.objects.remove(each)
     heads = Counter(name for *_, names in Drawn.things for name in names)
-    owners = {}
+    owners, most = {}, OBJECT_SHARE * len(Drawn.things)
     for name, mesh, matrix, names in Drawn.things:
         x, y, z = (column.normalized() for column in matrix.to_3x3().transposed())
         if max(abs(x.dot(y)), abs(y.dot(z)), abs(x.dot(z))) > 1e-5:  # glTF has no shear
@@ -297,7 +258,6 @@ def _replace_objects(scene: Any) -> dict[str, str]:
         made = bpy.data.objects.new(name, mesh)
         made.matrix_basis = matrix
         scene.collection.objects.link(made)
-        most = OBJECT_SHARE * len(Drawn.things)
         owners[made.name] = next((head for head in reversed(names) if heads[head] <= most), name)
     return owners
 

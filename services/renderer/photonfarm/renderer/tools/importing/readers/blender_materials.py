@@ -12,13 +12,12 @@ DULL: dict[str, Any] = {"Roughness": 1.0, "Specular IOR Level": 0.0}
 
 _BLACK = {**DULL, "Base Color": (0, 0, 0, 1)}
 _ROUGH = {"Color": "Base Color", "Base Color": "Base Color", "Roughness": "Roughness", "Normal": "Normal"}
-_LIGHT = {"Color": "Emission Color", "Strength": "Emission Strength"}
 _SHADERS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "BSDF_DIFFUSE": ({"Color": "Base Color", "Normal": "Normal"}, DULL),
     **dict.fromkeys(("BSDF_GLOSSY", "BSDF_METALLIC"), (_ROUGH, {"Metallic": 1.0})),
     "BSDF_GLASS": ({**_ROUGH, "IOR": "IOR"}, {"Transmission Weight": 1.0}),
     "BSDF_TRANSPARENT": ({"Color": "Base Color"}, {**DULL, "Alpha": 0.0}),
-    "EMISSION": (_LIGHT, _BLACK),
+    "EMISSION": ({"Color": "Emission Color", "Strength": "Emission Strength"}, _BLACK),
     "": ({}, _BLACK),
 }
 """The shaders that the Principled BSDF can stand for: which input becomes which of its own, and its other values."""
@@ -51,6 +50,9 @@ def prepare(material: Any, lose: Lose) -> None:
         unfit = _unfit(part)
         if part.name in _NEUTRAL and (part.is_linked or part.default_value > 0):
             lose("colour", part.name, "is not carried over")
+            for link in part.links:
+                tree.links.remove(link)
+            part.default_value = 0  # so that the exporter does not write it
         elif unfit is not None:
             effect = "light" if "Emission" in part.name else "colour"
             lose(effect, unfit.bl_label, f"{part.name} does not vary here; bake it to an image to keep it")
@@ -69,12 +71,23 @@ def source(part: Any) -> Any:
 
 
 def _make_principled(tree: Any, node: Any, lose: Lose) -> Any:
-    """The Principled BSDF that does what a shader does, as far as one can."""
+    """The Principled BSDF that does what a shader does, as far as one can; of two that are mixed, the heavier."""
     kind = node.type if node else ""
     if kind == "BSDF_PRINCIPLED":
         return node
     if kind in ("MIX_SHADER", "ADD_SHADER"):
-        return _mix(tree, node, lose)
+        one, other = (source(part) for part in list(node.inputs)[-2:])
+        share = node.inputs[0]
+        if kind == "MIX_SHADER" and one is not None and one.type == "BSDF_TRANSPARENT":  # which is opacity
+            _say_tint(one, lose)
+            made = _make_principled(tree, other, lose)
+            if made.inputs["Alpha"].default_value < 1 or made.inputs["Alpha"].is_linked:
+                lose("colour", "Alpha", "of what is mixed with something transparent is not carried over")
+            _give(share, made.inputs["Alpha"])
+            return made
+        effect = "light" if "EMISSION" in [each.type for each in (one, other) if each] else "colour"
+        lose(effect, node.bl_label, "only the heavier of its two shaders is carried over; bake it to images to keep it")
+        return _make_principled(tree, other if kind == "MIX_SHADER" and share.default_value > 0.5 else one, lose)
     if kind not in _SHADERS:
         lose("colour", node.bl_label, "became diffuse; bake it to images to keep it")
     takes, values = _SHADERS.get(kind, _SHADERS["BSDF_DIFFUSE"])
@@ -91,32 +104,6 @@ def _make_principled(tree: Any, node: Any, lose: Lose) -> Any:
     return made
 
 
-def _mix(tree: Any, node: Any, lose: Lose) -> Any:
-    """One shader for two: opacity for one that is transparent, the light of one that emits; else the heavier."""
-    pair = [source(part) for part in list(node.inputs)[-2:]]
-    kinds = [part.type if part else "" for part in pair]
-    adds, share = node.type == "ADD_SHADER", node.inputs[0]
-    special = "EMISSION" if adds else "BSDF_TRANSPARENT"
-    place = kinds.index(special) if special in kinds else -1
-    if place < 0 or (place == 1 and not adds and share.is_linked):
-        effect = "light" if "EMISSION" in kinds else "colour"
-        lose(effect, node.bl_label, "only the heavier of its two shaders is carried over")
-        return _make_principled(tree, pair[not adds and share.default_value > 0.5], lose)
-    made = _make_principled(tree, pair[1 - place], lose)
-    if adds:
-        if made.inputs["Emission Strength"].default_value > 0 or made.inputs["Emission Strength"].is_linked:
-            lose("light", node.bl_label, "only one of its two lights is carried over")
-        for name, ours in _LIGHT.items():
-            _give(pair[place].inputs[name], made.inputs[ours])
-    else:
-        _say_tint(pair[place], lose)
-        if made.inputs["Alpha"].default_value < 1 or made.inputs["Alpha"].is_linked:
-            lose("colour", "Alpha", "of what is mixed with something transparent is not carried over")
-        _give(share, made.inputs["Alpha"])
-        made.inputs["Alpha"].default_value = abs(place - share.default_value)
-    return made
-
-
 def _say_tint(transparent: Any, lose: Lose) -> None:
     if transparent.inputs["Color"].is_linked or min(transparent.inputs["Color"].default_value[:3]) < 1:
         lose("colour", transparent.bl_label, "lets all colours through")
@@ -127,18 +114,12 @@ def _unfit(part: Any) -> Any:
     node, name = source(part), part.name
     if node is None or node.type in ("RGB", "VALUE") or (node.type == "VERTEX_COLOR" and name == "Base Color"):
         return None
+    image = part if name in (*_COLOURS, *_NUMBERS, "Alpha") else None
     if name == "Normal" and node.type == "NORMAL_MAP" and node.space == "TANGENT":
-        images = [node.inputs["Color"]]
-    elif (
-        name in _COLOURS and node.type == "MIX" and node.blend_type == "MULTIPLY" and node.inputs[0].default_value == 1
-    ):
-        images = [each for each in node.inputs if each.type == "RGBA" and each.is_linked]
+        image = node.inputs["Color"]
     elif name in _NUMBERS and node.type == "SEPARATE_COLOR":
-        images = [node.inputs[0]]
-    else:
-        images = [part] if name in (*_COLOURS, *_NUMBERS, "Alpha") else []
-    fits = len(images) == 1 and _is_plain(images[0], "sRGB" if name in _COLOURS else "Non-Color")
-    return None if fits else node
+        image = node.inputs[0]
+    return None if image and _is_plain(image, "sRGB" if name in _COLOURS else "Non-Color") else node
 
 
 def _is_plain(part: Any, space: str) -> bool:

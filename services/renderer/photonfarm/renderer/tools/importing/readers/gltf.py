@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement
+from xml.etree.ElementTree import SubElement
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,23 +20,14 @@ from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.elements import WIDEST, cone_image, put_cone
 from photonfarm.renderer.tools.importing.imported import ImportedScene
 from photonfarm.renderer.tools.importing.meshes import Floats, Mesh
-from photonfarm.renderer.tools.importing.readers.gltf_file import (
-    COMPRESSED,
-    GltfFile,
-    Node,
-    extension,
-    normalise,
-    numbers,
-)
-from photonfarm.renderer.tools.importing.readers.gltf_materials import Look, Materials, Textures
+from photonfarm.renderer.tools.importing.readers.gltf_file import GltfFile, Node, extension, normalise, numbers
+from photonfarm.renderer.tools.importing.readers.gltf_materials import Look, Materials
 
 OBJECT_SHARE = 0.34
 """A node is an object as a whole up to this share of all meshes; above, it is a folder of objects."""
 
 _ONE_COLOUR = 2e-3  # colours of vertices that differ by no more are one colour
 _UNNAMED = (0.8, 0.8, 0.8, 1.0)  # the colour of what has neither a material nor colours of vertices
-_ASKEW = 0.5  # tangents whose cosine with the images' own ones is below this are others
-_MANY_ASKEW = 0.1  # the share of faces that is many
 
 _LIGHTS, _INSTANCES = "KHR_lights_punctual", "EXT_mesh_gpu_instancing"
 _OF_BLENDER = (
@@ -53,14 +44,13 @@ _WIDTHS = {"POSITION": (3,), "NORMAL": (3,), "TANGENT": (4,), "TEXCOORD": (2,), 
 _Piece = tuple[Mesh, Look]  # a mesh and its material
 
 
-def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
-    """Read a file; meshes and images are put into the folder `scratch`. Raises SpecError for what cannot be read."""
-    scene = ImportedScene()
+def read(path: Path, scratch: Path, log: Log, scene: ImportedScene | None = None) -> ImportedScene:
+    """Read a file into a scene; images go into the folder `scratch`. Raises SpecError for what cannot be read."""
+    scene = scene or ImportedScene()
     file = GltfFile(path, scene.changes)
-    materials = Materials(file, scene.root, Textures(file, scratch), scene.ids)
     with file.at(), np.errstate(invalid="ignore"):  # of corners that are infinite, which are said
         log(f"reading {len(file.all('nodes'))} nodes and {len(file.all('meshes'))} meshes of {path.name}")
-        _Reader(file, scene, materials).read()
+        _Reader(file, scene, Materials(file, scene, scratch)).read()
     if scene.root.find("shape") is None:
         changes = "".join(f"\n  {change}" for change in sorted(scene.changes, key=lambda change: not change.effect))
         raise SpecError(f"{path}: its scene has no triangles; nothing can be rendered{changes}")
@@ -73,11 +63,15 @@ class _Visit:
 
     node: Node
     name: str
-    place: str  # as a message names it
     matrix: Floats  # to the world
     above: tuple[_Visit, ...]  # from the root on
     meshes: int = 0  # at it and below it
     owner: str = ""  # the object that it is part of
+
+    @property
+    def place(self) -> str:
+        """The node as a message names it."""
+        return f"node {self.name!r}"
 
 
 @dataclass(slots=True)
@@ -97,7 +91,14 @@ class _Reader:
         pieces = [piece for visit in visits if "mesh" in visit.node for piece in self._pieces(visit)]
         for made, owner, mesh, look in pieces:  # materials need to know all meshes that have them
             with self.file.at(f"material {self.materials.name(look)!r}"):
-                self._put_piece(made, owner, mesh, look)
+                if self.materials.is_unseen(look):
+                    self.scene.changes.note(
+                        "what is wholly transparent is left out", f"node {made!r}", name="alphaMode"
+                    )
+                    continue
+                material, light = self.materials.make(look)
+                both_sides = bool(self.materials.entry(look.number).get("doubleSided"))
+                self.scene.put_shape(made, mesh, material, owner, light, both_sides=both_sides)
         lights = extension(self.file.document, _LIGHTS).get("lights", [])
         if lights and str(self.file.document["asset"].get("generator")).startswith("Khronos glTF Blender I/O"):
             self.scene.changes.note(_OF_BLENDER, name=_LIGHTS)
@@ -116,15 +117,22 @@ class _Reader:
             if not extension(node, "KHR_node_visibility").get("visible", True):
                 continue
             name = node.get("name") or ("mesh" in node and self.file.entry("meshes", node["mesh"]).get("name"))
-            name = str(name or f"node_{number}")
-            visit = _Visit(node, name, f"node {name!r}", np.eye(4), above)
+            visit = _Visit(node, str(name or f"node_{number}"), np.eye(4), above)
             with self.file.at(visit.place):
                 if any(each.node is node for each in above):
                     raise SpecError("is below itself; take it out of its children")
-                self.file.report(node, "geometry", visit.place)
                 visit.matrix = (above[-1].matrix if above else np.eye(4)) @ _matrix(node)
                 waiting += [(child, (*above, visit)) for child in reversed(node.get("children", ()))]
             yield visit
+
+    def _roots(self) -> list[int]:
+        if not (count := len(self.file.all("scenes"))):
+            below = {child for node in self.file.all("nodes") for child in node.get("children", ())}
+            return [number for number in range(len(self.file.all("nodes"))) if number not in below]
+        scene = self.file.entry("scenes", self.file.document.get("scene", 0))
+        if count > 1:
+            self.scene.changes.note(f"{scene.get('name', 'one')!r} of {count} is read", name="scenes")
+        return list(scene.get("nodes", ()))
 
     def _find_owners(self, visits: list[_Visit]) -> None:
         """Learn which object each node is part of: the first from the root on that is no folder of objects."""
@@ -135,21 +143,10 @@ class _Reader:
         for visit in visits:
             visit.owner = next((each.name for each in visit.above if each.meshes <= most), visit.name)
 
-    def _roots(self) -> list[int]:
-        if not (count := len(self.file.all("scenes"))):
-            below = {child for node in self.file.all("nodes") for child in node.get("children", ())}
-            return [number for number in range(len(self.file.all("nodes"))) if number not in below]
-        scene = self.file.entry("scenes", self.file.document.get("scene", 0))
-        if count > 1:
-            self.scene.changes.note(f"{scene.get('name', 'one')!r} of {count} is read", name="scenes")
-        self.file.report(scene, "light", "scene")
-        return list(scene.get("nodes", ()))
-
     def _pieces(self, visit: _Visit) -> Iterator[tuple[str, str, Mesh, Look]]:
         """The ids, objects, meshes in the world and materials of a node."""
         with self.file.at(visit.place):
             mesh = self.file.entry("meshes", visit.node["mesh"])
-            self.file.report(mesh, "geometry", visit.place)
             if "skin" in visit.node:
                 self.scene.changes.lose("geometry", "skin", "joints move nothing; it stands as modelled", visit.place)
             if np.any(visit.node.get("weights", mesh.get("weights", ()))):
@@ -159,14 +156,6 @@ class _Reader:
                     called = f"{name}_{number}" if len(mesh["primitives"]) > 1 else name
                     for part, look in self._meshes(primitive, matrix, visit.place):
                         yield self.scene.ids.make(called), owner, part, look
-
-    def _put_piece(self, made: str, owner: str, mesh: Mesh, look: Look) -> None:
-        material = self.materials.make(look)
-        if material is None:
-            self.scene.changes.note("what is wholly transparent is left out", f"node {made!r}", name="alphaMode")
-        else:
-            both = bool(self.materials.entry(look.number).get("doubleSided"))
-            self.scene.put_shape(made, mesh, material[0], owner, material[1], both_sides=both)
 
     def _instances(self, visit: _Visit) -> Iterator[tuple[str, str, Floats]]:
         """The names, objects and transforms of a node's mesh: one, or one for each instance, its own object."""
@@ -178,7 +167,7 @@ class _Reader:
         values = {}
         for key, number in instances.items():
             if key.lower() in _AT_REST:
-                values[key.lower()] = self.file.attribute(number, key, count, [len(_AT_REST[key.lower()])])
+                values[key.lower()] = self.file.array(number, key, [len(_AT_REST[key.lower()])], count)
             elif not key.startswith("_"):
                 self.scene.changes.lose("colour", key, f"{_INSTANCES} has no such attribute", visit.place)
         for number in range(count):
@@ -187,35 +176,38 @@ class _Reader:
 
     def _meshes(self, primitive: Node, matrix: Floats, place: str) -> list[_Piece]:
         """The meshes of a primitive: none if it has no triangles, and two where some of its images are mirrored."""
-        self.file.report(primitive, "geometry", place)
         mode, attributes, material = primitive.get("mode", _LISTS), primitive["attributes"], primitive.get("material")
         if mode not in (_LISTS, _STRIPS, _FANS) or "POSITION" not in attributes:
             name = _OTHERS.get(mode, f"mode {mode}") if "POSITION" in attributes else "no POSITION"
             self.scene.changes.lose("geometry", name, "points, lines and what is nowhere have no surface", place)
             return []
-        position = self.file.entry("accessors", attributes["POSITION"])
-        compressed = ", ".join(COMPRESSED & set(primitive.get("extensions", ())))
-        if compressed and "bufferView" not in position:
-            raise SpecError(f"a mesh is in {compressed}, which is not read; export it without")
-        known = [name for name in attributes if name.split("_")[0] in _WIDTHS]
-        values = {name: self._attribute(attributes[name], name, position["count"]) for name in known}
-        mesh = Mesh(values["POSITION"], self._faces(primitive, mode, position["count"]), values.get("NORMAL"))
+        count = self.file.entry("accessors", attributes["POSITION"])["count"]
+        values = {}
+        for name, number in attributes.items():
+            if (widths := _WIDTHS.get(name.split("_")[0])) is not None:
+                read = self.file.array(number, name, widths, count)  # integers of colours are fractions in any case
+                values[name] = normalise(read) if name.startswith("COLOR") else read.astype(np.float64)
+        mesh = Mesh(values["POSITION"], self._faces(primitive, mode, count), values.get("NORMAL"))
         mesh = replace(mesh, uv=self._uv(values, material, place))
-        piece = self._colour(mesh, values.get("COLOR_0"), material, place)
-        return self._place(piece, values.get("TANGENT"), matrix, place)
-
-    def _attribute(self, number: int, name: str, count: int) -> Floats:
-        """An attribute (V, width)."""
-        values = self.file.attribute(number, name, count, _WIDTHS[name.split("_")[0]])
-        if name.startswith("COLOR"):
-            values = normalise(values)  # integers mean nothing else here, whether they say so or not
-        return values.astype(np.float64)
+        mesh, look = self._colour(mesh, values.get("COLOR_0"), material, place)
+        mesh = mesh.transform(matrix)
+        if mesh.uv is None or "normalTexture" not in self.materials.entry(material):
+            return [(mesh, look)]
+        a, b, c = mesh.uv[mesh.faces].swapaxes(0, 1)
+        areas = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]  # v is downwards
+        mirrored = areas > 0
+        if "TANGENT" in values:
+            sides = values["TANGENT"][mesh.faces, 3].sum(axis=1) * np.linalg.det(matrix[:3, :3])
+            if (sides * areas > 0).any():
+                self.scene.changes.lose("colour", "TANGENT", "normal maps lie by texture coordinates alone", place)
+        parts = [(mesh.part(mirrored == side), look._replace(mirrored=side)) for side in (False, True)]
+        return [part for part in parts if len(part[0].faces)]
 
     def _faces(self, primitive: Node, mode: int, vertices: int) -> NDArray[np.uint32]:
         """The triangles (F, 3) of a list, a strip or a fan of vertices."""
         order = np.arange(vertices, dtype=np.uint32)
         if "indices" in primitive:
-            order = self.file.array(primitive["indices"])[:, 0]
+            order = self.file.array(primitive["indices"], "indices", [1])[:, 0]
         if order.dtype.kind != "u" or order.max(initial=0) >= max(vertices, 1):
             raise SpecError(f"indices ({order.dtype}) name vertex {order.max()}, and POSITION has {vertices}")
         if mode == _LISTS:
@@ -226,7 +218,7 @@ class _Reader:
 
     def _uv(self, values: Mapping[str, Floats], material: int | None, place: str) -> Floats | None:
         """The texture coordinates by which a material's images lie."""
-        used = self.materials.uv_sets(material)
+        used = self.materials.find_uv_sets(material)
         first, *others = [f"TEXCOORD_{number}" for number in used or [0]]
         if first not in values:
             if used:
@@ -249,40 +241,24 @@ class _Reader:
         used = colours[np.unique(mesh.faces)]
         used = np.column_stack([used, np.ones((len(used), 4 - used.shape[1]))])
         mean, same = np.round(used.mean(axis=0), 4).tolist(), np.ptp(used, axis=0) <= _ONE_COLOUR
-        if not same[3] and self.materials.entry(number).get("alphaMode", "OPAQUE") != "OPAQUE":
+        entry = self.materials.entry(number)
+        surface = entry.get("pbrMetallicRoughness", {})
+        if not same[3] and entry.get("alphaMode", "OPAQUE") != "OPAQUE":
             self.scene.changes.lose("colour", "COLOR_0", "the alpha of vertices is their mean", place)
         if same[:3].all():
             return mesh, Look(number, tint=tuple(mean))
-        look, (has_image, factor) = Look(number, tint=(1.0, 1.0, 1.0, mean[3])), self.materials.colour(number)
-        if has_image:
-            meaning = "colours of vertices multiply a plain colour of metallic-roughness alone, and are left out"
-            self.scene.changes.lose("colour", "COLOR_0", meaning, place)
+        look = Look(number, tint=(1.0, 1.0, 1.0, mean[3]))
+        if surface.get("baseColorTexture") is not None:
+            self.scene.changes.lose("colour", "COLOR_0", "colours of vertices are left out beside an image", place)
             return mesh, look
+        factor = numbers(surface, "baseColorFactor", (1, 1, 1, 1))
         painted = {"vertex_color": (colours[:, :3] * factor[:3]).clip(0, 1)}
         return replace(mesh, attributes=painted), look._replace(painted=True)
-
-    def _place(self, piece: _Piece, tangents: Floats | None, matrix: Floats, place: str) -> list[_Piece]:
-        """A mesh in the world; where its images are mirrored, its normal map is."""
-        mesh, look = piece[0].transform(matrix), piece[1]
-        if mesh.uv is None or "normalTexture" not in self.materials.entry(look.number):
-            return [(mesh, look)]
-        along, areas = _images(mesh, mesh.uv)
-        mirrored = areas > 0
-        if tangents is not None:
-            mirrored = tangents[mesh.faces, 3].sum(axis=1) * np.linalg.det(matrix[:3, :3]) < 0
-            given = (tangents[:, :3] @ matrix[:3, :3].T)[mesh.faces].sum(axis=1)
-            lengths = np.linalg.norm(along, axis=1) * np.linalg.norm(given, axis=1)
-            if ((along * given).sum(axis=1) < _ASKEW * lengths).sum() > _MANY_ASKEW * len(lengths):
-                meaning = "normal maps lie by their texture coordinates alone"
-                self.scene.changes.lose("colour", "TANGENT", meaning, place)
-        parts = [(mesh.part(mirrored == side), look._replace(mirrored=side)) for side in (False, True)]
-        return [part for part in parts if len(part[0].faces)]
 
     def _put_light(self, light: Node, matrix: Floats) -> None:
         """Candela and lux are taken as radiometric units, as emissive strength is, so that all lights agree."""
         kind, name = light["type"], light.get("name", light["type"])
         place = f"light {name!r}"
-        self.file.report(light, "light", place)
         if kind not in ("point", "spot", "directional"):
             self.scene.changes.lose("light", str(kind), "is no kind of light that is known", place)
             return
@@ -295,12 +271,14 @@ class _Reader:
             self.scene.changes.note("light does not end there", place, name="range")
         emitter = SubElement(self.scene.root, "emitter", type=kind, id=self.scene.ids.make(name))
         elements.put_value(emitter, "irradiance" if kind == "directional" else "intensity", colour.clip(0).tolist())
-        elements.put_matrix(emitter, "to_world", _along_z(matrix).tolist())
-        if kind == "spot":
-            self._put_cone(emitter, light.get("spot", {}), place)
-
-    def _put_cone(self, emitter: Element, spot: Node, place: str) -> None:
-        """Let a spot fade by the attenuation that the extension recommends."""
+        to_world = np.eye(4)
+        to_world[:3, 3] = matrix[:3, 3]
+        if matrix[:3, 2].any():  # it shines along −z, and Mitsuba's along +z
+            to_world[:3, :3] = Rotation.align_vectors(-matrix[:3, 2], (0, 0, 1))[0].as_matrix()
+        elements.put_matrix(emitter, "to_world", to_world.tolist())
+        if kind != "spot":
+            return
+        spot = light.get("spot", {})  # which fades by the attenuation that the extension recommends
         inner, outer = spot.get("innerConeAngle", 0.0), spot.get("outerConeAngle", np.pi / 4)
         if not 0 <= inner <= outer <= np.pi / 2 or outer == 0:
             meaning = f"{inner} and {outer} are no angles from 0 to π/2, of which the outer one is greater"
@@ -311,17 +289,7 @@ class _Reader:
             cosine, edge = 1 / np.sqrt(1 + x * x + y * y), np.cos(outer)
             return np.clip((cosine - edge) / max(1e-3, np.cos(inner) - edge), 0, 1) ** 2
 
-        file = self.materials.textures.scratch / f"{emitter.get('id')}_cone.png"
-        put_cone(emitter, cut, cone_image(profile, cut, file))
-
-
-def _along_z(matrix: Floats) -> Floats:
-    """The place of a light that shines along −z under a transform, for one that shines along +z, as Mitsuba's do."""
-    made = np.eye(4)
-    if matrix[:3, 2].any():
-        made[:3, :3] = Rotation.align_vectors(-matrix[:3, 2], (0, 0, 1))[0].as_matrix()
-    made[:3, 3] = matrix[:3, 3]
-    return made
+        put_cone(emitter, cut, cone_image(profile, cut, self.materials.scratch / f"{emitter.get('id')}_cone.png"))
 
 
 def _matrix(node: Node) -> Floats:
@@ -334,14 +302,3 @@ def _matrix(node: Node) -> Floats:
         raise ValueError("rotation is 0, 0, 0, 0, which is no rotation")
     made[:3, :3] = Rotation.from_quat(turn).as_matrix() * scale
     return made
-
-
-def _images(mesh: Mesh, uv: Floats) -> tuple[Floats, Floats]:
-    """How images lie on faces: the direction in which u grows (F, 3), and their signed areas (F,).
-
-    The area is negative where an image, whose v is downwards, is not mirrored.
-    """
-    a, b = (mesh.vertices[mesh.faces[:, i]] - mesh.vertices[mesh.faces[:, 0]] for i in (1, 2))
-    c, d = (uv[mesh.faces[:, i]] - uv[mesh.faces[:, 0]] for i in (1, 2))
-    area = c[:, :1] * d[:, 1:] - c[:, 1:] * d[:, :1]
-    return np.sign(area) * (a * d[:, 1:] - b * c[:, 1:]), area[:, 0]

@@ -1,4 +1,4 @@
-"""MTL files: their statements, the numbers of these, and the images that they name."""
+"""MTL files: their statements, the images that they name, and the Mitsuba material that is nearest to each."""
 
 from __future__ import annotations
 
@@ -6,8 +6,9 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from PIL import Image as Pillow
@@ -15,10 +16,12 @@ from PIL import Image as Pillow
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import images
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
-from photonfarm.renderer.tools.importing.surfaces import Lie, Map
+from photonfarm.renderer.tools.importing.surfaces import Lie, Map, Writer, constant
 
-Meaning = tuple[Effect | None, str]
-"""What of the picture a statement changes that is not carried over, if anything, and how."""
+_CARRIED = re.compile("(map_)?(kd|ke|d)|k[as]|n[si]|tr|tf|illum|sharpness|map_aat")
+"""What has its meaning here, or none where light and reflections are those of the scene."""
+
+_EFFECTS: dict[str, Effect | None] = {"disp": "geometry", "map_ka": None}  # of what is not carried over; else colour
 
 _OPTION = re.compile(
     r"-(?:(type|imfchan)\s+(\S+)|(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?=\s)){0,3}))\s+",
@@ -26,11 +29,16 @@ _OPTION = re.compile(
 )
 """An option before the name of an image: one word, or up to three numbers."""
 
-_CARRIED = ("o", "s", "clamp", "bm", "blendu", "blendv", "boost", "texres")
-"""The options that have their meaning here, or speak of how programs filter; others have none if 0 or off."""
+_OPTIONS = re.compile(r"(o|s|clamp|blendu|blendv|boost|texres) .*|\w+ (off|[0. ]*)|mm [0.]+ 1[0.]*")
+"""The options that have their meaning here, or none by what they speak of or by their values."""
 
-RELIEFS = ("norm", "map_bump", "bump")
-WHITE = (1.0, 1.0, 1.0)
+_GLASS, _MIRRORS, _LIT = (4, 6, 7, 9), (3, 5, 8), range(1, 10)
+"""The models of illumination that are glass, those that reflect the scene, and those of what light and shadows meet."""
+
+_WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+_GREY = (0.7, 0.7, 0.7)  # the reflectance of what has no colour
+_SMOOTH = 0.2  # gloss up to this α is Mitsuba's `roughplastic`, which loses light above; `principled` gains some
+_SHINES = 0.02  # gloss is modelled from this specular reflectance on
 
 
 def statements(file: Path) -> Iterator[tuple[int, str, str]]:
@@ -50,7 +58,7 @@ def statements(file: Path) -> Iterator[tuple[int, str, str]]:
         while line.endswith("\\") and not line.lstrip().startswith("#"):
             line = f"{line[:-1]} {next(lines, (0, ''))[1]}"
         words = line.split(None, 1)
-        if words and (words[0][0] != "#" or words[0] == "#MRGB"):
+        if words and words[0][0] != "#":
             yield number, words[0], words[1].rstrip() if len(words) > 1 else ""
 
 
@@ -68,7 +76,7 @@ def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[
                 changes.note("has no material or no value, and means nothing", f"{file.name}: line {line}", name=word)
             else:
                 if material.lines.get(word.lower(), (0, "", rest))[2] != rest:
-                    material.say((None, "is stated twice, and the last is taken"), word)
+                    material.say(None, word, "is stated twice, and the last is taken")
                 material.lines[word.lower()] = (line, word, rest)
     return materials
 
@@ -106,6 +114,41 @@ def _find(folder: Path, name: str) -> Path | None:
     return file if file.is_file() else None
 
 
+@dataclass(frozen=True, slots=True)
+class _Image:
+    """An image file, and the options that stand before its name, without their hyphens."""
+
+    file: Path
+    options: dict[str, str]
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether Mitsuba reads the file as it is; of other formats and modes it misreads some without a word."""
+        with suppress(OSError, ValueError, SyntaxError), Pillow.open(self.file) as image:
+            return image.format in ("PNG", "JPEG") and image.mode in ("L", "RGB", "RGBA")
+        return False
+
+    def numbers(self, option: str, otherwise: float = 0.0) -> list[float]:
+        """The numbers of an option, three or those that are missing `otherwise`."""
+        words = [word for word in self.options.get(option, "").split() if word not in ("on", "off")]
+        return [*map(float, words), *[otherwise] * 3][:3]
+
+    def values(self, *, raw: bool = False) -> images.Image:
+        """Its values as they are stored (H, W, 4)."""
+        return images.decode(self.file.read_bytes(), str(self.file), raw=raw)
+
+    def map(self, factor: Sequence[float]) -> Map:
+        """Its linear colours times a factor."""
+        return Map(images.linear(self.values()[..., :3]) * np.array(factor, np.float32), self.lie)
+
+    @property
+    def lie(self) -> Lie:
+        """How it lies. MTL's v goes upwards, and Mitsuba's downwards."""
+        (su, sv, _), (u, v, _) = self.numbers("s", 1.0), self.numbers("o")
+        wrap = "clamp" if self.options.get("clamp") == "on" else "repeat"
+        return Lie(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))
+
+
 @dataclass(slots=True, eq=False)
 class Material:
     """One material: its lines, as (number, word, rest), by their first words in small letters."""
@@ -115,11 +158,44 @@ class Material:
     changes: Changes
     lines: dict[str, tuple[int, str, str]] = field(default_factory=dict)
 
-    def number(self, key: str, otherwise: float) -> float:
-        """The first number of a line."""
-        return self.colour(key, (otherwise,))[0]
+    @property
+    def has_images(self) -> bool:
+        """Whether it names images."""
+        return any(key.startswith("map_") for key in self.lines)
 
-    def colour(self, key: str, otherwise: Sequence[float] = (0.0, 0.0, 0.0)) -> Sequence[float]:
+    def say(self, effect: Effect | None, name: str, meaning: str) -> None:
+        """Say what a statement means that is not carried over, and what of the picture that changes, if anything."""
+        self.changes.say(effect, name, meaning, f"material {self.name!r}")
+
+    def put(self, top: Element, stem: Path) -> Element | None:
+        """Make a Mitsuba material of an empty element; the emitter of what shines with it.
+
+        Names of images that are changed begin with `stem`.
+        """
+        writer = Writer(stem, self.changes, f"material {self.name!r}")
+        for key, (_, word, _) in self.lines.items():
+            if not _CARRIED.fullmatch(key):
+                self.say(_EFFECTS.get(key, "colour"), word, "is not carried over")
+        illum = self._number("illum", 2)
+        if illum not in _LIT:  # 10 is seen by its shadows alone
+            meaning = f"is lit as by model {1 if illum == 0 else 2} here"
+            self.say("colour" if illum == 10 else None, f"illum {illum:g}", meaning)
+        opacity, glow = self._opacity(illum), self._glow()
+        tint = self._cut("tf", _WHITE) if opacity else _WHITE
+        if illum in _GLASS and opacity and not self._is_textured:
+            glass = {"int_ior": self._eta(1.01), "specular_transmittance": constant(*tint)}
+            writer.put_surface(top, "thindielectric", glass)
+            self.say(None, "illum", "becomes clear glass without a thickness, of Ni and Tf; Ke shines in full")
+            return writer.light(glow, None, "map_Ke")
+        if illum in _GLASS:
+            effect: Effect | None = None if {"d", "tr"} & set(self.lines) else "colour"  # many state d 1
+            self.say(effect, f"illum {illum:g}", "is of glass, and is not here, by its d, Tr or images")
+        if min(tint) < 1:
+            self.say("colour", "Tf", "does not tint the light that passes through")
+        self._put_gloss(writer.put_layers(top, opacity, None), illum, writer)
+        return writer.light(glow, opacity, "map_Ke")
+
+    def _numbers(self, key: str, otherwise: Sequence[float] = _BLACK) -> Sequence[float]:
         """The numbers of a line; one stands for all three."""
         line, word, rest = self.lines.get(key, (0, key, ""))
         words = [part for part in rest.partition("#")[0].split() if part.lower() != "-halo"]
@@ -135,19 +211,22 @@ class Material:
             raise SpecError(f"{place}: {word} = {rest!r} is no number, or three")
         return values
 
-    def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
+    def _number(self, key: str, otherwise: float) -> float:
+        return self._numbers(key, (otherwise,))[0]
+
+    def _cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
         """The numbers of a line from 0 to `most`, to which others are cut. Where `otherwise` is white, so is black."""
-        values = self.colour(key, otherwise)
+        values = self._numbers(key, otherwise)
         made: list[float] = np.clip(values, 0, most).tolist()
         if np.abs(np.subtract(made, values)).max() > 1e-3:  # more than rounding
             bounds = "is below 0, and is cut to that" if most == math.inf else f"is cut to what lies in 0 to {most:g}"
-            self.say((effect, bounds), self.lines[key][1])
-        if tuple(otherwise) == WHITE and max(made) <= 0:
-            self.say((None, "is black where black is not meant, and is taken for white"), self.lines[key][1])
-            return list(WHITE)
+            self.say(effect, self.lines[key][1], bounds)
+        if tuple(otherwise) == _WHITE and max(made) <= 0:
+            self.say(None, self.lines[key][1], "is black where black is not meant, and is taken for white")
+            return list(_WHITE)
         return made
 
-    def image(self, key: str) -> Image | None:
+    def _image(self, key: str) -> _Image | None:
         """The image of a line; None if it is not there, which is said."""
         line, word, rest = self.lines.get(key, (0, key, ""))
         if not rest:
@@ -160,71 +239,83 @@ class Material:
         if file is None:
             self.changes.lose("colour", word, "images are not there", f"{self.file.name}: line {line}: {rest}")
             return None
-        made = Image(file, options)
         for name, value in options.items():
-            if name in ("s", "o", "bm") and {"on", "off"} & set(value.split()):
-                place = f"{self.file}: line {line}: material {self.name!r}"
-                raise SpecError(f"{place}: {word} -{name} {value} is no number")
-            if name not in _CARRIED and not _is_neutral(name, value):
-                self.say(("colour", "is an option that is not carried over"), f"{word} -{name}")
-        return made
+            if not _OPTIONS.fullmatch(f"{name} {value}"):
+                self.say("colour", f"{word} -{name}", "is an option that is not carried over")
+        return _Image(file, options)
 
     @property
-    def has_images(self) -> bool:
-        """Whether it names images."""
-        return any(key.startswith("map_") or key in RELIEFS for key in self.lines)
+    def _is_textured(self) -> bool:
+        return any(self._image(key) for key in ("map_kd", "map_d"))
 
-    def say(self, meaning: Meaning, name: str) -> None:
-        """Say what a statement means that is not carried over."""
-        self.changes.say(meaning[0], name, meaning[1], f"material {self.name!r}")
+    def _glow(self) -> Map:
+        """What it emits, by `Ke` and an image."""
+        image = self._image("map_ke")
+        ke = self._cut("ke", _WHITE if image else _BLACK, math.inf, "light")
+        return image.map(ke) if image else constant(*ke)
 
-    @property
-    def relief(self) -> str:
-        """The key of its normal map, or else of its bump map, or nothing."""
-        return next((key for key in RELIEFS if key in self.lines), "")
+    def _opacity(self, illum: float) -> Map | None:
+        """Its opacity; None is opaque. An image's own opacity where it has some, or else its brightness."""
+        opacity, image = self._dissolve(illum), self._image("map_d")
+        if image is None:
+            return constant(opacity) if opacity < 1 else None
+        values = image.values(raw=True)
+        grey = values[..., 3:] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2, keepdims=True)
+        return Map(np.float32(opacity) * grey.clip(0, 1), image.lie)
 
+    def _dissolve(self, illum: float) -> float:
+        """Its `d`, or 1 − `Tr`, unless that hides what is there to be seen."""
+        d, tr = self.lines.get("d"), self._cut("tr", (0.0,))[0]
+        opacity = self._cut("d", (1 - tr,))[0]
+        if d and d[2].lower().startswith("-halo") and opacity < 1:
+            self.say("colour", "d -halo", "is as opaque at its edges as in its middle")
+        if d and "tr" in self.lines and abs(opacity + tr - 1) > 0.01:
+            self.say(None, f"Tr {tr:g}", f"is left out, as d says how opaque it is: {opacity:g}")
+        if opacity > 0 or (illum in _GLASS and not self._is_textured):
+            return opacity
+        if not d or self._is_textured or max(self._numbers("ke")) > 0 or "map_ke" in self.lines:
+            self.say(None, "d 0" if d else "Tr 1", "would be unseen by this, and is opaque")
+            return 1
+        self.say(None, "d 0", "is not seen, as the file says")
+        return opacity
 
-def _is_neutral(name: str, value: str) -> bool:
-    """Whether an option changes nothing."""
-    try:
-        numbers = [float(part) for part in value.split()]
-    except ValueError:
-        return value == "off"
-    return numbers == ([0, 1] if name == "mm" else [0] * len(numbers))
+    def _put_gloss(self, place: Element, illum: float, writer: Writer) -> None:
+        """Put what lies below opacity: diffuse, with the gloss of plastic or without."""
+        ks, colour = self._numbers("ks"), self._colour()
+        if max(ks) <= _SHINES or illum in (0, 1):
+            writer.put_surface(place, "diffuse", {"reflectance": colour})
+            return
+        alpha = max(math.sqrt(2 / (max(self._number("ns", 30.0), 0.0) + 2)), 0.02)
+        if illum in _MIRRORS:
+            self.say("colour", f"illum {illum:g}", "reflects as plastic does here, and not as a mirror")
+        is_tinted = max(ks) - min(ks) > 0.1 * max(ks) and alpha > _SMOOTH
+        said = "becomes the gloss of plastic, by Ns" + ", without its colour" * is_tinted
+        self.say("colour" if is_tinted else None, "Ks", said)
+        if alpha <= _SMOOTH:
+            tint = constant(*(max(part, 0) / max(ks) for part in ks))
+            parts = {"diffuse_reflectance": colour, "alpha": constant(alpha), "specular_reflectance": tint}
+            writer.put_surface(place, "roughplastic", parts)
+        else:
+            parts = {"base_color": colour, "roughness": constant(math.sqrt(alpha)), "eta": self._eta(1.5)}
+            writer.put_surface(place, "principled", parts)
 
+    def _eta(self, otherwise: float) -> Map:
+        """Its index of refraction."""
+        eta = self._number("ni", 1.5)
+        if eta < 1.01:
+            self.say(None, f"Ni {eta:g}", f"is no index of what refracts, and is taken for {otherwise:g}")
+        return constant(eta if eta >= 1.01 else otherwise)
 
-@dataclass(frozen=True, slots=True)
-class Image:
-    """An image file, and the options that stand before its name, without their hyphens."""
-
-    file: Path
-    options: dict[str, str]
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether Mitsuba reads the file as it is; of other formats and modes it misreads some without a word."""
-        with suppress(OSError, ValueError, SyntaxError), Pillow.open(self.file) as image:
-            return image.format in ("PNG", "JPEG") and image.mode in ("L", "RGB", "RGBA")
-        return False
-
-    def triple(self, option: str, otherwise: float = 0.0) -> list[float]:
-        """The numbers of an option, three or those that are missing `otherwise`."""
-        return [*(float(part) for part in self.options.get(option, "").split()), *[otherwise] * 3][:3]
-
-    def values(self, *, raw: bool = False) -> images.Image:
-        """Its values as they are stored (H, W, 4)."""
-        return images.decode(self.file.read_bytes(), str(self.file), raw=raw)
-
-    def map(self, factor: Sequence[float] = WHITE, *, raw: bool = False) -> Map:
-        """Its colours times a factor, linear unless raw."""
-        if min(factor) >= 1 and self.is_plain:
-            return Map(np.zeros((0, 0, 3), np.float32), self.lie, self.file)
-        values = self.values(raw=raw)[..., :3]
-        return Map((values.clip(0, 1) if raw else images.linear(values)) * np.array(factor, np.float32), self.lie)
-
-    @property
-    def lie(self) -> Lie:
-        """How it lies. MTL's v goes upwards, and Mitsuba's downwards."""
-        (su, sv, _), (u, v, _) = self.triple("s", 1.0), self.triple("o")
-        wrap = "clamp" if self.options.get("clamp") == "on" else "repeat"
-        return Lie(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))
+    def _colour(self) -> Map:
+        image = self._image("map_kd")
+        kd = self._cut("kd", _WHITE if image else _GREY)
+        if image is None:
+            if "kd" not in self.lines and self.lines:
+                self.say(None, "Kd", "is not there; the surface is grey")
+            return constant(*kd)
+        if min(kd) >= 1 and image.is_plain:
+            return Map(np.zeros((0, 0, 3), np.float32), image.lie, image.file)
+        colour = image.map(kd)
+        if colour.values.max() > 1.001:
+            self.say("colour", "map_Kd", "goes beyond 1, which no surface reflects, and is cut")
+        return replace(colour, values=colour.values.clip(0, 1))

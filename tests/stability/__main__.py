@@ -20,10 +20,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tests.stability.scenes.case import BdptSettings
-
 if TYPE_CHECKING:
     from tests.stability.invariances import Invariance
+    from tests.stability.scenes.case import BdptSettings
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -31,7 +30,7 @@ def main(arguments: Sequence[str]) -> int:
         prog="python -m tests.stability", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--only", nargs="+", action="extend", default=[], help="rows (1 … 36) or scenes")
-    parser.add_argument("--settings", nargs="+", type=settings, default=[], help="connections,light_ratio[,guided]")
+    parser.add_argument("--settings", nargs="+", default=[], help="connections,light_ratio[,guided]")
     parser.add_argument("--seed", type=int, default=0, help="first seed")
     parser.add_argument("--quick", action="store_true", help="as in the tests: small images, mostly one settings")
     parser.add_argument("--threads", type=int, default=1, help="threads of Dr.Jit")
@@ -45,8 +44,9 @@ def main(arguments: Sequence[str]) -> int:
     from tests.stability import invariances, report, rows
 
     try:
-        checks = invariances.chosen(options.invariances or [], long=not options.quick)
-        scenes = rows.chosen(options.only, quick=options.quick, settings=options.settings)
+        checks = invariances.choose(options.invariances or [], long=not options.quick)
+        settings = [parse_settings(text) for text in options.settings]
+        scenes = rows.choose(options.only, quick=options.quick, settings=settings)
     except ValueError as error:
         parser.error(str(error))
     if options.invariances is not None:
@@ -56,21 +56,24 @@ def main(arguments: Sequence[str]) -> int:
         scenes,
         quick=options.quick,
         seed=options.seed,
-        settings=options.settings,
+        settings=settings,
         failures=options.out / "failures",
         log=lambda line: print(line, file=sys.stderr, flush=True),
     )
     command = shlex.join(["python", "-m", "tests.stability", *arguments])
     report.write(found, options.out, command)
     print(report.markdown(found, command))
-    held = bool(options.only or options.settings) or hold(checks)
+    held = bool(options.only or settings) or hold(checks)
     return 0 if held and found.passed else 1
 
 
-def settings(text: str) -> BdptSettings:
+def parse_settings(text: str) -> BdptSettings:
+    """Settings from "connections,light_ratio" or "connections,light_ratio,guided"; raises ValueError for others."""
+    from tests.stability.scenes.case import BdptSettings
+
     connections, light_ratio, *guided = text.split(",")
     if guided not in ([], ["guided"]):
-        raise ValueError(text)
+        raise ValueError(f"settings are {text!r}; allowed is connections,light_ratio[,guided]")
     return BdptSettings(int(connections), float(light_ratio), bool(guided))
 
 

@@ -22,8 +22,7 @@ from photonfarm.core.statistics import BlockTest, block_z_test
 from tests.stability.runner import ROUNDING, SIGNIFICANCE, plus_minus
 from tests.stability.scenes import hard_scenes
 from tests.stability.scenes.cameras import scaled
-from tests.stability.scenes.case import ALL, BdptSettings, Effort, Images, SceneDict
-from tests.stability.scenes.truths import TRUTH_SEEDS, load, render
+from tests.stability.scenes.case import ALL, TRUTH_SEEDS, BdptSettings, Effort, Images, SceneDict, load, render
 from tests.stability.weights import weight_check
 
 QUICK = Effort(size=16, blocks=4, seeds=8, spp=32, truth_spp=128, resolution=0.02)
@@ -33,7 +32,6 @@ COUNTS = tuple(BdptSettings(c, r) for c, r in product((0, 1, 4), (0.0, 0.25, 1.0
 """(connections, light_ratio) whose images must have equal means; connections without light paths are refused."""
 _SKEWED = ("glass_caustic", "floor_caustic", "mirror_room")
 """The scenes with rare bright samples, for which a few renders prove too little; they have rows of their own."""
-_MORE_COUNTS = tuple(name for name in hard_scenes.HARD_SCENES if name not in _SKEWED)
 _LANES = {False: 256, True: 8192}  # primary rays for the weights' check
 
 
@@ -75,59 +73,19 @@ class Invariance:
 def checks(*, long: bool) -> Iterator[Invariance]:
     """All invariances; the long version renders more scenes, with tighter limits."""
     effort = LONG if long else QUICK
-    for name, build in _scenes(long, ("plastics", "many_lights"), _MORE_COUNTS).items():
-        yield Invariance(
-            f"counts-{name}",
-            "every (connections, light_ratio) gives the same mean",
-            partial(equal_means, build, effort),
-            long,
-        )
-    for name, build in _scenes(long, ("many_lights",), ("hundred_lights",)).items():
-        yield Invariance(
-            f"additive-{name}",
-            "the image of all lights is the sum of the images of two halves of them",
-            partial(additive, build, effort),
-            long,
-        )
-    for name, build in _scenes(long, ("many_lights",), ("plastics", "rotated_envmap", "mirror_room")).items():
-        yield Invariance(
-            f"linear-{name}", "radiances times a factor give the image times it", partial(linear, build, effort), long
-        )
+    for kind, claim, find, quick, more in _KINDS:
+        for name in (*quick, *more) if long else quick:
+            check = partial(find, hard_scenes.HARD_SCENES[name], effort)
+            yield Invariance(f"{kind}-{name.replace('_', '-')}", claim, check, long)
     for factor in _NEAR_SCALED:
-        yield Invariance(
-            f"scale-{factor:g}", "lengths times a factor give the same image", partial(scale, factor, effort), long
-        )
-    for name, build in _scenes(long, ("many_lights",), ("cove",)).items():
-        yield Invariance(
-            f"update-{name}",
-            "a scene edited in place gives the image of the same scene loaded anew",
-            partial(update_equals_reload, build, effort),
-            long,
-        )
-    for name, build in _scenes(long, ("many_lights",), ("cornell", "plastics", "glass_caustic", "cove")).items():
-        yield Invariance(
-            f"seed-{name}",
-            "one seed gives one image, alone or among others, bit by bit",
-            partial(reproducible, build, effort),
-            long,
-        )
-    for name, build in _scenes(long, ("many_lights",), ("cornell", "glass_caustic", "cove")).items():
-        yield Invariance(
-            f"recorded-{name}",
-            "launches that are recorded give the images of those that are traced anew",
-            partial(recorded, build, effort),
-            long,
-        )
+        claim = "lengths times a factor give the same image"
+        yield Invariance(f"scale-{factor:g}", claim, partial(scale, factor, effort), long)
     for name, build in (weight_check.LONG_SCENES if long else weight_check.SCENES).items():
-        yield Invariance(
-            f"weights-{name}",
-            "weights of one path sum to 1 and are the oracle's",
-            partial(oracles_weights, build, _LANES[long]),
-            long,
-        )
+        claim = "weights of one path sum to 1 and are the oracle's"
+        yield Invariance(f"weights-{name}", claim, partial(oracles_weights, build, _LANES[long]), long)
 
 
-def chosen(names: Sequence[str], *, long: bool) -> list[Invariance]:
+def choose(names: Sequence[str], *, long: bool) -> list[Invariance]:
     """The checks of these names, or whose names begin with them; all for an empty choice.
 
     Raises ValueError for a name that matches none.
@@ -152,12 +110,6 @@ def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
     passed = f"**{len(lines) - len(failures)} of {len(lines)} invariances hold.**"
     parts = [passed, "\n".join([head, *lines]), "\n".join(failures)]
     return "\n\n".join(part for part in parts if part)
-
-
-def _scenes(long: bool, quick: tuple[str, ...], more: tuple[str, ...] = ()) -> dict[str, Callable[[int], SceneDict]]:
-    """Scenes by name: the quick ones, and for the long version also those in ``more``."""
-    names = (*quick, *more) if long else quick
-    return {name.replace("_", "-"): hard_scenes.HARD_SCENES[name] for name in names}
 
 
 # ------------------------------------------------ The checks ------------------------------------------------
@@ -336,6 +288,54 @@ def oracles_weights(build: Callable[[int], SceneDict], lanes: int) -> tuple[list
             f"sums within {found.sum_error:.1g}, weights within {found.weight_error:.1g}"
         )
     return faults, "; ".join(figures)
+
+
+_MANY = ("many_lights",)
+_KINDS: tuple[tuple[str, str, Callable[..., tuple[list[str], str]], tuple[str, ...], tuple[str, ...]], ...] = (
+    (
+        "counts",
+        "every (connections, light_ratio) gives the same mean",
+        equal_means,
+        ("plastics", *_MANY),
+        tuple(n for n in hard_scenes.HARD_SCENES if n not in (*_SKEWED, "plastics", *_MANY)),
+    ),
+    (
+        "additive",
+        "the image of all lights is the sum of the images of two halves of them",
+        additive,
+        _MANY,
+        ("hundred_lights",),
+    ),
+    (
+        "linear",
+        "radiances times a factor give the image times it",
+        linear,
+        _MANY,
+        ("plastics", "rotated_envmap", "mirror_room"),
+    ),
+    (
+        "update",
+        "a scene edited in place gives the image of the same loaded anew",
+        update_equals_reload,
+        _MANY,
+        ("cove",),
+    ),
+    (
+        "seed",
+        "one seed gives one image, alone or among others, bit by bit",
+        reproducible,
+        _MANY,
+        ("cornell", "plastics", "glass_caustic", "cove"),
+    ),
+    (
+        "recorded",
+        "launches that are recorded give the images of those that are traced anew",
+        recorded,
+        _MANY,
+        ("cornell", "glass_caustic", "cove"),
+    ),
+)
+"""Kinds of checks: name, claim, function of a scene, scenes of the quick version, and those that the long one adds."""
 
 
 # ------------------------------------------------ Their parts ------------------------------------------------

@@ -10,15 +10,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
 from photonfarm.core.statistics import BlockTest, block_means, block_z_test, student_to_normal, two_sided_limit
-from tests.stability.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal
-from tests.stability.scenes.truths import PATH, load, render
+from tests.stability.scenes.case import BdptSettings, Effort, HardScene, Images, Refusal, load, render
 
 SIGNIFICANCE = 4e-6
 """The probability that a right scene fails with one pair of settings: 0.1 % for 250 pairs, more than there are."""
@@ -31,38 +30,24 @@ In the shining sphere `path` itself is 0.04 % too bright at depth 2, 0.07 % at d
 
 @dataclass(frozen=True, slots=True)
 class SceneResult:
-    """A scene's result with one pair of settings: a line of the table."""
+    """A scene's result with one pair of settings; a refusal has no figures."""
 
     row: int | None
-    name: str
+    label: str  # as `--only` takes it
     hard: str
     truth: str
     settings: str  # connections, light paths per eye path
-    size: int
-    seeds: int
-    spp: int
-    truth_spp: int | None  # None for a truth that is known exactly
-    z_max: float | None  # largest block |z|, and that of the whole image
-    z_limit: float | None
-    mean_ratio: float | None  # bdpt over truth, whole images
-    mean_ratio_standard_error: float | None
-    resolution: float | None  # the largest standard error allowed
-    seen_bias: float | None  # the part of the mean by which the image must be off to fail, if the noise does not help
-    seen_block_bias: float | None  # likewise for its worst block, as part of the block's mean
-    max_over_mean: float | None  # brightest pixel of any render over the mean
-    truth_max_over_mean: float | None
-    nan: int
-    inf: int
     cpu_s: float
     faults: tuple[str, ...]  # why it failed; empty: it passed
     command: str  # the command that renders it again
-    path_ratio: float | None = None  # `path` over a truth that is known exactly: the effect of rounding alone
-    path_ratio_standard_error: float | None = None
-
-    @property
-    def label(self) -> str:
-        """Number and name, as `--only` takes them."""
-        return f"{self.row:02d}-{self.name}" if self.row else self.name
+    z_max: float | None = None  # largest block |z|, and that of the whole image
+    z_limit: float | None = None
+    mean_ratio: float | None = None  # bdpt over truth, whole images
+    mean_ratio_standard_error: float | None = None
+    resolution: float | None = None  # the largest standard error allowed
+    max_over_mean: float | None = None  # brightest pixel of any render over the mean
+    truth_max_over_mean: float | None = None
+    not_finite: int = 0  # values
 
     @property
     def verdict(self) -> str:
@@ -95,91 +80,69 @@ def run(
     Yields nothing for a scene without a quick version, or that is not tried with any of these settings.
     """
     if isinstance(item, Refusal):
-        yield _refused(item, quick)
+        yield SceneOutcome(_try_refusal(item, quick))
         return
     effort = item.quick if quick else item.long
-    if effort is None:
-        return
     usual = item.quick_settings if quick else item.settings
     tried = [s for s in item.settings if s in settings] if settings else usual
-    if not tried:
+    if effort is None or not tried:
         return
     start = time.process_time()
     truth = item.truth.images(item, effort, seed)
-    path = _path_ratio(item, effort, seed, truth)
     scene = load(item.build(effort.size))
     if item.edit is not None:
         item.edit(scene)
     for counts in tried:
-        integrator = {"type": "bdpt", "max_depth": item.max_depth, "rr_depth": item.rr_depth}
-        integrator |= counts.parameters
+        integrator = {"type": "bdpt", "max_depth": item.max_depth, "rr_depth": item.rr_depth, **counts.parameters}
         bdpt = render(scene, integrator, effort.spp, range(seed, seed + effort.seeds))
         command = f"python -m tests.stability --only {item.label} --settings {counts} --seed {seed}"
-        outcome = _judged(item, effort, counts, bdpt, truth, start, command + " --quick" * quick)
-        yield replace(outcome, result=replace(outcome.result, path_ratio=path[0], path_ratio_standard_error=path[1]))
+        yield _judge(item, effort, counts, bdpt, truth, start, command + " --quick" * quick)
         start = time.process_time()
 
 
-def _path_ratio(item: HardScene, effort: Effort, seed: int, truth: Images) -> tuple[float | None, float | None]:
-    """The mean ratio of `path` to the truth, and its standard error; None if the truth is a render."""
-    if len(truth) > 1:
-        return None, None
-    found = compare(PATH.images(item, effort, seed), truth, 1)
-    return _finite(found.mean_ratio), _finite(found.mean_ratio_standard_error)
-
-
-def _judged(
+def _judge(
     item: HardScene, effort: Effort, settings: BdptSettings, bdpt: Images, truth: Images, start: float, command: str
 ) -> SceneOutcome:
     with np.errstate(all="ignore"):  # values that are not finite, and black images, are judged below
         blocks, whole = compare(bdpt, truth, effort.blocks), compare(bdpt, truth, 1)
-        brightest, truth_brightest = _max_over_mean(bdpt), _max_over_mean(truth)
-    z_max = float(np.fmax(blocks.z_max, whole.z_max))
-    faults = tuple(_faults(item, effort, bdpt, blocks, whole, brightest))
+        brightest, truth_brightest = (float(np.max(images) / np.mean(images)) for images in (bdpt, truth))
+    figures = {
+        "z_max": float(np.fmax(blocks.z_max, whole.z_max)),
+        "z_limit": blocks.z_limit,
+        "mean_ratio": blocks.mean_ratio,
+        "mean_ratio_standard_error": blocks.mean_ratio_standard_error,
+        "resolution": effort.resolution,
+        "max_over_mean": brightest,
+        "truth_max_over_mean": truth_brightest,
+    }
     result = SceneResult(
-        item.row,
-        item.name,
-        item.hard,
-        item.truth.name,
-        str(settings),
-        effort.size,
-        effort.seeds,
-        effort.spp,
-        effort.truth_spp if len(truth) > 1 else None,
-        _finite(z_max),
-        blocks.z_limit,
-        _finite(blocks.mean_ratio),
-        _finite(blocks.mean_ratio_standard_error),
-        effort.resolution,
-        _finite(seen_bias(bdpt, truth, 1)),
-        _finite(seen_bias(bdpt, truth, effort.blocks)),
-        _finite(brightest),
-        _finite(truth_brightest),
-        int(np.isnan(bdpt).sum()),
-        int(np.isinf(bdpt).sum()),
-        time.process_time() - start,
-        faults,
-        command,
+        row=item.row,
+        label=item.label,
+        hard=item.what_is_hard,
+        truth=item.truth.name,
+        settings=str(settings),
+        cpu_s=time.process_time() - start,
+        faults=tuple(_find_faults(item, effort, bdpt, blocks, whole, brightest)),
+        command=command,
+        not_finite=int((~np.isfinite(bdpt)).sum()),
+        **{name: value if math.isfinite(value) else None for name, value in figures.items()},
     )
     return SceneOutcome(result, Renders(bdpt, truth, blocks.z))
 
 
-def _faults(
+def _find_faults(
     item: HardScene, effort: Effort, bdpt: Images, blocks: BlockTest, whole: BlockTest, brightest: float
 ) -> Iterator[str]:
     bad = int((~np.isfinite(bdpt)).sum())
     if bad:
         yield f"{bad} values are not finite"
         return
-    if not blocks.passed:
-        yield f"a block's |z| is {blocks.z_max:.2f}, the limit {blocks.z_limit:.2f}"
-    if not whole.passed:
-        yield f"the mean's |z| is {whole.z_max:.2f}, the limit {whole.z_limit:.2f}"
-    if not blocks.mean_ratio_standard_error <= effort.resolution:
-        yield (
-            f"too noisy to tell: the mean ratio's standard error is {blocks.mean_ratio_standard_error:.2g}, allowed is "
-            f"{effort.resolution:g}"
-        )
+    for what, test in (("a block", blocks), ("the mean", whole)):
+        if not test.passed:
+            yield f"{what}'s |z| is {test.z_max:.2f}, the limit {test.z_limit:.2f}"
+    error = blocks.mean_ratio_standard_error
+    if not error <= effort.resolution:
+        yield f"too noisy to tell: the mean ratio's standard error is {error:.2g}, allowed is {effort.resolution:g}"
     if item.max_over_mean is not None and brightest > item.max_over_mean:
         yield f"the brightest pixel is {brightest:.1f} times the mean, allowed is {item.max_over_mean:g}"
 
@@ -198,19 +161,6 @@ def compare(images: Images, truth: Images, blocks: int) -> BlockTest:
     return BlockTest(z, float(np.abs(z).max()), limit, float(each.mean()), ratio_error, bool(np.isfinite(images).all()))
 
 
-def seen_bias(images: Images, truth: Images, blocks: int) -> float:
-    """The smallest bias that fails, as part of a block's mean: that of the worst block, without black ones."""
-    with np.errstate(all="ignore"):
-        means, expected = block_means(images, blocks), block_means(truth, blocks)
-        variance = means.var(axis=0, ddof=1) / len(means)
-        if len(truth) > 1:
-            variance = variance + expected.var(axis=0, ddof=1) / len(truth)
-        level = expected.mean(axis=0)
-        error = np.maximum(np.sqrt(variance), ROUNDING * level)
-        limit = two_sided_limit(1 - (1 - SIGNIFICANCE) ** (1 / level.size))
-        return float(np.max(limit * (error / level)[level > 0], initial=0.0))
-
-
 def plus_minus(value: float, standard_error: float) -> str:
     """A value near 1, two digits of its error, and as many of the value, at most float32's: "1.000260 ± 0.000026"."""
     if not 0 < standard_error < np.inf:
@@ -219,59 +169,31 @@ def plus_minus(value: float, standard_error: float) -> str:
     return f"{value:.{digits}f} ± " + (f"{standard_error:.{digits}f}" if digits < 7 else f"{standard_error:.1e}")
 
 
-def _max_over_mean(images: Images) -> float:
-    return float(np.max(images) / np.mean(images))
-
-
-def _finite(value: float) -> float | None:
-    return value if np.isfinite(value) else None
-
-
 # ------------------------------------------------ Refusals ------------------------------------------------
 
 
-def message_of(refusal: Refusal, size: int = 8) -> str:
-    """The message with which `bdpt` refuses the scene; empty if it renders it."""
-    return _refusal(load(refusal.build(size)), refusal.settings)
-
-
-def _refusal(scene: object, settings: BdptSettings) -> str:
+def message_of(refusal: Refusal, settings: BdptSettings | None = None) -> str:
+    """The message with which `bdpt` refuses the scene, with other settings if given; empty if it renders it."""
     try:
-        mi.load_dict({"type": "bdpt", **settings.parameters}).render(scene, seed=0, spp=1)
+        scene = load(refusal.build(8))
+        mi.load_dict({"type": "bdpt", **(settings or refusal.settings).parameters}).render(scene, seed=0, spp=1)
     except ValueError as error:
         return str(error)
     return ""
 
 
-def _refused(refusal: Refusal, quick: bool) -> SceneOutcome:
-    start = time.process_time()
-    text = message_of(refusal)
+def _try_refusal(refusal: Refusal, quick: bool) -> SceneResult:
+    start, text = time.process_time(), message_of(refusal)
     faults = [] if refusal.sentence in text else [f"not refused with {refusal.sentence!r}, but with {text!r}"]
-    if refusal.allowed is not None and (again := _refusal(load(refusal.build(8)), refusal.allowed)):
+    if refusal.allowed is not None and (again := message_of(refusal, refusal.allowed)):
         faults.append(f"refused with connections,light_ratio = {refusal.allowed} too: {again}")
-    result = SceneResult(
-        refusal.row,
-        refusal.name,
-        text,
-        "refusal",
-        str(refusal.settings),
-        8,
-        1,
-        1,
-        None,
-        None,
-        None,
-        None,
-        None,
-        None,
-        None,
-        None,
-        None,
-        None,
-        0,
-        0,
-        time.process_time() - start,
-        tuple(faults),
-        f"python -m tests.stability --only {refusal.label}" + " --quick" * quick,
+    return SceneResult(
+        row=refusal.row,
+        label=refusal.label,
+        hard=text,
+        truth="refusal",
+        settings=str(refusal.settings),
+        cpu_s=time.process_time() - start,
+        faults=tuple(faults),
+        command=f"python -m tests.stability --only {refusal.label}" + " --quick" * quick,
     )
-    return SceneOutcome(result)

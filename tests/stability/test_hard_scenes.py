@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.stability.pictures import keep
+from tests.stability.report import keep
 from tests.stability.rows import REFUSALS, ROWS, SCENES
 from tests.stability.runner import message_of, run
 from tests.stability.scenes.case import GUIDED, BdptSettings, HardScene, Refusal
@@ -45,7 +45,7 @@ def check(scene: HardScene, *settings: BdptSettings) -> None:
         if outcome.result.faults:
             folder = keep(outcome, FAILURES).resolve()
             pytest.fail(
-                f"{scene.label} ({outcome.result.settings}), {scene.hard}; truth: {scene.truth.name}\n"
+                f"{scene.label} ({outcome.result.settings}), {scene.what_is_hard}; truth: {scene.truth.name}\n"
                 f"{'; '.join(outcome.result.faults)}\nmean ratio {outcome.result.mean_ratio} ± "
                 f"{outcome.result.mean_ratio_standard_error}\nagain: {outcome.result.command}\nrenders: {folder}"
             )

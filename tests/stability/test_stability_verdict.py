@@ -10,9 +10,8 @@ import pytest
 
 from tests.stability import runner
 from tests.stability.rows import SCENES
-from tests.stability.runner import SceneOutcome, compare, run, seen_bias
-from tests.stability.scenes.case import FIRST, QUICK, BdptSettings
-from tests.stability.scenes.truths import rendered
+from tests.stability.runner import SceneOutcome, compare, run
+from tests.stability.scenes.case import FIRST, QUICK, BdptSettings, rendered
 
 
 def scene(label: str) -> Any:
@@ -39,18 +38,6 @@ def test_a_dark_block_is_found_between_renders() -> None:
     assert compare(a, b, 4).passed
     a[:, :4, :4] *= 0.9
     assert not compare(a, b, 4).passed
-
-
-def test_what_would_be_seen_is_what_fails() -> None:
-    truth = np.ones((1, 16, 16, 3))
-    images = noisy(1.0, 0.5, 1)
-    seen = seen_bias(images, truth, 1)
-    offset = images.mean() - 1
-    assert 0.01 < seen < 0.2
-    assert compare(images - offset + 0.7 * seen, truth, 1).passed
-    assert not compare(images - offset + 3 * seen, truth, 1).passed  # few seeds: Student's t is wider than the normal
-    truth[:, :4, :4] = 0
-    assert np.isfinite(seen_bias(images, truth, 4)), "black blocks are left out"
 
 
 def test_differences_of_rounding_pass() -> None:
@@ -84,15 +71,13 @@ def test_spikes_fail_where_a_row_bounds_them() -> None:
     assert any("brightest" in fault for fault in only(spiky).result.faults)
 
 
-@pytest.mark.parametrize(("value", "nan", "inf"), [(np.nan, 1, 0), (np.inf, 0, 1), (-np.inf, 0, 1)])
-def test_a_value_that_is_not_finite_is_counted_and_fails(
-    value: float, nan: int, inf: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_not_finite_is_counted_and_fails(value: float, monkeypatch: pytest.MonkeyPatch) -> None:
     images = np.full((12, 16, 16, 3), 0.37)
     images[3, 5, 7, 1] = value
     monkeypatch.setattr(runner, "render", lambda *_: images)
     result = only(scene("05-empty")).result
-    assert (result.nan, result.inf) == (nan, inf)
+    assert result.not_finite == 1
     assert result.faults == ("1 values are not finite",)
 
 
@@ -103,8 +88,3 @@ def test_a_black_image_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_settings_that_are_not_complete_are_not_tried() -> None:
     assert list(run(scene("14-point-caustic"), quick=True, settings=[BdptSettings(0, 0.0)])) == []
-
-
-def test_one_seed_gives_one_result() -> None:
-    first, again = (only(scene("05-empty"), seed=3).result for _ in range(2))
-    assert replace(first, cpu_s=0.0) == replace(again, cpu_s=0.0)

@@ -76,16 +76,6 @@ def test_a_neutral_guide_has_the_density_of_no_guide() -> None:
     np.testing.assert_allclose(np.array(start.factor), np.array(plain.emission_factor(start.emitter)), rtol=1e-5)
 
 
-def test_positions_are_guided_on_rectangles_alone() -> None:
-    scene = loaded(ball_light)
-    plain = read_lights(scene)
-    lights = plain.guide_with(at_random(Layout(1, 2, 4)), scene)
-    assert lights.guided is not None
-    by_direction = np.array(lights.guided.gain).reshape(4, 16)
-    assert np.ptp(by_direction, axis=1).max() < 1e-5 * by_direction.max()
-    assert np.ptp(by_direction[:, 0]) > 0.1
-
-
 @pytest.mark.parametrize("towards", [(1, 2, 3), grid._AXIS, (0, 0, 1)], ids=str)
 def test_a_light_in_any_direction_has_a_frame(towards: tuple[float, float, float]) -> None:
     """The frame once had no directions for (1, 2, 3), so that all light paths of such a sun were lost."""
@@ -129,15 +119,6 @@ def test_any_guide_leaves_the_mean(
     assert_equal_means(np.stack(images), renders(scene, {**BDPT, **counts}, spp, range(100, 112)))
 
 
-def test_a_learned_guide_leaves_the_mean_of_a_caustic(renders: Any, assert_equal_means: Any) -> None:
-    scene = loaded(hard_scenes.glass_caustic)
-    plain, guided = (
-        renders(scene, {**BDPT, "light_ratio": 4.0, "guided_light": guided}, 512, seeds)
-        for guided, seeds in ((False, range(16)), (True, range(100, 116)))
-    )
-    assert_equal_means(guided, plain)
-
-
 def test_guided_light_paths_halve_the_error_of_a_caustic(renders: Any) -> None:
     scene = loaded(hard_scenes.floor_caustic, 32)
     settings = {**BDPT, "connections": 0, "light_ratio": 4.0, "record": True}
@@ -167,24 +148,11 @@ def test_a_guide_that_is_given_serves_all_images_alike() -> None:
         np.testing.assert_array_equal(alone, image)
 
 
-def test_nothing_is_learned_where_there_are_no_light_paths() -> None:
-    scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
-    for settings in ({"guided_light": False}, {"guided_light": True, "max_depth": 2}):
-        assert mi.load_dict({**BDPT, **settings}).learn_guide(scene, sensor, 0) is None
-
-
 def test_a_guide_of_other_lights_is_refused() -> None:
     scene = loaded(hard_scenes.cornell)
     guide = LightGuide(StartGuide.neutral(Layout.of(3)), None)
     with pytest.raises(ValueError, match="learned with 3 lights, the scene has 1"):
         mi.load_dict({**BDPT, "guided_light": True}).render(scene, spp=1, guide=guide)
-
-
-def test_a_guide_is_refused_without_guided_light() -> None:
-    scene = loaded(hard_scenes.cornell)
-    guide = LightGuide(StartGuide.neutral(Layout.of(1)), None)
-    with pytest.raises(ValueError, match="guided_light is false"):
-        mi.load_dict(BDPT).render(scene, spp=1, guide=guide)
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])

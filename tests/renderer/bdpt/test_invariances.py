@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import mitsuba as mi
-import numpy as np
 import pytest
 
 from photonfarm.renderer.bdpt import launches
-from tests.stability.invariances import COUNTS, Invariance, checks
+from tests.stability.invariances import Invariance, checks
 from tests.stability.scenes.hard_scenes import HARD_SCENES
 
 # The oracle's have tests of their own, and more of them: test_oracle.py
@@ -28,27 +27,7 @@ def test_an_image_does_not_change_with_what_must_not_matter(check: Invariance) -
     assert found.faults == (), f"{check.claim}: {found.figures}\nagain: {check.command}"
 
 
-def test_names_are_unique_and_the_long_version_has_all_quick_checks() -> None:
-    long = [check.name for check in checks(long=True)]
-    assert len(set(long)) == len(long)
-    assert {check.name for check in checks(long=False)} <= set(long)
-
-
-def test_all_counts_are_tried() -> None:
-    assert len(COUNTS) == 3 * 4 - 2
-
-
 # ------------------------------------------------ Several launches ------------------------------------------------
-
-
-def test_images_in_one_launch_or_in_several_are_the_same() -> None:
-    scene = mi.load_dict(HARD_SCENES["plastics"](16), optimize=False)
-    settings = {"type": "bdpt", "max_depth": 4, "light_ratio": 0.3}
-    bdpt = mi.load_dict(settings)
-    each = np.concatenate([np.array(bdpt.render_seeds(scene, scene.sensors()[0], [seed], 4)) for seed in range(5)])
-    bdpt = mi.load_dict({**settings, "paths_at_once": 2 * 16 * 16 * 4})  # two images at a time, and one left over
-    together = np.array(bdpt.render_seeds(scene, scene.sensors()[0], range(5), 4))
-    np.testing.assert_array_equal(together, each)
 
 
 @pytest.mark.parametrize("light_ratio", [0.3, 1.0])

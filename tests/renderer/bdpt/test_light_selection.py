@@ -87,13 +87,6 @@ def test_a_light_that_goes_out_has_probability_zero_everywhere_and_comes_back() 
     np.testing.assert_array_equal(table(scene), before)
 
 
-def test_with_no_light_left_nothing_has_a_probability() -> None:
-    scene = two_lights(0.0, 0.0)
-    assert not table(scene).any()
-    image = np.array(mi.render(scene, integrator=mi.load_dict({"type": "bdpt", "max_depth": 4}), spp=2))
-    assert not image[..., :3].any()
-
-
 def test_light_paths_start_with_the_mean_of_the_probabilities() -> None:
     scene = load(HARD_SCENES["many_lights"](8))
     lights = read_lights(scene)
@@ -144,12 +137,6 @@ def test_extreme_numbers_choose_lights_that_shine() -> None:
         assert not np.isin(np.array(chosen), [k for k, e in enumerate(scene.emitters()) if _is_dark(e)]).any()
 
 
-def test_the_null_light_has_probability_zero() -> None:
-    lights = read_lights(two_lights(1.0, 1.0))
-    assert lights.selection is not None
-    assert not np.array(lights.selection.probability(mi.Point3f(0, 0, 1), dr.zeros(mi.EmitterPtr))).any()
-
-
 # ------------------------------------------------ What they follow ------------------------------------------------
 
 
@@ -175,25 +162,6 @@ def test_a_light_of_a_thousand_times_the_power_is_preferred_accordingly() -> Non
     assert mixed.sum() > CELLS / 2
     np.testing.assert_allclose(brighter[mixed], (1000 * equal / (1000 * equal + 1 - equal))[mixed], atol=2e-3)
     assert np.median(brighter) > 0.99
-
-
-def test_sampling_weights_count_in_the_defensive_share() -> None:
-    scene = {
-        **lit_room(8),
-        "bulb": {"type": "point", "position": [0, 0, 1], "intensity": {"type": "rgb", "value": 1e-6}},
-    }
-    scene["light"]["emitter"]["sampling_weight"] = 3.0
-    loaded = load(scene)
-    bulb = next(k for k, emitter in enumerate(loaded.emitters()) if emitter.get_shape() is None)
-    assert table(loaded)[:, bulb].min() == pytest.approx(selection._DEFENSIVE / 4, rel=1e-2)
-
-
-def test_probabilities_do_not_depend_on_the_image_seed() -> None:
-    scene = load(HARD_SCENES["many_lights"](8))
-    integrator, before = mi.load_dict({"type": "bdpt", "max_depth": 4}), table(scene)
-    for seed in (0, 77):
-        mi.render(scene, integrator=integrator, spp=1, seed=seed)
-        np.testing.assert_array_equal(table(scene), before)
 
 
 # ------------------------------------------------ Edges of cells ------------------------------------------------
@@ -226,28 +194,3 @@ def test_a_wall_between_two_layers_of_cells_is_as_bright_as_it_should_be(
 
 
 # ------------------------------------------------ Kernels ------------------------------------------------
-
-
-def test_no_kernel_is_compiled_after_an_edit() -> None:
-    scene = two_lights(1.0, 2.0)
-    parameters = mi.traverse(scene)
-
-    def compiled() -> int:
-        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-            dr.kernel_history_clear()
-            table(scene)
-            return sum(1 for entry in dr.kernel_history([dr.KernelType.JIT]) if not entry["cache_hit"])
-
-    moved = rectangle([0.1, 0.1], [-0.5, 0.3, 1.9], [0, 0, -1])["to_world"]
-    place = mi.Transform4f(moved)
-    dr.make_opaque(place)
-    parameters["first.to_world"] = place
-    parameters.update()
-    compiled()  # the transform is data from now on
-    for step, value in enumerate((0.0, 0.5, 700.0)):
-        parameters["second.emitter.radiance.value"] = mi.Color3f(value)
-        place = mi.Transform4f(mi.ScalarTransform4f().translate([0.01 * step, 0, 0]) @ moved)
-        dr.make_opaque(place)
-        parameters["first.to_world"] = place
-        parameters.update()
-        assert compiled() == 0, f"radiance {value}, moved by {0.01 * step:g}"

@@ -45,10 +45,6 @@ def test_points_are_nets_in_base_two_in_every_pair_of_dimensions(seed: int, m: i
         assert is_net(all_pairs[:, 2 * pair : 2 * pair + 2], m), f"pair {pair}"
 
 
-def test_every_aligned_run_of_points_is_a_net_too() -> None:
-    assert is_net(points(7, 64, first=64 * 5), 6)
-
-
 def test_a_thousand_sequences_are_nets() -> None:
     sequences, n = 1000, 16
     number = dr.repeat(dr.arange(mi.UInt32, sequences), n)
@@ -94,13 +90,6 @@ def test_each_coordinate_of_a_point_is_uniform_over_the_sequences(read: str, ind
         assert stats.kstest(values, "uniform").pvalue > SIGNIFICANCE
 
 
-def test_each_coordinate_is_uniform_over_the_seeds_of_an_image() -> None:
-    keys = randomness.image_keys(range(1 << 14))
-    rng = randomness.sampler(randomness.stream(keys, randomness.LIGHT), dr.zeros(mi.UInt32, 1 << 14))
-    for values in np.array(rng.next_2d()):
-        assert stats.kstest(values, "uniform").pvalue > SIGNIFICANCE
-
-
 # ------------------------------------------------ Uncorrelated ------------------------------------------------
 
 
@@ -126,12 +115,6 @@ def test_sequences_of_pixels_purposes_and_seeds_are_uncorrelated() -> None:
         rng = randomness.sampler(randomness.stream(randomness.image_keys([0]), purpose), dr.arange(mi.UInt32, n))
         columns.append(np.array(rng.next_2d()).T)
     assert_uncorrelated(np.concatenate(columns, axis=1))
-
-
-def test_points_of_one_index_are_uncorrelated_between_neighbouring_pixels() -> None:
-    values = first_of_each(1 << 14, "next_2d", 3)
-    neighbours = [values[: 1 << 13], values[1 << 13 :], *(np.roll(values, -k, axis=0)[: 1 << 13] for k in (1, 2, 64))]
-    assert_uncorrelated(np.concatenate(neighbours, axis=1))
 
 
 def test_an_estimate_over_sequences_has_the_expectation_of_independent_numbers() -> None:

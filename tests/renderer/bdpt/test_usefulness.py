@@ -94,12 +94,6 @@ def test_useful_vertices_lower_the_error_behind_a_door() -> None:
     assert error[1] < 0.9 * error[0]
 
 
-def test_nothing_is_learned_of_vertices_without_connections() -> None:
-    scene = loaded(hard_scenes.cornell)
-    plugin = mi.load_dict(CONNECTED | {"connections": 0})
-    assert plugin.learn_guide(scene, scene.sensors()[0], 1).usefulness_table is None
-
-
 def test_an_image_hardly_depends_on_the_number_of_threads() -> None:
     scene = loaded(hard_scenes.cornell)
     plugin = mi.load_dict(CONNECTED)

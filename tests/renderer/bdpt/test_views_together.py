@@ -49,7 +49,7 @@ def test_views_rendered_together_are_those_rendered_alone_to_the_bit(
 ) -> None:
     scene, places, seeds = box(), placed([0.0, 7.0, -11.0, 0.0, 3.0]), [1, 2, 3, 4, 1]
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 5, "paths_at_once": paths_at_once, **settings})
-    together = np.array(bdpt.render_views(scene, sensor_of("perspective", SIZE), np.stack(places), seeds, SPP))
+    together = np.array(bdpt.render_seeds(scene, sensor_of("perspective", SIZE), seeds, SPP, places=np.stack(places)))
     one_by_one = [
         alone(bdpt, scene, "perspective", place, seed, SIZE) for place, seed in zip(places, seeds, strict=True)
     ]
@@ -61,7 +61,7 @@ def test_views_through_a_lens_of_another_size_differ_by_rounding() -> None:
     """15 × 15 pixels are no multiple of the processor's lanes, so that sums differ by their order, too."""
     size, places, seeds = 15, placed([0.0, 7.0, -11.0]), [1, 2, 3]
     scene, bdpt = box(), mi.load_dict({"type": "bdpt", "max_depth": 5})
-    together = np.array(bdpt.render_views(scene, sensor_of("thinlens", size), np.stack(places), seeds, SPP))
+    together = np.array(bdpt.render_seeds(scene, sensor_of("thinlens", size), seeds, SPP, places=np.stack(places)))
     one_by_one = np.stack(
         [alone(bdpt, scene, "thinlens", place, seed, size) for place, seed in zip(places, seeds, strict=True)]
     )
@@ -75,7 +75,7 @@ def test_a_recorded_launch_of_other_views_is_of_those_views() -> None:
     recorded, direct = (mi.load_dict({"type": "bdpt", "max_depth": 4, "record": record}) for record in (True, False))
     for turn in range(4):
         places, seeds = np.stack(placed([3.0 * turn, -turn])), [turn, turn + 10]
-        images = [np.array(bdpt.render_views(scene, sensor, places, seeds, SPP)) for bdpt in (recorded, direct)]
+        images = [np.array(bdpt.render_seeds(scene, sensor, seeds, SPP, places=places)) for bdpt in (recorded, direct)]
         np.testing.assert_array_equal(*images)
     dr.sync_thread()
 

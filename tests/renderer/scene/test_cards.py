@@ -19,7 +19,7 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
 
-PASSES = 12
+PASSES = 8
 
 
 def on_card(*arguments: str) -> Any:

@@ -86,14 +86,6 @@ def test_specular_of_a_plastic_ball_is_the_fresnel_reflectance_of_its_coat_whate
     assert found.max() < 1
 
 
-@pytest.mark.parametrize("nonlinear", [False, True])
-def test_specular_of_a_rough_plastic_ball_lies_between_the_fresnel_reflectance_head_on_and_1(nonlinear: bool) -> None:
-    bsdf = {"type": "roughplastic", "alpha": 0.1, "diffuse_reflectance": rgb(WHITE), "nonlinear": nonlinear}
-    found, _ = of_a_ball(bsdf)
-    assert 0.038 < found.min() < 0.04
-    assert 0.1 < found.max() < 1
-
-
 def test_specular_of_principled_materials_is_without_their_diffuse_lobe_and_that_of_metal_is_whole() -> None:
     """It answers with all of its lobes whatever is asked for."""
     dull, metal = ({"type": "principled", "base_color": rgb(GREY), "metallic": share} for share in (0.0, 1.0))
@@ -205,17 +197,6 @@ def test_the_back_of_a_one_sided_wall_in_a_mirror_is_black(bsdf: Shape, albedo: 
     found = known(scene_of(mirror=mirror, wall=square((0, 0, 6), (0, 0, 1), 8, bsdf=bsdf)))
     np.testing.assert_allclose(centre(found.beyond_albedo), albedo, atol=1e-6)
     assert centre(found.beyond_depth) == pytest.approx(9, rel=1e-2)
-
-
-def test_what_scatters_by_itself_has_nothing_beyond() -> None:
-    texture = {"type": "diffuse", "reflectance": rgb(GREY)}
-    scene = scene_of(
-        wall=square((0, 0, 0), (0, 0, 1), 3, bsdf=texture),
-        mirror=square((0, 0, 9), (0, 0, -1), 3, bsdf={"type": "conductor"}),
-    )
-    found = known(scene)
-    for name in ("throughput", "beyond_albedo", "beyond_normal", "beyond_depth"):
-        assert not getattr(found, name).any(), name
 
 
 def test_two_mirrors_that_face_each_other_end_after_so_many(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -95,17 +95,6 @@ def test_the_rest_state_comes_back_bit_by_bit(room: LoadedScene, somewhere: View
     np.testing.assert_array_equal(room.buffers(somewhere).albedo, buffers.albedo)
 
 
-def test_the_way_to_a_configuration_leaves_no_trace(room: LoadedScene) -> None:
-    target = sample_modification(room.spec, 7, 0)
-    room.apply(rest(room.spec))
-    room.apply(target)
-    direct = mesh_state(room)
-    for i in range(1, 4):
-        room.apply(sample_modification(room.spec, 7, i))
-    room.apply(target)
-    assert mesh_state(room) == direct
-
-
 def test_after_many_edits_a_scene_gives_the_bytes_of_a_fresh_load(room: LoadedScene, somewhere: View) -> None:
     target = sample_modification(room.spec, 4, 9)
     for i in range(6):

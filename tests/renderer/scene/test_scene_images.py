@@ -12,15 +12,6 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import Camera, View, sample_view
 
 
-def test_seeds_decide_the_noise_and_nothing_else_does(room: LoadedScene, somewhere: View) -> None:
-    room.apply(rest(room.spec))
-    first, again, other = (room.render_half(somewhere, seed) for seed in (0, 0, 1))
-    np.testing.assert_array_equal(first, again)
-    assert np.any(first != other)
-    assert first.shape == (16, 24, 3)
-    assert first.dtype == np.float32
-
-
 def test_the_camera_of_the_sensor_is_that_of_the_spec(room: LoadedScene, somewhere: View) -> None:
     mi = backend.load(1)
     spec = room.spec
@@ -34,26 +25,6 @@ def test_the_camera_of_the_sensor_is_that_of_the_spec(room: LoadedScene, somewhe
     start = camera.origin + camera.rays() * (spec.view.near / along)[..., None]
     np.testing.assert_allclose(np.array(ray.o).T.reshape(16, 24, 3), start, atol=1e-5)
     np.testing.assert_allclose(np.array(ray.maxt).reshape(16, 24), (spec.view.far - spec.view.near) / along, rtol=1e-5)
-
-
-def test_buffers_agree_with_rays_through_the_moved_scene(room: LoadedScene, somewhere: View) -> None:
-    mi = backend.load(1)
-    modification = sample_modification(room.spec, 2, 3)
-    room.apply(modification)
-    camera = Camera.of(somewhere, room.spec)
-    depth = room.buffers(somewhere).depth
-    rays = camera.rays().reshape(-1, 3)
-    si = room.scene.ray_intersect(mi.Ray3f(mi.Point3f(*map(float, camera.origin)), mi.Vector3f(*rays.T)))
-    hit = camera.origin + rays * (depth.ravel() / (rays @ camera.forward))[:, None]
-    np.testing.assert_allclose(hit, np.array(si.p).T, atol=2e-4)
-
-
-def test_a_static_scene_has_one_configuration(small: Callable[..., SceneSpec]) -> None:
-    cornell = LoadedScene.load(small(load_spec("cornell")))
-    assert not cornell.spec.groups
-    cornell.apply(rest(cornell.spec))
-    view = View(np.array([0, 1, 1.5], np.float32), np.array([0, 1, -1], np.float32))
-    assert cornell.render_half(view, 0).mean() > 0.05
 
 
 def test_guided_light_paths_follow_from_the_configuration_alone(small: Callable[..., SceneSpec]) -> None:

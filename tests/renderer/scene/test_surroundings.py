@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.surroundings import NONE, directions, hollow_boxes, surroundings
+from photonfarm.renderer.scene.surroundings import NONE, hollow_boxes, surroundings
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec_loading import load_spec
 
@@ -76,22 +76,6 @@ def test_a_single_sheet_holds_no_point() -> None:
     found = surroundings(scene, near)
     assert found.open.all()
     np.testing.assert_allclose(found.clearance[:2], 0.001, rtol=0.1)
-
-
-def test_distances_are_those_of_a_sphere() -> None:
-    scene = scene_of(sky={"type": "sphere", "radius": 5.0})
-    found = surroundings(scene, np.zeros((1, 3), np.float32))
-    np.testing.assert_allclose([found.clearance[0], found.reach[0]], 5, rtol=1e-5)
-    assert found.open.all()
-
-
-def test_no_points_have_no_surroundings() -> None:
-    assert surroundings(scene_of(one=box([0, 0, 0], [1, 1, 1])), np.zeros((0, 3), np.float32)).open.shape == (0,)
-
-
-def test_directions_are_unit_vectors_without_a_bias() -> None:
-    np.testing.assert_allclose(np.linalg.norm(directions(), axis=1), 1, rtol=1e-6)
-    np.testing.assert_allclose(directions().mean(axis=0), 0, atol=0.01)
 
 
 def test_a_box_of_most_others_is_hollow() -> None:

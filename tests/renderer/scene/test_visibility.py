@@ -16,7 +16,7 @@ from photonfarm.renderer.jobs.render import visibility_of
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import find_seen_points
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.scene.modification import Modification, rebuild, rest, sample_modification
+from photonfarm.scene.modification import Modification, rebuild, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec
 from photonfarm.scene.view import View, sample_view
@@ -163,14 +163,6 @@ def test_points_of_removed_groups_and_empty_slots_are_never_seen(looked: list[Lo
     assert any((one.photons.bounce < 0).any() for one in looked)
 
 
-def test_equal_views_give_equal_bits_whatever_came_before(loaded: LoadedScene, looked: list[Looked]) -> None:
-    for one in reversed(looked):
-        loaded.apply(one.modification)
-        again = visibility_of(loaded, one.view, rebuild(one.cloud, one.modification), one.photons)
-        np.testing.assert_array_equal(again.points, one.found.points)
-        np.testing.assert_array_equal(again.photons, one.found.photons)
-
-
 def test_neither_another_view_nor_an_edit_compiles_a_kernel(loaded: LoadedScene, looked: list[Looked]) -> None:
     import drjit as dr
 
@@ -227,13 +219,3 @@ def test_between_the_planes_only_and_what_is_before_the_near_plane_hides_nothing
     assert sees((0, 0, 1), (0, 0, -2), near=3.5, far=4.5) == [False, False]
     assert sees((0, 0, -1), (0.4, 0.4, -1), near=3.5, far=4.5) == [True, True]
     assert sees((0, 0, -1), near=2.5, far=4.5) == [False]
-
-
-def test_a_static_scene_and_one_without_photons_is_looked_at_alike(loaded: LoadedScene, looked: list[Looked]) -> None:
-    one = looked[0]
-    at_rest = rest(loaded.spec)
-    loaded.apply(at_rest)
-    alone = visibility_of(loaded, one.view, rebuild(one.cloud, at_rest), None)
-    together = visibility_of(loaded, one.view, rebuild(one.cloud, at_rest), one.photons)
-    assert alone.photons.shape == (0,)
-    np.testing.assert_array_equal(alone.points, together.points)

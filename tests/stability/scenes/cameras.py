@@ -9,9 +9,17 @@ from typing import Any
 import mitsuba as mi
 
 from tests.stability.scenes import hard_scenes
-from tests.stability.scenes.case import EYE_ALONE, LONG, QUICK, HardScene, Refusal, SceneDict
+from tests.stability.scenes.case import (
+    EYE_ALONE,
+    LONG,
+    QUICK,
+    HardScene,
+    Refusal,
+    SceneDict,
+    crop_of_full_image,
+    same_by_bdpt,
+)
 from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
-from tests.stability.scenes.truths import PATH, crop_of_full_image, same_by_bdpt
 
 
 def seen_by(**changes: Any) -> Callable[[int], SceneDict]:
@@ -30,12 +38,12 @@ def seen_by(**changes: Any) -> Callable[[int], SceneDict]:
 
 
 def camera_in_light(size: int) -> SceneDict:
-    """The camera lies in the plane of the light, within it, and looks in the direction of its light."""
+    """The camera lies in the plane of the light, within it, and looks where that shines: connections of length 0."""
     return {**lit_room(size), "sensor": camera(size, [0.1, 0.05, 1.95], [0.1, 0.3, 0], 60)}
 
 
 def camera_at_wall(size: int) -> SceneDict:
-    """The camera touches a wall and looks along it."""
+    """The camera touches a wall and looks along it: splats of huge weight."""
     return {**lit_room(size), "sensor": camera(size, [-0.999, -0.9, 1], [-0.9, 0.9, 0.9], 70, near_clip=1e-3)}
 
 
@@ -53,7 +61,7 @@ def light_on_wall(size: int) -> SceneDict:
 
 
 def orthographic(size: int) -> SceneDict:
-    """The room of two-sided sheets without perspective."""
+    """The room of two-sided sheets without perspective: a camera that light cannot be joined to."""
     scene = hard_scenes.twosided(size)
     sensor = {key: value for key, value in scene["sensor"].items() if key != "fov"}
     to_world = sensor["to_world"] @ mi.ScalarTransform4f().scale([0.8, 0.8, 1])
@@ -131,9 +139,8 @@ def _depth(max_depth: int, rr_depth: int) -> HardScene:
     return HardScene(
         35,
         name,
-        "depth and roulette mean what they mean for `path`",
         light_on_wall,
-        PATH,
+        hard="depth and roulette mean what they mean for `path`",
         max_depth=max_depth,
         rr_depth=rr_depth,
         quick=quick if shown else None,
@@ -142,50 +149,20 @@ def _depth(max_depth: int, rr_depth: int) -> HardScene:
 
 
 SCENES = (
-    HardScene(
-        27,
-        "camera-in-light",
-        "the camera lies in a light: connections of length 0",
-        camera_in_light,
-        PATH,
-        max_over_mean=None,
-    ),
-    HardScene(
-        27,
-        "camera-at-wall",
-        "the camera touches a wall: splats of huge weight",
-        camera_at_wall,
-        PATH,
-        quick=replace(QUICK, resolution=0.02),
-    ),
-    HardScene(
-        27, "blocker-before-near-plane", "a blocker that the near plane cuts away", blocked_before_near_plane, PATH
-    ),
-    HardScene(28, "thin-lens", "a lens with an area", seen_by(**LENS), PATH),
-    HardScene(28, "clipped-thin-lens", "the same with clipping planes in the room", seen_by(**CLIPPED_LENS), PATH),
-    HardScene(
-        28,
-        "orthographic",
-        "a camera that light cannot be joined to",
-        orthographic,
-        PATH,
-        settings=EYE_ALONE,
-        quick_settings=EYE_ALONE,
-    ),
-    HardScene(
-        29,
-        "crop",
-        "a crop window with the principal point moved",
-        cropped,
-        crop_of_full_image(seen_by(**OFFSET), slice(2, 14), slice(4, 12)),
-    ),
+    HardScene(27, "camera-in-light", camera_in_light, max_over_mean=None),
+    HardScene(27, "camera-at-wall", camera_at_wall, quick=replace(QUICK, resolution=0.02)),
+    HardScene(27, "blocker-before-near-plane", blocked_before_near_plane),
+    HardScene(28, "thin-lens", seen_by(**LENS), hard="a lens with an area"),
+    HardScene(28, "clipped-thin-lens", seen_by(**CLIPPED_LENS), hard="the same with clipping planes in the room"),
+    HardScene(28, "orthographic", orthographic, settings=EYE_ALONE, quick_settings=EYE_ALONE),
+    HardScene(29, "crop", cropped, crop_of_full_image(seen_by(**OFFSET), slice(2, 14), slice(4, 12))),
     *(
         HardScene(
             32,
             f"scale-{factor:g}",
-            "lengths that ray offsets and clamps do not expect",
             scaled(factor),
             same_by_bdpt(scaled(1.0), "the same image at scale 1"),
+            hard="lengths that ray offsets and clamps do not expect",
             max_depth=5,
             quick=replace(QUICK, spp=96) if factor > 1 else None,
         )

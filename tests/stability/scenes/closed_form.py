@@ -8,9 +8,8 @@ import mitsuba as mi
 import numpy as np
 import numpy.typing as npt
 
-from tests.stability.scenes.case import ALL, QUICK, HardScene, SceneDict
+from tests.stability.scenes.case import ALL, QUICK, HardScene, SceneDict, known, known_on_plane
 from tests.stability.scenes.hard_scenes import camera, grey, rectangle, shining
-from tests.stability.scenes.truths import PATH, known, known_on_plane
 
 Points = npt.NDArray[np.float64]  # [N, 3]
 Values = npt.NDArray[np.float64]  # [N]
@@ -33,12 +32,12 @@ def shining_sphere(size: int) -> SceneDict:
 
 
 def point_in_sphere(size: int) -> SceneDict:
-    """The closed sphere with a point light of intensity π in its centre."""
+    """The closed sphere with a point light of intensity π in its centre, which no ray can hit."""
     return {**closed_sphere(size), "light": {"type": "point", "intensity": {"type": "rgb", "value": np.pi}}}
 
 
 def four_points_in_sphere(size: int) -> SceneDict:
-    """The closed sphere with four lights in its centre, of intensity π/4 each, chosen with unequal probabilities."""
+    """The closed sphere with four lights of intensity π/4 in its centre: the unequal choice of one must cancel."""
     scene = closed_sphere(size)
     for k in range(4):
         intensity = {"type": "rgb", "value": np.pi / 4}
@@ -50,7 +49,7 @@ def four_points_in_sphere(size: int) -> SceneDict:
 
 
 def furnace(size: int) -> SceneDict:
-    """Bodies that reflect or transmit all light, under a constant sky of radiance 1."""
+    """Bodies that reflect or transmit all light, under a sky of radiance 1: each lost or doubled path shows."""
     mirror = {"type": "conductor", "material": "none"}
     rough = {"type": "roughdielectric", "alpha": 0.002, "distribution": "ggx"}
     return {
@@ -86,7 +85,7 @@ def rough_furnace(size: int) -> SceneDict:
 
 
 def empty(size: int) -> SceneDict:
-    """Nothing but a constant sky."""
+    """Nothing but a constant sky: light paths hit nothing, the scene has no size."""
     sky = {"type": "constant", "radiance": {"type": "rgb", "value": 0.37}}
     return {"type": "scene", "sensor": camera(size, [0, 0, 6], [0, 0, 0], 40), "sky": sky}
 
@@ -101,7 +100,7 @@ def over_a_plane(size: int, light: SceneDict) -> SceneDict:
 
 
 def point_over_plane(size: int) -> SceneDict:
-    """A plane below a point light of intensity 8 at (1, 0, 2)."""
+    """A plane below a point light of intensity 8 at (1, 0, 2): light tracing against next event estimation."""
     return over_a_plane(size, {"type": "point", "position": [1, 0, 2], "intensity": {"type": "rgb", "value": 8.0}})
 
 
@@ -112,7 +111,7 @@ def point_radiance(p: Points) -> Values:
 
 
 def sun_over_plane(size: int) -> SceneDict:
-    """A plane below a directional light of irradiance 3."""
+    """A plane below a directional light of irradiance 3, which has no solid angle."""
     irradiance = {"type": "rgb", "value": 3.0}
     return over_a_plane(size, {"type": "directional", "direction": [1, 0, -2], "irradiance": irradiance})
 
@@ -140,7 +139,7 @@ def rectangle_radiance(p: Points) -> Values:
 
 
 def ball_over_plane(size: int) -> SceneDict:
-    """A plane below a sphere light of radius 0.6 around (−1, 0, 2), wholly above the horizon of every point."""
+    """A plane wholly below a sphere light of radius 0.6 around (−1, 0, 2): solid angles against areas."""
     light = {"type": "sphere", "center": [-1, 0, 2], "radius": 0.6, "bsdf": grey(0.0), "emitter": shining(5.0)}
     return over_a_plane(size, light)
 
@@ -179,7 +178,7 @@ def _depth(k: int) -> HardScene:
     name = f"shining-sphere-depth-{k}" if k > 0 else "shining-sphere"
     hard = "every path ends on the light it came from, by every technique at once"
     return HardScene(
-        1, name, hard, shining_sphere, known(answer, truth), max_depth=k, quick=QUICK if k in (3, -1) else None
+        1, name, shining_sphere, known(answer, truth), hard=hard, max_depth=k, quick=QUICK if k in (3, -1) else None
     )
 
 
@@ -188,65 +187,16 @@ ONE = known(1.0, "1")
 SCENES = (
     *(_depth(k) for k in (1, 2, 3, -1)),
     # Irradiance π at radius 1: first bounce ρ/π·π = ½, all bounces ½/(1 − ½) = 1
-    HardScene(
-        2,
-        "point-light-in-sphere",
-        "a light that no ray can hit",
-        point_in_sphere,
-        ONE,
-        max_depth=-1,
-        quick_settings=ALL,
-    ),
-    HardScene(
-        3,
-        "four-lights-in-sphere",
-        "the choice of a light must cancel in every technique's density",
-        four_points_in_sphere,
-        ONE,
-        max_depth=-1,
-        quick_settings=ALL,
-    ),
+    HardScene(2, "point-light-in-sphere", point_in_sphere, ONE, max_depth=-1, quick_settings=ALL),
+    HardScene(3, "four-lights-in-sphere", four_points_in_sphere, ONE, max_depth=-1, quick_settings=ALL),
     # Everything reflects or transmits all light, and the sky is 1 everywhere, so every radiance is 1
-    HardScene(
-        4,
-        "furnace",
-        "each lost or doubled path shows: diffuse, glass, rough glass, mirror, pane",
-        furnace,
-        ONE,
-        max_depth=-1,
-        quick_settings=ALL,
-    ),
-    HardScene(
-        4,
-        "glass-in-sphere",
-        "light passes glass and mirrors between vertices that join, by every technique",
-        glass_in_sphere,
-        ONE,
-        max_depth=-1,
-        quick_settings=ALL,
-    ),
-    HardScene(
-        4,
-        "rough-furnace",
-        "rough glass and metal, which lose light as `path` says they do",
-        rough_furnace,
-        PATH,
-        max_depth=12,
-        quick=None,
-    ),
-    HardScene(
-        5,
-        "empty",
-        "no surface: light paths hit nothing, the scene has no size",
-        empty,
-        known(0.37, "its radiance 0.37"),
-        quick=replace(QUICK, spp=16),
-        quick_settings=ALL,
-    ),
+    HardScene(4, "furnace", furnace, ONE, max_depth=-1, quick_settings=ALL),
+    HardScene(4, "glass-in-sphere", glass_in_sphere, ONE, max_depth=-1, quick_settings=ALL),
+    HardScene(4, "rough-furnace", rough_furnace, max_depth=12, quick=None),
+    HardScene(5, "empty", empty, known(0.37, "its radiance 0.37"), quick=replace(QUICK, spp=16), quick_settings=ALL),
     HardScene(
         8,
         "point-over-plane",
-        "light tracing against next event estimation",
         point_over_plane,
         known_on_plane(point_radiance, "I·ρ·cosθ/(π·d²)"),
         max_depth=4,
@@ -255,7 +205,6 @@ SCENES = (
     HardScene(
         8,
         "sun-over-plane",
-        "a light at infinity without a solid angle",
         sun_over_plane,
         known_on_plane(lambda p: np.full(len(p), 0.5 / np.pi * 3 * 2 / np.sqrt(5)), "E·ρ·cosθ/π"),
         max_depth=4,
@@ -264,7 +213,6 @@ SCENES = (
     HardScene(
         9,
         "rectangle-over-plane",
-        "area densities against solid angles",
         rectangle_over_plane,
         known_on_plane(rectangle_radiance, "form factor"),
         max_depth=4,
@@ -273,7 +221,6 @@ SCENES = (
     HardScene(
         10,
         "ball-over-plane",
-        "a light sampled by its solid angle here, by its area there",
         ball_over_plane,
         known_on_plane(ball_radiance, "π·L·(r/d)²·cosθ·ρ/π"),
         max_depth=4,
@@ -282,7 +229,6 @@ SCENES = (
     HardScene(
         26,
         "narrow-spot",
-        "a cone of 5° with a soft rim",
         spot_over_plane,
         known_on_plane(spot_radiance, "I(θ)·ρ·cosθ/(π·d²)"),
         max_depth=4,
@@ -292,9 +238,9 @@ SCENES = (
     HardScene(
         36,
         "long-paths",
-        "24 edges, no roulette: every vertex must be kept",
         shining_sphere,
         known(1 - 0.5**24, "1 − ½^24"),
+        hard="24 edges, no roulette: every vertex must be kept",
         max_depth=24,
         rr_depth=1000,
         quick=replace(QUICK, spp=32),

@@ -179,7 +179,7 @@ def bump_floor(size: int) -> SceneDict:
 
 
 def normal_floor(size: int) -> SceneDict:
-    """A floor with a strong normal map in a room with an area light."""
+    """A floor with a strong normal map in a lit room: `ptracer` is off by up to 23 %."""
     slope = (bumps()[..., 0] - 0.5) * 0.9
     normals = np.stack([slope, slope.T, np.sqrt(1 - slope**2 - slope.T**2)], axis=-1) * 0.5 + 0.5
     mapped = {

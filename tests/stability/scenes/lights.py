@@ -14,16 +14,19 @@ from tests.stability.scenes.case import (
     ALL,
     LONG,
     QUICK,
+    TRUTH_SEEDS,
     WITH_LIGHT_PATHS,
     Effort,
     HardScene,
     Images,
     SceneDict,
     Truth,
+    load,
+    render,
+    rendered,
 )
 from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
 from tests.stability.scenes.meshes import grid, octahedron
-from tests.stability.scenes.truths import PATH, TRUTH_SEEDS, load, render, rendered
 
 # ------------------------------------------------ Lights at infinity, and edits ------------------------------------
 
@@ -42,7 +45,7 @@ def _under_sky_and_sun(size: int, block: Any) -> SceneDict:
 
 
 def block_at_home(size: int) -> SceneDict:
-    """A block on a floor, under a sky and a sun."""
+    """A block on a floor, under a sky and a sun, which must reach it where it is moved to."""
     return _under_sky_and_sun(size, mi.ScalarTransform4f().translate([0, 0, 0.8]).scale(0.8))
 
 
@@ -63,7 +66,7 @@ def move_block(scene: Any) -> None:
 
 
 def point_caustic(size: int) -> SceneDict:
-    """The caustic of a point light under a glass ball, which is itself out of the picture."""
+    """The caustic of a point light under a glass ball out of the picture: `path` misses it."""
     glass = {"type": "dielectric", "int_ior": 1.5}
     return {
         "type": "scene",
@@ -98,7 +101,7 @@ def _cube_light(size: int, mirrored: bool) -> SceneDict:
 
 
 def mirrored_light(size: int) -> SceneDict:
-    """A room lit by a box whose transformation mirrors it."""
+    """A room lit by a box whose transformation mirrors it: which side shines?"""
     return _cube_light(size, mirrored=True)
 
 
@@ -127,14 +130,14 @@ def round_lights(size: int) -> SceneDict:
 
 
 def smooth_mesh_light(size: int) -> SceneDict:
-    """A room lit by an octahedron with smooth normals, which only hits find."""
+    """A room lit by an octahedron with smooth normals, where `path` is biased: only hits find it."""
     scene = lit_room(size)
     scene["light"] = octahedron("light", [0, 0, 1.5], 0.35, emitter=shining(8.0))
     return scene
 
 
 def textured_ball_light(size: int) -> SceneDict:
-    """A room lit by a ball with a texture, which only hits find."""
+    """A room lit by a ball whose points Mitsuba samples without their texels: only hits find it."""
     emitter = hard_scenes.textured_light(size)["light"]["emitter"]
     return {**lit_room(size), "light": {"type": "sphere", "center": [0, 0, 1.3], "radius": 0.3, "emitter": emitter}}
 
@@ -188,34 +191,22 @@ _UNGUIDED = tuple(settings for settings in ALL if not settings.guided_light)
 _INDIRECT = replace(LONG, truth_spp=512)
 
 SCENES = (
-    HardScene(
-        6, "rotated-envmap", "a bright spot in a sky that is turned about two axes", hard_scenes.rotated_envmap, PATH
-    ),
-    HardScene(
-        6,
-        "constant-sky",
-        "a constant sky, a room open to it, rough metal",
-        hard_scenes.constant_environment,
-        PATH,
-        quick=None,
-    ),
-    HardScene(6, "sun-and-sky", "a light that no light path can start from", sun_and_sky, PATH),
+    HardScene(6, "rotated-envmap", hard_scenes.rotated_envmap),
+    HardScene(6, "constant-sky", hard_scenes.constant_environment, quick=None),
+    HardScene(6, "sun-and-sky", sun_and_sky),
     HardScene(
         7,
         "moved-geometry",
-        "sky and sun reach a block that was moved out of the old bounding sphere",
         block_at_home,
         rendered("path", "fresh load by `path`", block_far_away),
         max_depth=4,
         edit=move_block,
     ),
-    HardScene(11, "cove", "all light is indirect", hard_scenes.cove, PATH, long=_INDIRECT),
+    HardScene(11, "cove", hard_scenes.cove, long=_INDIRECT),
     HardScene(
         12,
         "door-gap",
-        "all light comes through a narrow gap",
         hard_scenes.door_gap,
-        PATH,
         max_depth=8,
         quick=replace(QUICK, truth_spp=512, resolution=0.02),
         long=replace(_INDIRECT, resolution=0.004),
@@ -223,7 +214,6 @@ SCENES = (
     HardScene(
         13,
         "glass-caustic",
-        "a caustic of a small area light, and its image in the ball, found by chance alone",
         hard_scenes.glass_caustic,
         rendered("path", "`path` at very high spp"),
         settings=_UNGUIDED,
@@ -233,7 +223,6 @@ SCENES = (
     HardScene(
         14,
         "point-caustic",
-        "a caustic that only light paths find: `path` misses it",
         point_caustic,
         rendered("ptracer", "`ptracer`"),
         settings=WITH_LIGHT_PATHS,
@@ -243,52 +232,27 @@ SCENES = (
     HardScene(
         15,
         "light-in-bulb",
-        "a light within glass: nothing joins it, caustics of caustics",
         bulb,
-        PATH,
         max_depth=10,
         quick=replace(QUICK, truth_spp=256, resolution=0.02),
         long=replace(LONG, resolution=0.004),
     ),
-    HardScene(
-        16,
-        "mirror-corridor",
-        "light that arrives by several mirrorings",
-        hard_scenes.mirror_room,
-        PATH,
-        max_depth=8,
-        long=replace(LONG, resolution=0.006),
-    ),
-    HardScene(
-        22,
-        "mirrored-mesh-light",
-        "a mesh light of negative scale: which side shines?",
-        mirrored_light,
-        rendered("path", "`path`, not mirrored", unmirrored_light),
-    ),
-    HardScene(23, "textured-light", "dark and bright texels", hard_scenes.textured_light, PATH),
+    HardScene(16, "mirror-corridor", hard_scenes.mirror_room, max_depth=8, long=replace(LONG, resolution=0.006)),
+    HardScene(22, "mirrored-mesh-light", mirrored_light, rendered("path", "`path`, not mirrored", unmirrored_light)),
+    HardScene(23, "textured-light", hard_scenes.textured_light),
     HardScene(
         23,
         "textured-ball-light",
-        "a textured light whose points Mitsuba samples without their texels",
         textured_ball_light,
-        PATH,
         quick=replace(QUICK, spp=256, resolution=0.02),
         long=replace(LONG, resolution=0.008),
     ),
-    HardScene(24, "mesh-light", "1058 unequal triangles, chosen by area", grid_light, PATH),
-    HardScene(24, "round-lights", "cylinder, disk and sphere lights", round_lights, PATH),
-    HardScene(
-        24,
-        "smooth-mesh-light",
-        "smooth normals on a mesh light, where `path` itself is biased",
-        smooth_mesh_light,
-        rendered("prb_basic", "`prb_basic`: hits alone"),
-    ),
+    HardScene(24, "mesh-light", grid_light),
+    HardScene(24, "round-lights", round_lights),
+    HardScene(24, "smooth-mesh-light", smooth_mesh_light, rendered("prb_basic", "`prb_basic`: hits alone")),
     HardScene(
         25,
         "hundred-lights",
-        "radiances of 1:10⁴, every tenth light dead",
         hard_scenes.hundred_lights,
         Truth("sum of single-light images by `path`", hundred_lights_one_by_one),
         max_depth=4,
@@ -298,20 +262,13 @@ SCENES = (
     HardScene(
         25,
         "hundred-lights-at-once",
-        "the same against one render of all lights",
         hard_scenes.hundred_lights,
-        PATH,
+        hard="the same against one render of all lights",
         max_depth=4,
         quick=replace(QUICK, spp=256, truth_spp=1024, resolution=0.03),
         long=replace(LONG, spp=512, truth_spp=2048, resolution=0.01),
     ),
-    HardScene(
-        25,
-        "lights-of-every-kind",
-        "rectangle, sphere, disk, mesh, point, spot, sun and sky at once",
-        hard_scenes.many_lights,
-        PATH,
-    ),
-    HardScene(26, "projector", "a pattern thrown from a point", projector, PATH),
+    HardScene(25, "lights-of-every-kind", hard_scenes.many_lights),
+    HardScene(26, "projector", projector),
 )
 """The scenes of rows 6, 7, 11–16 and 22–26."""

@@ -15,9 +15,8 @@ from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, Usefulness
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.bdpt.lights.emission import read_lights
 from tests.stability.scenes import hard_scenes
-from tests.stability.scenes.case import BdptSettings, SceneDict
+from tests.stability.scenes.case import BdptSettings, SceneDict, load
 from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
-from tests.stability.scenes.truths import load
 from tests.stability.weights import oracle
 from tests.stability.weights.joined_paths import Pinhole, TechniqueCounts, walk, weights_of
 from tests.stability.weights.oracle import Mask, OraclePaths

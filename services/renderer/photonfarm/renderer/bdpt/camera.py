@@ -5,12 +5,17 @@ Estimates are summed over the pixels of several images in device memory, and put
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import drjit as dr
 import mitsuba as mi
 
 from photonfarm.renderer.bdpt.randomness import Sampler
+
+NoteSplat: TypeAlias = "Callable[[mi.Point2f, mi.Spectrum, mi.Bool], None]"
+"""A function of places in the crop window, what is added there, and which of it is."""
 
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
 
@@ -136,12 +141,15 @@ class Splat:
     offset: mi.UInt32  # first pixel of the image that a lane's light path belongs to
     width: int  # of the crop window, pixels
     height: int
+    note: NoteSplat | None = None  # where a guide is learned
 
     def add(self, position: mi.Point2f, value: mi.Spectrum, active: mi.Bool) -> None:
         """Add ``value`` at ``position``, in pixels of the crop window; what falls outside is lost."""
         inside = active & dr.all((position >= 0) & (position < mi.ScalarVector2f(self.width, self.height)))
         pixel = mi.UInt32(position.y) * self.width + mi.UInt32(position.x)
         self.sums.add(self.offset + pixel, value * self.scale, 0, inside)
+        if self.note is not None:
+            self.note(position, value, inside)
 
 
 @dataclass(slots=True)

@@ -14,7 +14,7 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import EyeStart
-from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections
+from photonfarm.renderer.bdpt.guiding.tally import NoteConnection
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices
 from photonfarm.renderer.bdpt.light_paths import PathOptions, exchange_directions
 from photonfarm.renderer.bdpt.lights.emission import DirectSample, Lights, hit_densities, sample_direct
@@ -53,7 +53,7 @@ class Connectable:
     image: mi.UInt32  # image of the launch that a lane belongs to
     first: mi.UInt32  # the slot of its image that a lane is joined to, but for the shift
     shifts: mi.UInt32  # see randomness.shifts
-    tally: TalliedConnections | None = None  # where a guide is learned
+    note: NoteConnection | None = None  # where a guide is learned
 
 
 def trace_eye_paths(
@@ -280,8 +280,8 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
         slot = connectable.image * connectable.paths + (connectable.first + shift) % connectable.paths
         vertex = connectable.vertices.draw(slot, active)
         value = _connect(scene, options, replace(own, active=active), vertex)
-        if connectable.tally is not None:
-            connectable.tally.add(vertex, value * share, active)
+        if connectable.note is not None:
+            connectable.note(vertex, value * share, active)
         total += value
     return total * share
 

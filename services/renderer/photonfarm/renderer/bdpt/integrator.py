@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -15,14 +16,19 @@ from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.guiding.grid import Grid, SparseLanes
 from photonfarm.renderer.bdpt.guiding.learning import Effort, LightGuide, learn
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
-from photonfarm.renderer.bdpt.guiding.tally import TalliedConnections, TalliedSplat, Tally, Totals
+from photonfarm.renderer.bdpt.guiding.tally import Tally, Totals
 from photonfarm.renderer.bdpt.guiding.usefulness import SIDE, Usefulness
 from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launches
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights
-from photonfarm.renderer.bdpt.poses import Places, PosedSensor, Poses
-from photonfarm.renderer.bdpt.recording import Recorder
-from photonfarm.renderer.bdpt.scenes import UNBOUNDED, bounding_box, check_scene, depth_limit
+from photonfarm.renderer.bdpt.poses import Places, Poses
+from photonfarm.renderer.bdpt.recording import Recorder, call_recorded
+from photonfarm.renderer.bdpt.scenes import bounding_box, check_scene
+
+UNBOUNDED = 0xFFFFFFFF
+"""The longest path, in edges, where there is no bound."""
+
+SomeLanes = TypeVar("SomeLanes", bound=Lanes)
 
 
 class BidirectionalPathTracer(mi.SamplingIntegrator):
@@ -52,45 +58,26 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties) -> None:
         super().__init__(props)
-        self.max_depth = depth_limit(_whole(props, "max_depth", -1))
-        self.rr_depth = _whole(props, "rr_depth", 5)
-        self.connections = _whole(props, "connections", 1)
-        self.light_ratio = _number(props, "light_ratio", 1.0)
-        self.light_samples = _whole(props, "light_samples", 1)
-        self.paths_at_once = _whole(props, "paths_at_once", LAUNCH_PATHS)
-        self.guided_light = _yes_or_no(props, "guided_light")
-        self._check_parameters()
-        record = _yes_or_no(props, "record")
-        self._recorder = Recorder(trace) if record else None
-        self._learning_recorder = Recorder(explore) if record else None
-
-    def _check_parameters(self) -> None:
-        if self.rr_depth < 1:
-            raise ValueError(f"bdpt: rr_depth is {self.rr_depth}; allowed are numbers of edges from 1")
-        if not 0 <= self.connections <= 64:
-            raise ValueError(f"bdpt: connections is {self.connections}; allowed are whole numbers from 0 to 64")
-        if not 0 <= self.light_ratio <= 64:
-            raise ValueError(
-                f"bdpt: light_ratio is {self.light_ratio}; allowed are light paths per eye path from 0 to 64"
-            )
-        if not 1 <= self.light_samples <= 64:
-            raise ValueError(f"bdpt: light_samples is {self.light_samples}; allowed are whole numbers from 1 to 64")
-        if self.connections and not self.light_ratio:
-            raise ValueError(
-                f"bdpt: connections is {self.connections} and light_ratio is 0; connections need light paths to "
-                "connect to; use connections=0 or a light_ratio above 0"
-            )
-        if self.guided_light and not self.light_ratio:
-            raise ValueError(
-                "bdpt: guided_light is true and light_ratio is 0; without light paths there is nothing to guide; use "
-                "guided_light=false or a light_ratio above 0"
-            )
-        if self.paths_at_once < 1:
-            raise ValueError(f"bdpt: paths_at_once is {self.paths_at_once}; allowed are numbers of paths from 1")
+        max_depth = _number(props, "max_depth", -1, -1)
+        self.max_depth = UNBOUNDED if max_depth == -1 else max_depth
+        self.rr_depth = _number(props, "rr_depth", 5, 1)
+        self.connections = _number(props, "connections", 1, 0, 64)
+        self.light_ratio = _number(props, "light_ratio", 1.0, 0, 64)
+        self.light_samples = _number(props, "light_samples", 1, 1, 64)
+        self.paths_at_once = _number(props, "paths_at_once", LAUNCH_PATHS, 1)
+        self.guided_light, record = _yes_or_no(props, "guided_light"), _yes_or_no(props, "record")
+        for name in ("connections", "guided_light"):
+            if getattr(self, name) and not self.light_ratio:
+                raise ValueError(
+                    f"bdpt: {name} is {getattr(self, name)} and light_ratio is 0; it needs light paths; use a "
+                    f"light_ratio above 0, or {name}={'false' if name == 'guided_light' else 0}"
+                )
         if self.hide_emitters:
             raise ValueError(
                 "bdpt: hide_emitters is set; only false is allowed, because light paths cannot know what is hidden"
             )
+        self._recorder = Recorder(trace) if record else None
+        self._learning_recorder = Recorder(explore) if record else None
 
     def to_string(self) -> str:
         """The integrator and its parameters in Mitsuba's notation."""
@@ -118,7 +105,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         film = sensor.film()
         seed = int(seed if isinstance(seed, int) else seed[0])
-        images = self._render(scene, sensor, [seed], spp or sensor.sampler().sample_count(), guide=guide)
+        images = self._render(scene, sensor, [seed], spp or sensor.sampler().sample_count(), guide)
         with dr.suspend_grad():
             film.prepare([])
             images.put(film)
@@ -130,35 +117,28 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             return image
 
     def render_seeds(
-        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, guide: LightGuide | None = None
-    ) -> mi.TensorXf:
-        """Independent images of one view, [K, H, W, 3], one for each seed; several small images share a launch.
-
-        Each equals the image that ``render`` gives for its seed. On one thread it is equal bit by bit if the numbers of
-        an image's samples and light paths are multiples of 16, the lanes of a SIMD packet. Otherwise sums may differ by
-        their order. A ``guided_light`` integrator without a ``guide`` learns one for each image. Raises as ``render``
-        does.
-        """
-        width, height = sensor.film().crop_size()
-        return self._render(scene, sensor, seeds, spp, guide=guide).tensor(width, height)
-
-    def render_views(
         self,
         scene: mi.Scene,
         sensor: mi.Sensor,
-        places: Places,
         seeds: Sequence[int],
         spp: int,
         guide: LightGuide | None = None,
+        places: Places | None = None,
     ) -> mi.TensorXf:
-        """Images of K views, [K, H, W, 3], one for each place and seed; as many as may be share a launch.
+        """Independent images, [K, H, W, 3], one for each seed; several small images share a launch.
 
-        ``sensor`` stands at the origin, and is moved to each of the ``places``. An image has the random numbers that it
-        has alone, and differs from it by rounding: a path near an edge may fall to its other side. Raises as ``render``
-        does. A ``guided_light`` integrator without a ``guide`` learns one for each view.
+        Without ``places`` all are of one view. Each equals the image that ``render`` gives for its seed. On one thread
+        it is equal bit by bit if the numbers of an image's samples and light paths are multiples of 16, the lanes of a
+        SIMD packet. Otherwise sums may differ by their order.
+
+        With ``places``, of one for each image, the ``sensor`` stands at the origin, and is moved to each of them. An
+        image has the random numbers that it has alone, and differs from it by rounding: a path near an edge may fall to
+        its other side.
+
+        A ``guided_light`` integrator without a ``guide`` learns one for each image. Raises as ``render`` does.
         """
         width, height = sensor.film().crop_size()
-        return self._render(scene, sensor, seeds, spp, places, guide).tensor(width, height)
+        return self._render(scene, sensor, seeds, spp, guide, places).tensor(width, height)
 
     def learn_guide(
         self,
@@ -184,14 +164,11 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             layout = Layout.of(lights.count)
             lights = lights.guide_with(StartGuide.neutral(layout), scene)
             views = 1 if places is None else len(places)
-            seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, views)
             launch = effort.launch(views)
             options = self._options(launch, width * height)
             options = replace(options, light_ratio=dr.opaque(mi.Float, self.light_ratio))
-            shifts = randomness.shifts(seeds, launch, self.connections) if options.connects else None
-            poses = None if places is None else Poses.of(places)
-            keys = randomness.image_keys(seeds)
-            lanes = SparseLanes.of(launch, (width, height), 1, keys, shifts, poses)
+            seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, views)
+            lanes = self._lanes(SparseLanes, launch, (width, height), 1, seeds, places, options)
             lanes.thin(effort.eye_paths // views)
             grid = Grid.over(bounding_box(scene), SIDE)
             images, totals = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes, grid)
@@ -211,56 +188,54 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         sensor: mi.Sensor,
         seeds: Sequence[int],
         spp: int,
+        guide: LightGuide | None,
         places: Places | None = None,
-        guide: LightGuide | None = None,
     ) -> ImageStack:
         self._check(scene, sensor)
         if guide is not None and not self.guided_light:
             raise ValueError("bdpt: a guide is given and guided_light is false; use guided_light=true, or no guide")
-        if self.guided_light and guide is None and len(seeds) > 1:
-            return self._render_with_own_guides(scene, sensor, seeds, spp, places)
+        width, height = (int(n) for n in sensor.film().crop_size())
+        pixels = width * height
+        images = ImageStack.black(len(seeds) * pixels)
+        if self.guided_light and guide is None and len(seeds) > 1:  # each image is rendered alone, by its own guide
+            for k, seed in enumerate(seeds):
+                place = None if places is None else places[k : k + 1]
+                images.add(self._render(scene, sensor, [seed], spp, None, place), k * pixels)
+            return images
         with dr.suspend_grad():
             seeds = [seed & 0xFFFFFFFF for seed in seeds]
-            width, height = (int(n) for n in sensor.film().crop_size())
-            pixels = width * height
             if self.guided_light and guide is None:
                 effort = Effort.for_image(pixels * spp, self.light_ratio, self.connections)
                 guide = self.learn_guide(scene, sensor, seeds[0], places, effort)
             lights = read_lights(scene) if scene.emitters() else None
             light_ratio = self.light_ratio if self._has_light_paths(scene) else 0
+            useful = None
             if lights is not None and guide is not None and light_ratio:
                 lights = lights.guide_with(guide.starts, scene)
-            useful = None
-            if guide is not None and guide.usefulness_table is not None and self.connections and light_ratio:
-                useful = Usefulness.over(scene, guide.usefulness_table)
-            images = ImageStack.black(len(seeds) * pixels)
+                if guide.usefulness_table is not None and self.connections:
+                    useful = Usefulness.over(scene, guide.usefulness_table)
             for launch in launches(len(seeds), pixels, spp, light_ratio, self.paths_at_once):
                 options = self._options(launch, pixels, useful)
-                images_of = slice(launch.first_image, launch.first_image + launch.images)
-                own = seeds[images_of]
-                shifts = randomness.shifts(own, launch, self.connections) if options.connects else None
-                poses = None if places is None else Poses.of(places[images_of])
-                lanes = Lanes.of(launch, (width, height), spp, randomness.image_keys(own), shifts, poses)
-                part = self._trace(scene, sensor, lights, options, lanes)
+                own = slice(launch.first_image, launch.first_image + launch.images)
+                own_places = None if places is None else places[own]
+                lanes = self._lanes(Lanes, launch, (width, height), spp, seeds[own], own_places, options)
+                part = self._call(trace, self._recorder, scene, sensor, lights, options, lanes)
                 images.add(part, launch.first_image * pixels)
             return images
 
-    def _render_with_own_guides(
-        self, scene: mi.Scene, sensor: mi.Sensor, seeds: Sequence[int], spp: int, places: Places | None
-    ) -> ImageStack:
-        """The images that are rendered alone, each with a guide of its own."""
-        width, height = sensor.film().crop_size()
-        images = ImageStack.black(len(seeds) * width * height)
-        for k, seed in enumerate(seeds):
-            image = self._render(scene, sensor, [seed], spp, None if places is None else places[k : k + 1])
-            images.add(image, k * width * height)
-        return images
-
-    def _trace(
-        self, scene: mi.Scene, sensor: mi.Sensor, lights: Lights | None, options: PathOptions, lanes: Lanes
-    ) -> ImageStack:
-        images: ImageStack = self._call(trace, self._recorder, scene, sensor, lights, options, lanes)
-        return images
+    def _lanes(
+        self,
+        kind: type[SomeLanes],
+        launch: Launch,
+        size: tuple[int, int],
+        spp: int,
+        seeds: Sequence[int],
+        places: Places | None,
+        options: PathOptions,
+    ) -> SomeLanes:
+        shifts = randomness.shifts(seeds, launch, self.connections) if options.connects else None
+        poses = None if places is None else Poses.of(places)
+        return kind.of(launch, size, spp, randomness.image_keys(seeds), shifts, poses)
 
     def _call(
         self,
@@ -273,11 +248,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         lanes: Lanes,
         *more: Any,
     ) -> Any:
-        if recorder is None:
-            return function(scene, sensor, lights, options, lanes, *more)
-        clipping = (sensor.near_clip(), sensor.far_clip())
+        clipping = (sensor.near_clip(), sensor.far_clip()) if recorder else ()
         kind = (lanes.kind, options.kind, lights.kind_of_kernels if lights else None, clipping)
-        return recorder(kind, scene, sensor, lights, options, lanes, *more)
+        return call_recorded(recorder, function, kind, scene, sensor, lights, options, lanes, *more)
 
     def _options(self, launch: Launch, pixels: int, useful: Usefulness | None = None) -> PathOptions:
         connects = self.connections > 0 and launch.light_paths > 0
@@ -322,15 +295,13 @@ def trace(
     if lights is not None and options.traces_light:
         image, path = lanes.light()
         sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.LIGHT)
-        lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
-        splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height)
-        if tally is not None:
-            splat = TalliedSplat.of(splat, tally, image, dr.rsqrt(options.light_ratio * mi.Float(lanes.counts[2])))
+        note_splat = None if tally is None else tally.splats(image, options.light_ratio)
+        splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height, note_splat)
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
         offset = randomness.sampler(randomness.stream(lanes.keys, randomness.SLOTS), lanes.first_light_path)
         vertices = trace_light_paths(
             scene,
-            lens,
+            lanes.place(sensor, image),
             lights,
             options,
             rng=rng,
@@ -338,6 +309,7 @@ def trace(
             paths=lanes.counts[2],
             offset=offset.next_independent(),
             splat=splat,
+            tally=tally,
         )
         dr.eval(splats)  # a kernel of its own: one kernel with both loops is 5 % slower
 
@@ -345,13 +317,12 @@ def trace(
     keys = dr.gather(mi.UInt32, lanes.keys, image)
     sequence = randomness.stream(keys, randomness.EYE, pixel)
     rng = randomness.sampler(sequence, sample + lanes.first_sample)
-    lens = sensor if lanes.poses is None else PosedSensor(sensor, lanes.poses, image)
-    start = primary_rays(lens, rng, pixel, joined=options.traces_light)
+    start = primary_rays(lanes.place(sensor, image), rng, pixel, joined=options.traces_light)
     connectable = None
     if vertices is not None:
         first = lanes.partner(sample, randomness.places(keys, sample + lanes.first_sample, pixel))
-        noted = None if tally is None else TalliedConnections.of(tally, image, pixel, lanes)
-        connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts, noted)
+        note = None if tally is None else tally.connections_of(image, pixel)
+        connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts, note)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 
     sums.add(image * lanes.pixels + pixel, radiance * lanes.eye_scale, dr.select(hit, lanes.eye_scale, 0))
@@ -373,20 +344,14 @@ def connection_count(connections: int, max_depth: int, *, guided: bool) -> float
     return connections / (1 if guided else min(3, max(1, max_depth - 2)))
 
 
-def _whole(props: mi.Properties, name: str, default: int) -> int:
-    """A whole number of the plugin's parameters; raises ValueError for anything else."""
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or value != value // 1:
-        raise ValueError(f"bdpt: {name} is {value!r}; allowed are whole numbers")
-    return int(value)
-
-
-def _number(props: mi.Properties, name: str, default: float) -> float:
-    """A number of the plugin's parameters; raises ValueError for anything else."""
-    value = props.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ValueError(f"bdpt: {name} is {value!r}; allowed are numbers")
-    return float(value)
+def _number(props: mi.Properties, name: str, default: float, least: int, most: float = math.inf) -> Any:
+    """A number of the plugin's parameters, whole if its default is; raises ValueError for anything else."""
+    value, whole = props.get(name, default), isinstance(default, int)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if not is_number or (whole and value != value // 1) or not least <= value <= most:
+        kind, bound = "whole numbers" if whole else "numbers", f" to {most}" if most < math.inf else ""
+        raise ValueError(f"bdpt: {name} is {value!r}; allowed are {kind} from {least}{bound}")
+    return type(default)(value)
 
 
 def _yes_or_no(props: mi.Properties, name: str) -> bool:

@@ -70,7 +70,8 @@ class KeptVertices:
         numbers = dr.empty(mi.Float, n * 4 * _QUADS)
         power = record[_POWER]
         scaled = mi.Vector4f(*(power[k] * factor for k in range(3)), power.w)
-        _write(numbers, dr.arange(mi.UInt32, n), (*record[:_POWER], scaled, *record[_POWER + 1 :]))
+        for k, quad in enumerate((*record[:_POWER], scaled, *record[_POWER + 1 :])):  # no two lanes write in one place
+            dr.scatter(numbers, quad, dr.arange(mi.UInt32, n) * _QUADS + k, mode=dr.ReduceMode.NoConflicts)
         return cls(numbers, slots)
 
     def draw(self, slot: mi.UInt32, active: mi.Bool) -> KeptVertex:
@@ -79,8 +80,9 @@ class KeptVertices:
 
     def read(self, path: mi.UInt32, active: mi.Bool) -> KeptVertex:
         """The kept vertex of light path ``path``; its depth is 0 if there is none."""
-        record = _read(self.numbers, path, _QUADS, active)
-        p, n, frame_n, frame_s, wi, throughput, dp_du, dp_dv = record
+        p, n, frame_n, frame_s, wi, throughput, dp_du, dp_dv = (
+            dr.gather(mi.Vector4f, self.numbers, path * _QUADS + k, active) for k in range(_QUADS)
+        )
         si = dr.zeros(mi.SurfaceInteraction3f, dr.width(path))
         si.t = mi.Float(0)  # finite: a surface was hit
         si.p, si.n, si.wi = p.xyz, mi.Normal3f(n.xyz), wi.xyz
@@ -96,17 +98,6 @@ class KeptVertices:
 def empty_record() -> Record:
     """A record of zeros."""
     return tuple(mi.Vector4f(0) for _ in range(_QUADS))
-
-
-def _write(memory: mi.Float, place: mi.UInt32, record: Record) -> None:
-    """Write a record at ``place``, where no other lane writes."""
-    for k, quad in enumerate(record):
-        dr.scatter(memory, quad, place * len(record) + k, mode=dr.ReduceMode.NoConflicts)
-
-
-def _read(memory: mi.Float, place: mi.UInt32, quads: int, active: mi.Bool) -> Record:
-    """The record of so many vectors at ``place``."""
-    return tuple(dr.gather(mi.Vector4f, memory, place * quads + k, active) for k in range(quads))
 
 
 def _bits_to_float(bits: mi.UInt32) -> mi.Float:

@@ -9,7 +9,7 @@ from typing import Self
 import drjit as dr
 import mitsuba as mi
 
-from photonfarm.renderer.bdpt.poses import Poses
+from photonfarm.renderer.bdpt.poses import PosedSensor, Poses
 
 LAUNCH_PATHS = 1 << 20
 """The most eye or light paths of one image traced at once, unless one sample of each pixel needs more.
@@ -133,6 +133,10 @@ class Lanes:
     def pixels(self) -> int:
         """The number of pixels of one image."""
         return self.width * self.height
+
+    def place(self, sensor: mi.Sensor, image: mi.UInt32) -> mi.Sensor | PosedSensor:
+        """The sensor of the images that lanes belong to."""
+        return sensor if self.poses is None else PosedSensor(sensor, self.poses, image)
 
     def eye(self) -> tuple[mi.UInt32, mi.UInt32, mi.UInt32]:
         """(image, sample, pixel) of each eye path's lane."""

@@ -23,7 +23,7 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt import weights
 from photonfarm.renderer.bdpt.camera import Splat, sample_sensor
-from photonfarm.renderer.bdpt.guiding.tally import TalliedSplat
+from photonfarm.renderer.bdpt.guiding.tally import Tally
 from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertex, KeptVertices, Record, empty_record
 from photonfarm.renderer.bdpt.lights.emission import AREA, Emission, Lights, sample_emission
@@ -93,15 +93,17 @@ def trace_light_paths(
     paths: mi.UInt32,
     offset: mi.Float,
     splat: Splat,
+    tally: Tally | None = None,
 ) -> KeptVertices | None:
     """Trace a light path for each of n points of ``rng``, and add what the lens sees of them by ``splat``.
 
     ``path`` [n] is a path's number among the ``paths`` [1] of its image in this launch, and ``offset`` [K] a random
-    number for each image. Returns the kept vertices, or None without connections.
+    number for each image. ``tally`` notes their starts and edges. Returns the kept vertices, or None without
+    connections.
     """
     start = sample_emission(lights, rng, path, paths)
-    if isinstance(splat, TalliedSplat):
-        splat.begin(start.cell)
+    if tally is not None:
+        tally.begin_paths(start.cell)
     (state,) = loop_once(
         state=(first_state(scene, lights, start, rng, empty_record() if options.connects else ()),),
         cond=lambda s: s.active,
@@ -109,8 +111,8 @@ def trace_light_paths(
         labels=("light path",),
         label="bdpt light paths",
     )
-    if isinstance(splat, TalliedSplat):
-        splat.end(state.depth)
+    if tally is not None:
+        tally.end_paths(state.depth)
     if not options.connects:
         dr.eval(state.depth)
         return None

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.light_paths import LightState, PathOptions, first_state, scatter
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights, sample_emission
-from photonfarm.renderer.bdpt.recording import Recorder, loop_once
+from photonfarm.renderer.bdpt.recording import Recorder, call_recorded, loop_once
 from photonfarm.renderer.bdpt.scenes import check_scene
 
 Floats = npt.NDArray[np.float32]
@@ -56,8 +56,7 @@ def trace_photons(
         lights = read_lights(scene)
         keys = randomness.image_keys([seed & 0xFFFFFFFF])
         arguments = (lights, keys, dr.opaque(mi.UInt32, paths), dr.opaque(mi.Float, 0), paths, depth)
-        traced = partial(recorder, (paths, depth, lights.kinds)) if recorder else trace
-        out, bounce = traced(scene, None, *arguments)
+        out, bounce = call_recorded(recorder, trace, (paths, depth, lights.kinds), scene, None, *arguments)
     position, direction, normal, power = (np.ascontiguousarray(np.array(column).T, dtype=np.float32) for column in out)
     return TracedPhotons(position, direction, normal, power / np.float32(paths), np.array(bounce))
 

@@ -133,9 +133,17 @@ def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
     The place along the curve has 32 bits, 16 for each coordinate; the bits below them are drawn independently.
     """
     length = mi.UInt32((mi.Float64(lane) + mi.Float64(rng.next_1d())) * (4294967296.0 / mi.Float64(n)))
-    below = mi.Point2f(rng.next_independent(), rng.next_independent())
-    cell = mi.Point2f(mi.Float(every_other_bit(length)), mi.Float(every_other_bit(length >> 1)))
-    return dr.minimum((cell + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
+    return point_on_curve(length, mi.Point2f(rng.next_independent(), rng.next_independent()))
+
+
+def point_on_curve(place: mi.UInt32, below: mi.Point2f) -> mi.Point2f:
+    """The points in [0, 1)² at places along Morton's curve, 16 bits for each coordinate; ``below`` are those below."""
+    return dr.minimum((corner_of(place) + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
+
+
+def corner_of(cell: mi.UInt32) -> mi.Point2f:
+    """The lower corner of the cells with these numbers along Morton's curve, in cells."""
+    return mi.Point2f(mi.Float(every_other_bit(cell)), mi.Float(every_other_bit(cell >> 1)))
 
 
 def every_other_bit(x: mi.UInt32) -> mi.UInt32:

@@ -62,6 +62,18 @@ class Recorder:
         return self._function(scene, sensor, *arguments)
 
 
+def call_recorded(
+    recorder: Recorder | None,
+    function: Callable[..., Any],
+    kind: Hashable,
+    scene: mi.Scene,
+    sensor: mi.Sensor | None,
+    *arguments: Any,
+) -> Any:
+    """The result of ``function`` by its ``recorder``, or called directly if there is none."""
+    return function(scene, sensor, *arguments) if recorder is None else recorder(kind, scene, sensor, *arguments)
+
+
 @dataclass(slots=True)
 class _Recording:
     """A function recorded for one kind of call, and the number of failed attempts."""

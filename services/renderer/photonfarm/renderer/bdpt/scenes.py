@@ -5,8 +5,6 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
-UNBOUNDED = 0xFFFFFFFF
-
 UNSAMPLED = {"Instance": "an instance", "BSplineCurve": "a curve", "LinearCurve": "a curve"}
 """The classes of shapes whose surfaces Mitsuba cannot sample, in words; it fails if a scene has any of them."""
 
@@ -53,13 +51,6 @@ def check_scene(scene: mi.Scene, *, light_paths: bool) -> None:
             "paths cannot start in it, because Mitsuba cannot sample a shape's surface where some shapes are of this "
             "kind; use light_ratio=0 and connections=0"
         )
-
-
-def depth_limit(max_depth: int) -> int:
-    """The longest path, in edges, as an unsigned number; −1 stands for no bound. Raises ValueError below −1."""
-    if max_depth < -1:
-        raise ValueError(f"bdpt: max_depth is {max_depth}; allowed are -1 (unbounded) and any number of edges from 0")
-    return UNBOUNDED if max_depth == -1 else max_depth
 
 
 def bounding_box(scene: mi.Scene) -> mi.ScalarBoundingBox3f:

@@ -48,9 +48,12 @@ def points(values: NDArray[Any]) -> Any:
     return mi.Point3f(*(floats(values[:, i]) for i in range(3)))
 
 
-def matrix(values: NDArray[np.float64]) -> Any:
-    """A (4, 4) matrix as mi.Matrix4f whose entries are opaque to the compiler."""
-    return mi.Matrix4f(*(dr.opaque(mi.Float, float(entry)) for entry in values.ravel()))
+def put_transform(parameters: Any, to_world: NDArray[np.float64]) -> None:
+    """Give the `to_world` of Mitsuba's parameters a matrix (4, 4) whose entries are opaque to the compiler."""
+    matrix = mi.Matrix4f(*(dr.opaque(mi.Float, float(entry)) for entry in to_world.ravel()))
+    parameters["to_world"] = type(parameters["to_world"])(matrix)
+    dr.make_opaque(parameters["to_world"])
+    parameters.update()
 
 
 def zeros_like(value: Any) -> Any:

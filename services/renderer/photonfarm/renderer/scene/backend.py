@@ -25,7 +25,6 @@ from typing import Any
 from photonfarm.core.errors import BackendError
 from photonfarm.farm import devices
 from photonfarm.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
-from photonfarm.renderer.scene import native
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "PHOTONFARM_VARIANT"
@@ -116,8 +115,6 @@ def load(threads: int | None = None) -> Any:
         os.environ[LLVM_VARIABLE] = find_llvm()
     mitsuba, drjit = _import("mitsuba"), _import("drjit")
     _set_variant(mitsuba, chosen.variant)
-    if chosen.variant.startswith("llvm"):
-        native.use_gathers_if_asked()
     if threads is not None:
         drjit.set_thread_count(threads)
     _import("photonfarm.renderer.bdpt")

@@ -7,7 +7,7 @@ short by at most 0.1 %.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,13 +43,17 @@ def triangles_of(shape: Any, sections: int = SECTIONS) -> Triangles:
         positions = np.array(shape.vertex_positions_buffer(), np.float32)
         faces = np.array(shape.faces_buffer(), np.uint32)
         return Triangles(positions.reshape(-1, 3), faces.reshape(-1, 3))
-    make = {"Sphere": _sphere, "Disk": _disk, "Cylinder": _cylinder}.get(shape.class_name())
-    if make is None:
+    if shape.class_name() not in _PROFILES:
         raise SpecError(
             f"shape {shape.id()!r} is a {shape.class_name()}; "
             "only meshes, rectangles, cubes, spheres, disks and cylinders can be used"
         )
-    points = make(sections)
+    angle = np.linspace(0, 2 * np.pi, sections + 1)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    radius, height = _PROFILES[shape.class_name()](sections)
+    points = np.empty((len(radius), len(circle), 3))
+    points[..., :2] = np.array(radius)[:, None, None] * circle
+    points[..., 2] = np.array(height)[:, None]
     to_world = np.array(mi.traverse(shape)["to_world"].matrix, np.float64).reshape(4, 4)
     vertices = points.reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
     corners = _grid_faces(*points.shape[:2])
@@ -58,31 +62,17 @@ def triangles_of(shape: Any, sections: int = SECTIONS) -> Triangles:
     return Triangles(vertices.astype(np.float32), corners)
 
 
-def _around(sections: int) -> NDArray[np.float64]:
-    angle = np.linspace(0, 2 * np.pi, sections + 1)
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
-def _sphere(sections: int) -> NDArray[np.float64]:
-    """Unit sphere, rows from the lower pole to the upper."""
+def _half_circle(sections: int) -> tuple[Any, Any]:
     polar = np.linspace(-np.pi / 2, np.pi / 2, sections // 2 + 1)
-    circle = _around(sections)
-    points = np.empty((len(polar), len(circle), 3))
-    points[..., :2] = np.cos(polar)[:, None, None] * circle
-    points[..., 2] = np.sin(polar)[:, None]
-    return points
+    return np.cos(polar), np.sin(polar)
 
 
-def _disk(sections: int) -> NDArray[np.float64]:
-    """Unit disk at z = 0, facing +z: rows from the rim to the centre."""
-    rim = np.pad(_around(sections), ((0, 0), (0, 1)))
-    return np.stack([rim, np.zeros_like(rim)])
-
-
-def _cylinder(sections: int) -> NDArray[np.float64]:
-    """Unit cylinder without caps, z from 0 to 1."""
-    rim = np.pad(_around(sections), ((0, 0), (0, 1)))
-    return np.stack([rim, rim + np.array([0, 0, 1])])
+_PROFILES: dict[str, Callable[[int], tuple[Any, Any]]] = {
+    "Sphere": _half_circle,
+    "Disk": lambda _: ((1, 0), (0, 0)),
+    "Cylinder": lambda _: ((1, 1), (0, 1)),
+}
+"""Shapes that turn a profile about z: (radii, heights) of its points, for so many sections around."""
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.uint32]:

@@ -12,7 +12,6 @@ The scene's own lights are dimmed or switched off by the factors that a spec has
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import drjit as dr
@@ -22,8 +21,8 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.records import F32
-from photonfarm.renderer.bdpt.lights.selection import BRIGHTNESS
-from photonfarm.renderer.scene.arrays import floats, matrix, zeros_like
+from photonfarm.renderer.bdpt.lights.selection import brightness_of
+from photonfarm.renderer.scene.arrays import floats, put_transform, zeros_like
 from photonfarm.scene.files import ENVIRONMENT
 from photonfarm.scene.spec import SceneSpec
 
@@ -67,18 +66,13 @@ class TransformPlacement:
 
     def move(self, translation: F32) -> None:
         """Place the shape at `translation` (3,) from rest."""
-        self._put(_shift(translation.astype(np.float64)) @ self._rest)
+        put_transform(self._parameters, _shift(translation.astype(np.float64)) @ self._rest)
 
     def park(self, parking: Parking) -> None:
         """Shrink the shape into the parking place."""
         shrunk = np.diag([PARKED_SCALE] * 3 + [1.0])
-        self._put(_shift(parking.astype(np.float64)) @ shrunk @ _shift(-self._corner) @ self._rest)
-
-    def _put(self, to_world: NDArray[np.float64]) -> None:
-        kind = type(self._parameters["to_world"])
-        self._parameters["to_world"] = kind(matrix(to_world))
-        dr.make_opaque(self._parameters["to_world"])
-        self._parameters.update()
+        to_world = _shift(parking.astype(np.float64)) @ shrunk @ _shift(-self._corner) @ self._rest
+        put_transform(self._parameters, to_world)
 
 
 class LightSwitch:
@@ -86,8 +80,7 @@ class LightSwitch:
 
     def __init__(self, emitter: Any) -> None:
         self._parameters = mi.traverse(emitter)
-        keys = [key for key in self._parameters.keys() if key.startswith("radiance.")]  # noqa: SIM118 - no mapping
-        values = {key: self._parameters[key] for key in keys if not key.endswith("to_uv")}
+        values = {key: self._parameters[key] for key in brightness_of(self._parameters)}
         self._lit = {key: type(value)(value) for key, value in values.items()}  # references change with the scene
         self._dark = {key: zeros_like(value) for key, value in self._lit.items()}
 
@@ -105,39 +98,31 @@ def _shift(offset: NDArray[np.float64]) -> NDArray[np.float64]:
     return shift
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class MovableGroup:
     """The shapes of one movable group."""
 
-    placements: tuple[MeshPlacement | TransformPlacement, ...]
-    shines: tuple[LightSwitch, ...]
-
-    @classmethod
-    def of(cls, shapes: list[Any]) -> MovableGroup:
-        """The group of these shapes, which are placed as modelled."""
-        shines = tuple(LightSwitch(shape.emitter()) for shape in shapes if shape.is_emitter())
-        placements = (
+    def __init__(self, shapes: list[Any]) -> None:
+        """Take shapes, which are placed as modelled."""
+        self._lights = [LightSwitch(shape.emitter()) for shape in shapes if shape.is_emitter()]
+        self._placements = [
             MeshPlacement(shape) if "vertex_positions" in mi.traverse(shape) else TransformPlacement(shape)
             for shape in shapes
-        )
-        return cls(tuple(placements), shines)
+        ]
 
     def move(self, translation: F32, *, was_present: bool) -> None:
         """Place the group at `translation` (3,) from rest."""
-        for placement in self.placements:
+        for placement in self._placements:
             placement.move(translation)
         if not was_present:
-            self._switch(True)
+            for light in self._lights:
+                light.switch(True)
 
     def park(self, parking: Parking) -> None:
         """Remove the group from the scene."""
-        for placement in self.placements:
+        for placement in self._placements:
             placement.park(parking)
-        self._switch(False)
-
-    def _switch(self, on: bool) -> None:
-        for shine in self.shines:
-            shine.switch(on)
+        for light in self._lights:
+            light.switch(False)
 
 
 def dim(scene: Any, spec: SceneSpec) -> None:
@@ -165,25 +150,20 @@ def _name(emitter: Any) -> str:
 
 def _multiply(emitter: Any, factor: float, what: str) -> None:
     parameters = mi.traverse(emitter)
-    names = list(parameters.keys())
-    brightness = [name for name in names if name.startswith(BRIGHTNESS) and not name.endswith("to_uv")]
-    keys = ["scale"] if "scale" in names else brightness
+    keys = ["scale"] if "scale" in parameters else brightness_of(parameters)
     if not keys:
         raise SpecError(f"{what} is a {emitter.class_name()}, which has no factor; only 1 is allowed")
     for key in keys:
-        parameters[key] = _product(parameters[key], factor, f"{what} has {key}")
+        value = parameters[key]
+        if not dr.is_array_v(value):
+            raise SpecError(
+                f"{what} has {key}, which is not in proportion to its radiance; give it an rgb radiance to dim it"
+            )
+        if factor and not dr.is_float_v(value):
+            raise SpecError(
+                f"{what} has {key} in 8 bits, which have no room for factors but 0 and 1; give its bitmap "
+                '<string name="format" value="variant"/>'
+            )
+        parameters[key] = value * factor if factor else zeros_like(value)
         dr.make_opaque(parameters[key])
     parameters.update()
-
-
-def _product(value: Any, factor: float, what: str) -> Any:
-    if not dr.is_array_v(value):
-        raise SpecError(f"{what}, which is not in proportion to its radiance; give it an rgb radiance to dim it")
-    if factor == 0:
-        return zeros_like(value)
-    if not dr.is_float_v(value):
-        raise SpecError(
-            f"{what} in 8 bits, which have no room for factors but 0 and 1; give its bitmap "
-            '<string name="format" value="variant"/>'
-        )
-    return value * factor

@@ -27,22 +27,21 @@ letter: N points.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.core.records import F32, ViewBuffers
+from photonfarm.renderer.bdpt.recording import call_recorded
 from photonfarm.renderer.scene.arrays import floats, points, rows
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 
 if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder
-
-
-from numpy.typing import NDArray
 
 GRID = 4
 """The number of rays along each axis of a pixel, over which albedo is averaged."""
@@ -58,11 +57,11 @@ def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | N
     many materials.
     """
     camera = Camera.of(view, spec)
-    directions = camera.rays()
-    hit, normal, distance = _trace_recorded("centre", scene, _rays(camera, directions, spec), recorder)
-    along = directions.reshape(-1, 3).astype(np.float64) @ camera.forward
-    depth = np.where(np.array(hit), spec.view.near + np.array(distance) * along, 0)
+    rays, along = camera_rays(camera, camera.rays(), spec)
     shape = (camera.height, camera.width)
+    kind = ("centre", dr.width(rays[2]))
+    hit, normal, distance = call_recorded(recorder, trace_first_surfaces, kind, scene, None, *rays, "centre")
+    depth = np.where(np.array(hit), spec.view.near + np.array(distance) * along, 0)
     albedo = _mean_albedo(scene, camera, spec, recorder)
     return ViewBuffers(depth.astype(np.float32).reshape(shape), albedo, rows(normal, *shape))
 
@@ -75,26 +74,26 @@ def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec, recorder: Recorder
     total = np.zeros((camera.height, camera.width, 3))
     for start in range(0, len(within), at_once):
         directions = np.stack([camera.rays(u, v) for u, v in within[start : start + at_once]])
-        (albedo,) = _trace_recorded("albedo", scene, _rays(camera, directions, spec), recorder)
+        rays, _ = camera_rays(camera, directions, spec)
+        kind = ("albedo", dr.width(rays[2]))
+        (albedo,) = call_recorded(recorder, trace_first_surfaces, kind, scene, None, *rays, "albedo")
         total += rows(albedo, *directions.shape[:-1]).sum(axis=0, dtype=np.float64)
     return (total / len(within)).astype(np.float32)
 
 
-What = Literal["centre", "albedo"]
-Rays = tuple[Any, Any, Any]
-"""The origins (Point3f), directions (Vector3f) and lengths (Float) of rays."""
+def camera_rays(camera: Camera, directions: F32, spec: SceneSpec) -> tuple[tuple[Any, Any, Any], NDArray[np.float64]]:
+    """Rays from the near to the far plane, along unit directions (..., 3), and their cosines to the forward axis.
+
+    The origins (Point3f), directions (Vector3f) and lengths (Float) of rays.
+    """
+    flat = directions.reshape(-1, 3)
+    along = flat.astype(np.float64) @ camera.forward
+    near, far = spec.view.near / along, spec.view.far / along
+    return (points(camera.origin + flat * near[:, None]), mi.Vector3f(points(flat)), floats(far - near)), along
 
 
-def _trace_recorded(what: What, scene: Any, rays: Rays, recorder: Recorder | None) -> tuple[Any, ...]:
-    """The result of `trace_first_surfaces`, recorded by `what` and the number of rays."""
-    if recorder is None:
-        return trace_first_surfaces(scene, None, *rays, what)
-    columns: tuple[Any, ...] = recorder((what, dr.width(rays[2])), scene, None, *rays, what)
-    return columns
-
-
-def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: What) -> tuple[Any, ...]:
-    """The hits, normals and distances of the first surfaces that rays meet, or their albedo; zeros without a hit."""
+def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: str) -> tuple[Any, ...]:
+    """(hits, normals, distances) of the first surfaces that rays meet ("centre"), or ("albedo",); zeros without."""
     si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
     hit = si.is_valid()
     columns: tuple[Any, ...] = (dr.select(hit, seen_reflectance(si, hit), 0),)
@@ -106,16 +105,8 @@ def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach:
 
 def first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
     """The first hits between the near and the far plane of rays from the camera along unit directions (..., 3)."""
-    origin, direction, reach = _rays(camera, directions, spec)
+    (origin, direction, reach), _ = camera_rays(camera, directions, spec)
     return scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
-
-
-def _rays(camera: Camera, directions: F32, spec: SceneSpec) -> Rays:
-    """Rays from the near to the far plane, along unit directions (..., 3)."""
-    flat = directions.reshape(-1, 3)
-    along = flat.astype(np.float64) @ camera.forward  # cosine to the forward axis
-    near, far = spec.view.near / along, spec.view.far / along
-    return points(camera.origin + flat * near[:, None]), mi.Vector3f(points(flat)), floats(far - near)
 
 
 def seen_reflectance(si: Any, active: Any) -> Any:

@@ -11,15 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError
-from photonfarm.core.keys import Key
+from photonfarm.core.keys import Key, seed_of
 from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import GuideSpec, SceneSpec, Transport, shape_ids
-from photonfarm.scene.view import View
+from photonfarm.scene.view import View, sample_view
 
 if TYPE_CHECKING:
     from photonfarm.renderer.scene.surroundings import Surroundings
+
+
+GUIDE_VIEWS = 4
+"""The views that a guide of light paths is learned from."""
+
+GUIDED_SAMPLES = 16
+"""The samples that such a guide is learned for, where there is a single configuration; else it is one."""
 
 
 class LoadedScene:
@@ -40,7 +47,6 @@ class LoadedScene:
         from photonfarm.renderer.scene.editing import MovableGroup
         from photonfarm.renderer.scene.loading import AimedSensor
         from photonfarm.renderer.scene.materials import Materials
-        from photonfarm.renderer.scene.start_guides import SceneGuides
         from photonfarm.renderer.scene.surroundings import boxes_of
 
         self.spec = spec
@@ -55,11 +61,11 @@ class LoadedScene:
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
         by_id = {shape.id(): shape for shape in shapes}
-        self._groups = [MovableGroup.of(_find_shapes(by_id, shape_ids(group), group.name)) for group in spec.groups]
+        self._groups = [MovableGroup(_find_shapes(by_id, shape_ids(group), group.name)) for group in spec.groups]
         self.boxes = boxes_of(shapes)
         self.still = np.array([shape.id() not in self._group_of for shape in shapes], np.bool_)
         self._parking = self.boxes[self.still if self.still.any() else slice(None), 0].min(axis=0)
-        self._start_guides = SceneGuides(spec, self._sensor)
+        self._light_guides: dict[Any, Any] = {}  # by integrator, of the present configuration
         self._distant = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         self._state = rest(spec)
 
@@ -93,17 +99,12 @@ class LoadedScene:
                 group.move(translation, was_present=was_present)
             elif was_present and not present:
                 group.park(self._parking)
+        if not np.array_equal(modification.vector, self._state.vector):
+            self.forget_guides()
         self._state = modification
-        self._refresh()
-
-    def _refresh(self) -> None:
-        """Let Mitsuba rebuild what depends on all shapes.
-
-        It gives environment lights the scene's bounding sphere before it knows the new one, and never gives it to
-        directional lights; so they are updated once more.
-        """
         if self._groups:
-            self.scene.parameters_changed([])
+            self.scene.parameters_changed([])  # Mitsuba rebuilds what depends on all shapes
+            # It gives environment lights the old bounding sphere of the scene, and directional ones none
             for emitter in self._distant:
                 emitter.set_scene(self.scene)
 
@@ -124,7 +125,7 @@ class LoadedScene:
         places = np.stack([self._sensor.place(view) for view in views])
         sensor, spp = self._sensor.at_origin, self.spec.transport.half_spp
         guide = self._guide(self._integrator)
-        return np.array(self._integrator.render_views(self.scene, sensor, places, seeds, spp, guide), np.float32)
+        return np.array(self._integrator.render_seeds(self.scene, sensor, seeds, spp, guide, places), np.float32)
 
     def render_half(self, view: View, seed: int) -> F32:
         """One half-estimate, (H, W, 3)."""
@@ -147,12 +148,31 @@ class LoadedScene:
         return np.array(image, np.float32)
 
     def _guide(self, integrator: Any) -> Any:
-        """The guide of the present configuration's light paths; None for an integrator that is not guided."""
-        return self._start_guides.of(integrator, self.scene, self._state)
+        """The guide of light paths in the present configuration, learned once; None for an integrator without one.
+
+        It follows from the configuration's content key alone: it is learned from a few views that are drawn as those of
+        samples are. So both halves of a sample, every view and every worker have the same guide, and none of them
+        shares a random number with it.
+        """
+        from photonfarm.renderer.bdpt.guiding.learning import Effort
+
+        if not getattr(integrator, "guided_light", False):
+            return None
+        if integrator not in self._light_guides:
+            spec, key = self.spec, self._state.key(self.spec.radiance_id)
+            seed = seed_of(key, "guide of light paths")
+            views = [sample_view(spec, key, seed, i, self._state) for i in range(GUIDE_VIEWS)]
+            places = np.stack([self._sensor.place(view) for view in views])
+            samples = 1 if spec.groups else GUIDED_SAMPLES
+            eye_paths = 2 * spec.film.width * spec.film.height * spec.transport.half_spp * samples
+            effort = Effort.for_image(eye_paths, integrator.light_ratio, integrator.connections)
+            guide = integrator.learn_guide(self.scene, self._sensor.at_origin, seed, places, effort)
+            self._light_guides[integrator] = guide
+        return self._light_guides[integrator]
 
     def forget_guides(self) -> None:
-        """Learn guides anew, as for another configuration."""
-        self._start_guides.forget()
+        """Learn the guides of light paths anew, as for another configuration."""
+        self._light_guides.clear()
 
     def buffers(self, view: View) -> ViewBuffers:
         """The depth, albedo and normal buffers of a view in the present configuration."""

@@ -21,9 +21,9 @@ from photonfarm.core.errors import SpecError
 from photonfarm.renderer.bdpt.lights.selection import is_flat
 from photonfarm.renderer.bdpt.scenes import check_scene
 from photonfarm.renderer.scene import rooms
-from photonfarm.renderer.scene.arrays import matrix
+from photonfarm.renderer.scene.arrays import put_transform
 from photonfarm.renderer.scene.editing import dim, factor_of
-from photonfarm.renderer.scene.rooms.solids import rectangle_light
+from photonfarm.renderer.scene.solids import rectangle_light
 from photonfarm.scene.files import SceneFile
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import find_scene
@@ -34,21 +34,36 @@ class AimedSensor:
     """A perspective sensor whose transform is opaque to the compiler, so that views cost no compilation."""
 
     def __init__(self, spec: SceneSpec) -> None:
+        """Have a float32 RGB film with a box filter, the field of view along the width, and the clip planes."""
+        film = {
+            "type": "hdrfilm",
+            "width": spec.film.width,
+            "height": spec.film.height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        }
+        self._described = {
+            "type": "perspective",
+            "fov": spec.view.fov_deg,
+            "fov_axis": "x",
+            "near_clip": spec.view.near,
+            "far_clip": spec.view.far,
+            "film": film,
+            "sampler": {"type": "independent", "sample_count": spec.transport.half_spp},
+        }
         self._spec = spec
-        self.sensor = mi.load_dict(describe(spec))
+        self.sensor = mi.load_dict(self._described)
         self._parameters = mi.traverse(self.sensor)
 
     @cached_property
     def at_origin(self) -> Any:
         """A sensor that stays at the origin and looks along +z, for the integrator to place."""
-        return mi.load_dict(describe(self._spec))
+        return mi.load_dict(self._described)
 
     def aim(self, view: View) -> Any:
         """The sensor, looking at this view."""
-        kind = type(self._parameters["to_world"])
-        self._parameters["to_world"] = kind(matrix(self.place(view)))
-        dr.make_opaque(self._parameters["to_world"])
-        self._parameters.update()
+        put_transform(self._parameters, self.place(view))
         return self.sensor
 
     def place(self, view: View) -> NDArray[np.float64]:
@@ -58,50 +73,24 @@ class AimedSensor:
         return to_world
 
 
-def describe(spec: SceneSpec) -> dict[str, Any]:
-    """The sensor's description: float32 RGB film with a box filter, field of view along the width, clip planes."""
-    film = {
-        "type": "hdrfilm",
-        "width": spec.film.width,
-        "height": spec.film.height,
-        "pixel_format": "rgb",
-        "component_format": "float32",
-        "rfilter": {"type": "box"},
-    }
-    return {
-        "type": "perspective",
-        "fov": spec.view.fov_deg,
-        "fov_axis": "x",
-        "near_clip": spec.view.near,
-        "far_clip": spec.view.far,
-        "film": film,
-        "sampler": {"type": "independent", "sample_count": spec.transport.half_spp},
-    }
-
-
 def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
     """The Mitsuba scene of a spec; its cameras, films and integrators are ignored, as the spec has its own.
 
     Shapes stay separate (`optimize=False`), as merged ones could not move. Raises SpecError for a file that is missing,
     that changed since the spec was read, or that Mitsuba or the integrator refuses.
     """
-    scene = _load_builtin(spec) if spec.scene.builtin else _load_file(spec, beside)
+    scene = _load_file(spec, beside) if spec.scene.file else _load_builtin(spec)
     try:
         check_scene(scene, light_paths=bool(spec.transport.light_ratio or spec.photons.paths))
     except ValueError as error:
         raise SpecError(f"{spec.name}: {error}") from error
-    _check_lights(spec, scene)
-    return scene
-
-
-def _check_lights(spec: SceneSpec, scene: Any) -> None:
-    """Raise SpecError for mesh lights with smooth normals: only hits find them, which would give almost pure noise."""
-    for shape in scene.shapes():
+    for shape in scene.shapes():  # only hits find mesh lights with smooth normals, which would give almost pure noise
         if shape.is_emitter() and shape.is_mesh() and not np.array(is_flat(shape)).all():
             raise SpecError(
                 f"{spec.name}: mesh light {shape.id()!r} has smooth vertex normals, with which it cannot be sampled "
                 'without bias; give it <boolean name="face_normals" value="true"/>'
             )
+    return scene
 
 
 def _load_builtin(spec: SceneSpec) -> Any:

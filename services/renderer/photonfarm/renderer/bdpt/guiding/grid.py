@@ -19,7 +19,6 @@ import mitsuba as mi
 
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.launches import Lanes
-from photonfarm.renderer.bdpt.randomness import every_other_bit
 
 _MARGIN = 0.01373, 0.02291  # below and above the scene, over its extent: so that walls seldom lie between two cells
 
@@ -125,20 +124,6 @@ def cell_of(u: mi.Point2f, side: int) -> mi.UInt32:
     """The number along Morton's curve of the cell that points lie in, of ``side``² ones; some cell for NaN."""
     x, y = (mi.UInt32(dr.clip(u[k] * side, 0, side - 0.5)) for k in range(2))
     return dr.minimum(_spread(x) | (_spread(y) << 1), side * side - 1)
-
-
-def corner_of(cell: mi.UInt32) -> mi.Point2f:
-    """The lower corner of cells with these numbers, in cells."""
-    return mi.Point2f(mi.Float(every_other_bit(cell)), mi.Float(every_other_bit(cell >> 1)))
-
-
-def decode_morton(place: mi.Float64, below: mi.Point2f) -> mi.Point2f:
-    """The points in [0, 1)² at places in [0, 1) along Morton's curve, with 16 bits for each coordinate.
-
-    ``below`` in [0, 1)² are the bits below them.
-    """
-    bits = mi.UInt32(place * 4294967296.0)
-    return dr.minimum((corner_of(bits) + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
 
 
 def _spread(x: mi.UInt32) -> mi.UInt32:

@@ -16,8 +16,8 @@ import mitsuba as mi
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.renderer.bdpt.guiding.grid import cell_of, corner_of, decode_morton
-from photonfarm.renderer.bdpt.randomness import Sampler
+from photonfarm.renderer.bdpt.guiding.grid import cell_of
+from photonfarm.renderer.bdpt.randomness import Sampler, corner_of, point_on_curve
 
 F64 = NDArray[np.float64]
 
@@ -139,7 +139,7 @@ class GuidedStarts:
         cell = mi.UInt32(dr.binary_search(0, last, lambda i: dr.gather(mi.Float64, self.cdf, i) <= target))
         start = dr.gather(mi.Float64, self.cdf, dr.maximum(cell, 1) - 1, cell > 0)
         rest = (target - start) / (dr.gather(mi.Float64, self.cdf, cell) - start)
-        inside = decode_morton(dr.clip(rest, 0, 1 - 2.0**-33), below)
+        inside = point_on_curve(mi.UInt32(dr.clip(rest, 0, 1 - 2.0**-33) * 4294967296.0), below)
         square = cell // layout.positions**2
         light = square // layout.directions**2
         direction = (corner_of(square - light * layout.directions**2) + inside) / layout.directions

@@ -30,9 +30,6 @@ _PROBES = (
     (0.1, 0.1, 0.8),
 )  # points of each face that are looked up
 
-BRIGHTNESS = ("radiance.", "intensity.", "irradiance.")
-"""The first parts of the names of parameters that scale a light's brightness."""
-
 LightIndex: TypeAlias = "mi.Int32 | mi.UInt32"
 """Numbers of lights; ``dr.binary_search`` finds signed ones."""
 
@@ -105,16 +102,19 @@ def _over_cell(value: mi.Float, n: int) -> mi.Float:
 
 def sampling_weight(emitter: mi.Emitter, parameters: mi.SceneParameters) -> mi.Float:
     """The weight of a light's selection [1]: the emitter's ``sampling_weight`` while it shines, else 0."""
-    shines = mi.Bool(True)
-    keys = list(parameters.keys())
-    brightness = [key for key in keys if key.startswith(BRIGHTNESS) and not key.endswith("to_uv")]
-    if brightness:
-        shines = mi.Bool(False)
-        for key in brightness:
-            shines |= _is_positive(parameters[key])
+    brightness = brightness_of(parameters)
+    shines = mi.Bool(not brightness)
+    for key in brightness:
+        shines |= _is_positive(parameters[key])
     if "scale" in parameters:
         shines &= _is_positive(parameters["scale"])
     return dr.select(shines, dr.opaque(mi.Float, emitter.sampling_weight()), 0)
+
+
+def brightness_of(parameters: mi.SceneParameters) -> list[str]:
+    """The names of the parameters of a light that scale its brightness."""
+    kinds = ("radiance.", "intensity.", "irradiance.")
+    return [key for key in parameters.keys() if key.startswith(kinds) and not key.endswith("to_uv")]  # noqa: SIM118
 
 
 def _is_positive(value: Any) -> mi.Bool:

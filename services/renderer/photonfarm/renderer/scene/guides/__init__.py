@@ -24,9 +24,7 @@ Shape letters: H W image, L lit points, N rays: pixel by pixel, and within a pix
 
 from __future__ import annotations
 
-from photonfarm.renderer.scene.guides.direct import irradiance, point_light
-from photonfarm.renderer.scene.guides.images import view_guides
-from photonfarm.renderer.scene.guides.pattern import FOLLOWED, GuideSettings
-from photonfarm.renderer.scene.guides.specular_paths import trace
+from photonfarm.renderer.scene.guides.direct import FOLLOWED, GuideSettings, irradiance, point_light
+from photonfarm.renderer.scene.guides.images import trace, view_guides
 
 __all__ = ["FOLLOWED", "GuideSettings", "irradiance", "point_light", "trace", "view_guides"]

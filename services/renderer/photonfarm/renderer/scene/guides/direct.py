@@ -1,11 +1,10 @@
-"""Light that arrives straight from lights, at points and at surfaces that reflect it.
+"""Light that arrives straight from lights, at points and at surfaces that reflect it, and the sample points for that.
 
 Shape letters: L lit points, N rays.
 """
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,21 +15,73 @@ import numpy as np
 from photonfarm.core.keys import Key, Stream
 from photonfarm.core.records import F32
 from photonfarm.renderer.bdpt.lights.emission import Lights, hit_densities, read_lights, sample_direct
-from photonfarm.renderer.bdpt.recording import loop_once
+from photonfarm.renderer.bdpt.recording import call_recorded, loop_once
 from photonfarm.renderer.scene.arrays import floats, points, rows
-from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, reflects_here
-from photonfarm.renderer.scene.guides.pattern import (
-    SUB_PIXELS,
-    GuideSettings,
-    PatternSampler,
-    pattern_of,
-    shift_pattern,
-)
+from photonfarm.renderer.scene.gbuffer import GRID, diffuse_reflectance, reflects_here
 from photonfarm.renderer.scene.materials import has_other_lobes
 from photonfarm.scene.spec import GuideSpec
 
 if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorder
+
+FOLLOWED = 8
+"""The most mirrors and panes of glass that are followed."""
+
+NO_LIMIT = 1 << 20
+"""The edges of a path if the spec sets no limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuideSettings:
+    """The numbers that a kernel is compiled for."""
+
+    light_samples: int  # of each ray
+    followed: int  # the most mirrors and panes
+    max_depth: int  # the most edges of a path
+    near: float  # distance of the near plane
+    glossy: bool  # whether any surface has lobes that are neither diffuse nor followed
+
+
+SUB_PIXELS = GRID * GRID
+
+STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
+"""The steps of the additive recurrence R₃, n · steps modulo 1.
+
+They are the powers of 1 / 1.2207…, the root of x⁴ = x + 1 [Roberts, The unreasonable effectiveness of quasirandom
+sequences, 2018].
+"""
+
+
+def pattern_of(light_samples: int) -> F32:
+    """The points of a pixel before the shift, (…, 3): first those of each light sample, then those of the BSDF."""
+    number = np.arange((light_samples + 1) * SUB_PIXELS)[:, None]
+    return (number * np.array(STEPS) % 1).astype(np.float32)
+
+
+def shift_pattern(pattern: Any, shift: Any, sample: Any) -> list[Any]:
+    """The three random numbers of sample number `sample`, for each ray."""
+    within = dr.arange(mi.UInt32, dr.width(shift)) % SUB_PIXELS
+    place = sample * SUB_PIXELS + within
+    u = [dr.gather(mi.Float, column, place) + x for column, x in zip(pattern, shift, strict=True)]
+    return [x - dr.floor(x) for x in u]
+
+
+class PatternSampler:
+    """A sampler that returns three given numbers: one to choose a light, and two to choose a point on it."""
+
+    def __init__(self, u: list[Any]) -> None:
+        self._u = u
+
+    def next_1d(self) -> Any:
+        """The first number, which chooses a light."""
+        return self._u[0]
+
+    def next_2d(self) -> Any:
+        """The other two numbers, which choose a point on the light."""
+        return mi.Point2f(self._u[1], self._u[2])
+
+
+# ---------------------------------------------------------------------------------------------------------- at points
 
 
 def point_light(
@@ -47,8 +98,7 @@ def point_light(
     u = (Stream(key, "point light").uniform(len(position), 1, 3) + pattern) % 1
     at, facing = (np.repeat(each, SUB_PIXELS, axis=0) for each in (position, normal))
     arguments = lights, points(at), points(facing), [floats(column) for column in u.reshape(-1, 3).T]
-    traced = functools.partial(recorder, (len(at), lights.kinds)) if recorder else irradiance
-    irradiances = traced(scene, None, *arguments)
+    irradiances = call_recorded(recorder, irradiance, (len(at), lights.kinds), scene, None, *arguments)
     mean: F32 = rows(irradiances, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
     return mean
 
@@ -72,107 +122,64 @@ def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u
 # -------------------------------------------------------------------------------------------------------- on surfaces
 
 
-@dataclass(frozen=True, slots=True)
-class RayArrival:
-    """How rays reached a surface."""
-
-    met: Any  # Bool: there is a surface
-    direction: Any  # Vector3f: of the ray that meets it
-    followed: Any  # UInt32: surfaces passed on the way
-
-
 @dataclass(slots=True)
 class _Sum:
     """Loop variables of the sums over light samples."""
 
     index: Any  # UInt32
-    diffuse: Any  # Color3f
-    whole: Any  # Color3f
-
-
-@dataclass(slots=True)
-class ReflectedLight:
-    """Reflected direct light."""
-
-    diffuse: Any  # Color3f: by a white diffuse surface
-    whole: Any  # Color3f: by the surface as it is
-
-    def __add__(self, more: ReflectedLight) -> ReflectedLight:
-        return ReflectedLight(self.diffuse + more.diffuse, self.whole + more.whole)
-
-
-@dataclass(frozen=True, slots=True)
-class _Surface:
-    """A surface that reflects direct light."""
-
-    scene: Any
-    lights: Lights
-    si: Any  # SurfaceInteraction3f
-    normal: Any  # Normal3f: turned to where the ray comes from
-    direction: Any  # Vector3f: of that ray
-    diffuse: Any  # Bool: its diffuse lobe reflects
-    other: Any  # Bool: it has other lobes
-    settings: GuideSettings
+    diffuse: Any  # Color3f: reflected by a white diffuse surface
+    whole: Any  # Color3f: reflected by all lobes of a surface that has others
 
 
 def direct_light(
-    scene: Any, lights: Lights | None, si: Any, seen: RayArrival, pattern: Any, shift: Any, settings: GuideSettings
-) -> ReflectedLight:
-    """Direct light reflected by a surface: as if it were white and diffuse, and by all of its lobes."""
-    nothing = ReflectedLight(mi.Color3f(0), mi.Color3f(0))
+    scene: Any, lights: Lights | None, si: Any, d: Any, reached: Any, pattern: Any, shift: Any, settings: GuideSettings
+) -> tuple[Any, Any]:
+    """Direct light reflected by surfaces that rays along `d` have `reached`: (as if white and diffuse, by all lobes).
+
+    The mean over shadow rays to points of lights; lobes that are not diffuse get the share of the balance heuristic.
+    """
     if lights is None or not settings.light_samples:
-        return nothing
-    flags = si.bsdf().flags()
-    reached = seen.met & (seen.followed + 2 <= settings.max_depth)
-    diffuse = reached & reflects_here(si) & mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
-    other = reached & has_other_lobes(flags) & settings.glossy
-    at = _Surface(
-        scene, lights, si, turn_towards(si.sh_frame.n, seen.direction), seen.direction, diffuse, other, settings
-    )
-    return _sample_lights(at, pattern, shift) + (_sample_bsdf(at, pattern, shift) if settings.glossy else nothing)
-
-
-def _sample_lights(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
-    """The mean over shadow rays to points of lights; other lobes get the share of the balance heuristic."""
-    count = at.settings.light_samples
-    context, bsdf, si = mi.BSDFContext(), at.si.bsdf(), at.si
+        return mi.Color3f(0), mi.Color3f(0)
+    count, context, bsdf, normal = settings.light_samples, mi.BSDFContext(), si.bsdf(), turn_towards(si.sh_frame.n, d)
+    is_diffuse = reached & reflects_here(si) & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
+    other = reached & has_other_lobes(bsdf.flags()) & settings.glossy
 
     def body(s: _Sum) -> tuple[_Sum]:
-        light = sample_direct(
-            at.lights, si, PatternSampler(shift_pattern(pattern, shift, s.index)), at.diffuse | at.other
-        )
+        light = sample_direct(lights, si, PatternSampler(shift_pattern(pattern, shift, s.index)), is_diffuse | other)
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
-        lit = light.valid & ~at.scene.ray_test(shadow, light.valid)
-        cosine = dr.dot(at.normal, light.d)
-        reflects = at.diffuse & lit & (cosine > 0) & (dr.dot(si.n, light.d) * dr.dot(si.n, at.direction) < 0)
+        lit = light.valid & ~scene.ray_test(shadow, light.valid)
+        cosine = dr.dot(normal, light.d)
+        reflects = is_diffuse & lit & (cosine > 0) & (dr.dot(si.n, light.d) * dr.dot(si.n, d) < 0)
         white = dr.select(reflects, light.radiance_over_density * cosine * dr.inv_pi, 0)
         whole = mi.Color3f(0)
-        if at.settings.glossy:
-            value, density = bsdf.eval_pdf(context, si, si.to_local(light.d), at.other & lit)
+        if settings.glossy:
+            value, density = bsdf.eval_pdf(context, si, si.to_local(light.d), other & lit)
             share = dr.select(light.delta, 1, count * light.density / (count * light.density + density))
-            whole = dr.select(at.other & lit, value * light.radiance_over_density * share, 0)
+            whole = dr.select(other & lit, value * light.radiance_over_density * share, 0)
         return (_Sum(s.index + 1, s.diffuse + white, s.whole + whole),)
 
-    width = dr.width(at.diffuse)
+    width = dr.width(is_diffuse)
     start = _Sum(dr.zeros(mi.UInt32, width), dr.zeros(mi.Color3f, width), dr.zeros(mi.Color3f, width))
     (sums,) = loop_once(state=(start,), cond=lambda s: s.index < count, body=body, labels=("sum",), label="shadow rays")
     diffuse = sums.diffuse / count
-    of_diffuse = dr.select(at.other, 0, diffuse_reflectance(si, at.diffuse) * diffuse)
-    return ReflectedLight(diffuse, sums.whole / count + of_diffuse)
+    whole = sums.whole / count + dr.select(other, 0, diffuse_reflectance(si, is_diffuse) * diffuse)
+    if settings.glossy:
+        u = shift_pattern(pattern, shift, mi.UInt32(count))
+        whole += _sample_bsdf(scene, lights, si, other, u, count)
+    return diffuse, whole
 
 
-def _sample_bsdf(at: _Surface, pattern: Any, shift: Any) -> ReflectedLight:
-    """The light of one ray along a sample of the BSDF, with the share that shadow rays leave."""
-    u = shift_pattern(pattern, shift, mi.UInt32(at.settings.light_samples))
-    bs, weight = at.si.bsdf().sample(mi.BSDFContext(), at.si, u[0], mi.Point2f(u[1], u[2]), at.other)
-    ray = at.si.spawn_ray(at.si.to_world(bs.wo))
-    hit = at.scene.ray_intersect(ray, active=at.other)
-    emitter = hit.emitter(at.scene, at.other)
-    by_light, _ = hit_densities(at.scene, at.lights, emitter, hit, ray.o, at.si.p, at.other)
+def _sample_bsdf(scene: Any, lights: Lights, si: Any, active: Any, u: list[Any], count: int) -> Any:
+    """The light of one ray along a sample of the BSDF, with the share that `count` shadow rays leave."""
+    bs, weight = si.bsdf().sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]), active)
+    ray = si.spawn_ray(si.to_world(bs.wo))
+    hit = scene.ray_intersect(ray, active=active)
+    emitter = hit.emitter(scene, active)
+    by_light, _ = hit_densities(scene, lights, emitter, hit, ray.o, si.p, active)
     is_delta = mi.has_flag(bs.sampled_type, mi.BSDFFlags.Delta)
-    share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + at.settings.light_samples * by_light))
-    emitted = emitter.eval(hit, at.other)
-    return ReflectedLight(mi.Color3f(0), dr.select(at.other & (dr.max(emitted) > 0), weight * emitted * share, 0))
+    share = dr.select(is_delta, 1, bs.pdf / (bs.pdf + count * by_light))
+    emitted = emitter.eval(hit, active)
+    return dr.select(active & (dr.max(emitted) > 0), weight * emitted * share, 0)
 
 
 def turn_towards(normal: Any, direction: Any) -> Any:

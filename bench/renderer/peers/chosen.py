@@ -75,7 +75,7 @@ def by_pilot(scene: Any, max_depth: int, seconds: float, spp: int) -> Chosen:
     from photonfarm.renderer.strategy.candidates import GRID, PLAIN, best, compare_at_cost
     from photonfarm.renderer.strategy.content import SceneContent
     from photonfarm.renderer.strategy.pilot import measure_errors
-    from photonfarm.renderer.strategy.plan_text import BLACK, reasons_for
+    from photonfarm.renderer.strategy.plan import BLACK, reasons_for
 
     plugins: dict[Any, Any] = {}
 

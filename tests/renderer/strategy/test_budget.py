@@ -54,18 +54,6 @@ def test_with_too_little_time_it_is_said_how_much_would_do() -> None:
     assert chosen(20), "what the message names is enough"
 
 
-def test_items_are_taken_while_their_share_of_the_time_lasts() -> None:
-    machine = Machine(lambda *_: 0.0)
-    budget = Budget(10, machine.clock)
-    taken = []
-    for item in budget.take_within(0.25, range(9), 2):
-        machine.now += 1
-        taken.append(item)
-    assert taken == [0, 1, 2]
-    machine.now = 9
-    assert list(budget.take_within(0.25, range(9), 2)) == [0, 1]
-
-
 # ----------------------------------------------------------------------------------------------------- times of images
 
 

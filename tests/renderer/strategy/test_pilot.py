@@ -21,7 +21,7 @@ from photonfarm.renderer.strategy.candidates import (  # noqa: E402
 )
 from photonfarm.renderer.strategy.noise import pair_errors, view_weights  # noqa: E402
 from photonfarm.renderer.strategy.pilot import PilotResult, measure_errors  # noqa: E402
-from photonfarm.renderer.strategy.plan_text import reasons_for  # noqa: E402
+from photonfarm.renderer.strategy.plan import reasons_for  # noqa: E402
 from tests.stability.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 
 LIGHT, JOINED = Candidate(0, 1.0), Candidate(1, 1.0)

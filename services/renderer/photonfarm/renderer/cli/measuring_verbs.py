@@ -5,12 +5,27 @@ from __future__ import annotations
 import json
 import math
 from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from photonfarm.cli.options import device_option, json_option
 from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import WorkLog
+
+if TYPE_CHECKING:
+    from photonfarm.scene.spec import SceneSpec
+
+
+def _load(spec: str, *, measured_again: bool = False) -> tuple[SceneSpec, Path]:
+    """A spec and its file, with Mitsuba loaded as workers load it."""
+    from photonfarm.renderer.scene import backend
+    from photonfarm.scene.spec_loading import find_spec, load_spec
+
+    loaded = load_spec(spec, measured_again=measured_again)
+    backend.load(threads=1)
+    return loaded, find_spec(spec)
 
 
 @click.command()
@@ -37,16 +52,12 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
     Half a minute for a small room, minutes for a large one. `configuration` is taken by each configuration, `view` by
     each view of it, `pass` by each sample of such a view, and `spp` by each sample per pixel of that.
     """
-    from photonfarm.renderer.scene import backend
-    from photonfarm.scene.spec_loading import find_spec, load_spec
-
-    loaded = load_spec(spec)
-    backend.load(threads=1)
+    loaded, file = _load(spec)
     from photonfarm.renderer.tools.measure.sample_costs import find_or_measure
 
     log = partial(click.echo, err=True)
     limit = math.inf if seconds is None else seconds
-    costs = find_or_measure(loaded, find_spec(spec).parent, frames, again=again, log=log, seconds=limit)
+    costs = find_or_measure(loaded, file.parent, frames, again=again, log=log, seconds=limit)
     click.echo(costs.json() if as_json else costs.line())
 
 
@@ -74,16 +85,12 @@ def scene_exposure(spec: str, target: float, frames: int, as_json: bool) -> None
 
     How far views differ in brightness decides how well it is known; more of them help.
     """
-    from photonfarm.renderer.scene import backend
-    from photonfarm.scene.spec_loading import find_spec, load_spec
-
-    loaded = load_spec(spec)
-    backend.load(threads=1)
+    loaded, file = _load(spec)
     from photonfarm.renderer.tools.measure.exposure import propose
 
     with WorkLog(partial(click.echo, err=True)) as work:
         work.begin(f"loading {loaded.name}")
-        proposal = propose(loaded, find_spec(spec).parent, work, target=target, frames=frames)
+        proposal = propose(loaded, file.parent, work, target=target, frames=frames)
     click.echo(json.dumps(proposal.document(), indent=1) if as_json else proposal.line())
 
 
@@ -99,15 +106,12 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     With it in the spec, `submit` plans no view from inside a solid or from outside the room, and camera paths are kept
     out of them.
     """
-    from photonfarm.renderer.scene import backend
-    from photonfarm.scene.spec_loading import find_spec, load_spec
-
-    loaded = load_spec(spec, measured_again=True)
-    backend.load(threads=1)
+    loaded, file = _load(spec, measured_again=True)
     from photonfarm.renderer.tools import spec_file
     from photonfarm.renderer.tools.measure.free_space import measure
 
-    file = spec_file.writable(spec) if write else find_spec(spec)
+    if write:
+        file = spec_file.writable(spec)
     with WorkLog(partial(click.echo, err=True)) as work:
         measured = measure(loaded, file.parent, work.begin)
     click.echo(json.dumps(measured.entry()) if as_json else measured.line())
@@ -141,17 +145,13 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
 @end_on_ctrl_c()
 def scene_plan(spec: str, seconds: int, purpose: str, write: bool, again: bool, as_json: bool) -> None:
     """Choose how SPEC's light is sampled: by its content, and by a short measurement of error and time."""
-    from photonfarm.renderer.scene import backend
-    from photonfarm.scene.spec_loading import find_spec, load_spec
-
-    loaded = load_spec(spec)
-    backend.load(threads=1)
+    loaded, file = _load(spec)
     from photonfarm.renderer.strategy.noise import Purpose
-    from photonfarm.renderer.strategy.plan import make_plan
-    from photonfarm.renderer.strategy.plan_text import lines
+    from photonfarm.renderer.strategy.plan import lines, make_plan
     from photonfarm.renderer.tools import spec_file
 
-    file = spec_file.writable(spec) if write else find_spec(spec)
+    if write:
+        file = spec_file.writable(spec)
     log = partial(click.echo, err=True)
     plan = make_plan(loaded, file.parent, Purpose(purpose), seconds=seconds, again=again, log=log)
     click.echo(json.dumps(plan.document(), indent=2) if as_json else "\n".join(lines(plan)))

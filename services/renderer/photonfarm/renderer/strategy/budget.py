@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Sequence, Set
 from dataclasses import dataclass, field
 from math import ceil
-from typing import TypeVar
 
 import numpy as np
 
@@ -13,8 +12,6 @@ from photonfarm.core.errors import IncompleteError
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidates import Candidate, ImageCost, Render
 from photonfarm.renderer.strategy.pilot import LEAST_PAIRS, SCOUTS
-
-T = TypeVar("T")
 
 LEAST_TURNS, MOST_TURNS = 3, 60
 
@@ -66,13 +63,6 @@ class Budget:
                 f"{what} does not fit in --seconds {self.seconds:g}: {self.spent_s:.0f} s of processor time are used, "
                 f"and about {max(ceil(more_s), 1)} s more are needed; give it {10 * ceil((self.spent_s + more_s) / 10)}"
             )
-
-    def take_within(self, share: float, items: Iterable[T], least: int) -> Iterator[T]:
-        """The items for as long as no more than a share of the whole time is used; so many in any case."""
-        for count, item in enumerate(items):
-            yield item
-            if count + 1 >= least and self.spent_s > share * self.seconds:
-                return
 
 
 def affordable(

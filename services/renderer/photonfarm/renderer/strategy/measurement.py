@@ -52,9 +52,8 @@ TIMING = 0.2
 
 MOST_VIEWS = 8
 
-LIT, LEAST_LIT, REACH = 16, 2, 0.25
-"""The number of configurations in which light paths are traced, to see which photons are worth storing: 16, or as many,
-at least 2, as a quarter of the time allows, with what went before."""
+LIT = 6
+"""The number of configurations in which light paths are traced, to see which photons are worth storing."""
 
 IMAGES = 400
 """The number of images that the time should pay for: about as many as ten settings need at least."""
@@ -156,8 +155,8 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         work_log.begin(f"following the light of {spec.name}", budget.words)
         content, depth = SceneContent.of(scene.loaded.scene, AimedSensor(spec).sensor), spec.transport.max_depth
         loaded_s = budget.spent_s
-        reach = light_reach(budget.take_within(REACH, scene.configurations(LIT), LEAST_LIT), spec.view, SEED)
-        edit_s = (budget.spent_s - loaded_s) / reach.configurations
+        reach = light_reach(scene.configurations(LIT), spec.view, SEED)
+        edit_s = (budget.spent_s - loaded_s) / LIT
         pointless = content.why_no_light_paths(depth, reach.hit)
 
         every = list(dict.fromkeys([*([PLAIN] if pointless else GRID), now]))

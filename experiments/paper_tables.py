@@ -13,8 +13,12 @@ import numpy as np
 from experiments.rooms import Room, read_estimate
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.metrics import HEADLINE_BLOCK, confidence_interval, format_with_interval
-from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.metrics.image_metrics import (
+    HEADLINE_BLOCK,
+    NOT_AVAILABLE,
+    confidence_interval,
+    format_with_interval,
+)
 from photonfarm.trainer.report.contents import Published, PublishedTable
 
 T = TypeVar("T")

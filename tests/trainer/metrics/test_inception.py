@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.core.errors import StoreError
-from photonfarm.trainer.metrics import InceptionWeights, find_weights, load_inception
-from photonfarm.trainer.metrics.inception import prepare_images
+from photonfarm.trainer.metrics.features import InceptionWeights, find_weights, load_inception, prepare_images
 
 SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
 

@@ -10,18 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError
-from photonfarm.trainer.metrics import (
-    Inception,
-    InceptionWeights,
-    feature_l1,
-    fid,
-    kid,
-    load_inception,
-    measure_images,
-    metric_space,
-)
-from photonfarm.trainer.metrics.fid import ROWS
-from photonfarm.trainer.metrics.image_metrics import TITLES
+from photonfarm.trainer.metrics.features import ROWS, Inception, InceptionWeights, fid, kid, load_inception
+from photonfarm.trainer.metrics.image_metrics import TITLES, feature_l1, measure_images, metric_space
 
 
 def _normal(count: int, mean: NDArray, root: NDArray, seed: int, *, exact: bool = False) -> NDArray[np.float64]:

@@ -10,8 +10,17 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from photonfarm.core.errors import SpecError
-from photonfarm.trainer.metrics import confidence_interval, flip, measure_images, metric_space, mse, mssim
-from photonfarm.trainer.metrics.image_metrics import CHUNK, PerImage, t_975
+from photonfarm.trainer.metrics.image_metrics import (
+    CHUNK,
+    PerImage,
+    confidence_interval,
+    flip,
+    measure_images,
+    metric_space,
+    mse,
+    mssim,
+    t_975,
+)
 
 
 def _pictures(count: int, size: tuple[int, int], seed: int) -> NDArray[np.float32]:

@@ -94,4 +94,4 @@ def reported(measured: Measured, tmp_path_factory: pytest.TempPathFactory) -> tu
 def contents(measured: Measured) -> ReportContents:
     """Of one run, without references."""
     first = [TrainedRun.load(measured.runs[0])]
-    return gather_contents(measured.store, first, [], references=None, inception=None, timed=False)
+    return gather_contents(measured.store, first, timed=False)

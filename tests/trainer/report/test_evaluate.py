@@ -31,7 +31,8 @@ from photonfarm.trainer.compare.evaluation_page import (
 from photonfarm.trainer.compare.evaluation_samples import References
 from photonfarm.trainer.data.batch import choose_kept_pixels, count_kept
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.metrics import find_weights, metric_space, mse
+from photonfarm.trainer.metrics.features import find_weights
+from photonfarm.trainer.metrics.image_metrics import metric_space, mse
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predictors.evaluation import (
     TIMED_ROUNDS,

@@ -27,7 +27,7 @@ from photonfarm.plan.top_up import TopUp
 from photonfarm.store import SceneReader, Store, store_status
 from photonfarm.store.read.merge import MergedView
 from photonfarm.trainer.compare.evaluate import PredictorRow
-from photonfarm.trainer.metrics import confidence_interval, metric_space, mse, mssim
+from photonfarm.trainer.metrics.image_metrics import confidence_interval, metric_space, mse, mssim
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.report.contents import MOVABLE_LIGHTS, gather_contents
@@ -189,9 +189,11 @@ def uncertain(row: PredictorRow) -> PredictorRow:
 
 def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_the_axis(measured, monkeypatch) -> None:
     """The table's order is not that of the times, by which points are drawn."""
-    loaded, asked = [TrainedRun.load(run) for run in measured.runs], {"inception": None, "timed": False, "most": 4}
-    contents = gather_contents(measured.store, loaded, [("fill-in", 4)], references=measured.references, **asked)
-    times = [FrameTime(None, Seconds(s, s, s), None, None, None, Seconds(1.0, 1.0, 1.0)) for s in (3.0, 2.0, 1.0)]
+    loaded, asked = [TrainedRun.load(run) for run in measured.runs], {"timed": False, "most": 4}
+    contents = gather_contents(
+        measured.store, loaded, denoisers=[("fill-in", 4)], references=measured.references, **asked
+    )
+    times = [FrameTime({"buffers": Seconds(s, s, s), "network": Seconds(1.0, 1.0, 1.0)}) for s in (3.0, 2.0, 1.0)]
     entries = tuple(
         replace(entry, time=time, row=uncertain(entry.row)) for entry, time in zip(contents.entries, times, strict=True)
     )

@@ -26,69 +26,63 @@ device_option = click.option(
     "--device", default="auto", show_default=True, help="Of the networks: cpu, cuda, or auto, cuda where there is one."
 )
 
-
-runs_option = click.option(
-    "--run",
-    "runs",
-    cls=RepeatableOption,
-    multiple=True,
-    type=click.Path(path_type=Path, file_okay=False),
-    default=["run"],
-    envvar="PHOTONFARM_RUN",
-    show_default=True,
-    help="Folder of a training run; several give several rows.",
+MEASURING = (
+    store_option,
+    click.option(
+        "--run",
+        "runs",
+        cls=RepeatableOption,
+        multiple=True,
+        type=click.Path(path_type=Path, file_okay=False),
+        default=["run"],
+        envvar="PHOTONFARM_RUN",
+        show_default=True,
+        help="Folder of a training run; several give several rows.",
+    ),
+    click.option(
+        "--references",
+        type=click.Path(path_type=Path, file_okay=False),
+        metavar="FOLDER",
+        help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
+    ),
+    click.option(
+        "--denoiser",
+        "denoisers",
+        type=click.Choice(get_args(ReadyDenoiser)),
+        cls=RepeatableOption,
+        multiple=True,
+        help="Measure a ready one too, or several. none: dropped pixels stay black.",
+    ),
+    click.option(
+        "--kept",
+        type=click.IntRange(1),
+        cls=RepeatableOption,
+        multiple=True,
+        metavar="K",
+        help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
+    ),
+    click.option(
+        "--samples",
+        "most",
+        type=click.IntRange(1),
+        default=MOST_HELD_OUT,
+        show_default=True,
+        help="At most so many, each of a view of its own.",
+    ),
+    click.option(
+        "--inception",
+        type=click.Path(path_type=Path, dir_okay=False),
+        metavar="FILE",
+        help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
+    ),
+    device_option,
 )
-references_option = click.option(
-    "--references",
-    type=click.Path(path_type=Path, file_okay=False),
-    metavar="FOLDER",
-    help="Converged views, as `photonfarm store merge --out FOLDER` leaves them.",
-)
-denoisers_option = click.option(
-    "--denoiser",
-    "denoisers",
-    type=click.Choice(get_args(ReadyDenoiser)),
-    cls=RepeatableOption,
-    multiple=True,
-    help="Measure a ready one too, or several. none: dropped pixels stay black.",
-)
-kept_option = click.option(
-    "--kept",
-    type=click.IntRange(1),
-    cls=RepeatableOption,
-    multiple=True,
-    metavar="K",
-    help="These denoisers are given one of K pixels; may be repeated.  [default: 1]",
-)
-samples_option = click.option(
-    "--samples",
-    "most",
-    type=click.IntRange(1),
-    default=MOST_HELD_OUT,
-    show_default=True,
-    help="At most so many, each of a view of its own.",
-)
-inception_option = click.option(
-    "--inception",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
-)
+"""The options for what is measured, against what and where."""
 
 
 def add_measuring_options(command: Callable[..., None]) -> Callable[..., None]:
-    """The options for what is measured, against what and where; `_collect_arguments` takes all but the runs."""
-    options = (
-        store_option,
-        runs_option,
-        references_option,
-        denoisers_option,
-        kept_option,
-        samples_option,
-        inception_option,
-        device_option,
-    )
-    for option in reversed(options):
+    """Add `MEASURING` to a verb; `_collect_arguments` takes all but the runs."""
+    for option in reversed(MEASURING):
         command = option(command)
     return command
 

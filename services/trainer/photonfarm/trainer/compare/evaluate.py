@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -23,15 +23,8 @@ from photonfarm.store import SceneReader
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
 from photonfarm.trainer.data.batch import TrainingBatch, count_kept
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.metrics import (
-    Features,
-    ImageMetrics,
-    Inception,
-    confidence_interval,
-    load_inception,
-    measure_images,
-    metric_space,
-)
+from photonfarm.trainer.metrics.features import Features, Inception, load_inception
+from photonfarm.trainer.metrics.image_metrics import ImageMetrics, confidence_interval, measure_images, metric_space
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.predictors.evaluation import (
     NONE_COMPLETE,
@@ -141,6 +134,17 @@ class Evaluation:
             "rows": [row.document(self.rows[0]) for row in self.rows],
             "shown": [target.row for target in self.shown],  # of the store: the rows of comparison.png, from the top
         }
+
+
+class MeasureOptions(TypedDict, total=False):
+    """The options of `compare` that reports have too."""
+
+    denoisers: Sequence[tuple[ReadyDenoiser, int]]
+    references: Path | None
+    inception: Path | None
+    most: int
+    device: str
+    on_progress: MeasureProgress | None
 
 
 def compare(

@@ -16,8 +16,7 @@ from photonfarm.core.formatting import format_count, format_milliseconds
 from photonfarm.core.page import Table
 from photonfarm.core.pictures import Picture, draw_sheet, enlarge, write_png
 from photonfarm.trainer.compare.evaluate import Evaluation, PredictorRow
-from photonfarm.trainer.metrics import ImageMetrics, format_with_interval
-from photonfarm.trainer.metrics.image_metrics import HEADLINE
+from photonfarm.trainer.metrics.image_metrics import HEADLINE, ImageMetrics, format_with_interval
 from photonfarm.trainer.predictors.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.predictors.trained import TrainedRun
 

@@ -24,8 +24,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.pictures import display_values
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
-from photonfarm.trainer.metrics.fid import FEWEST, Fid, fid, kid
-from photonfarm.trainer.metrics.inception import Features, Inception, InceptionWeights
+from photonfarm.trainer.metrics.features import FEWEST, Features, Fid, Inception, InceptionWeights, fid, kid
 
 NORMAL_975 = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""

@@ -9,56 +9,35 @@ import json
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from photonfarm.core.errors import store_errors
 from photonfarm.core.page import write_page
 from photonfarm.core.pictures import write_png
-from photonfarm.trainer.compare.evaluate import MeasureProgress
+from photonfarm.trainer.compare.evaluate import MeasureOptions
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparison
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report.contents import gather_contents
 from photonfarm.trainer.report.page import Verdict, format_page
 from photonfarm.trainer.report.plots import draw_plots
 from photonfarm.trainer.report.views import choose_views
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
 def write_report(
-    store: str | Path,
-    runs: Sequence[Path],
-    out: Path,
-    *,
-    denoisers: Sequence[tuple[ReadyDenoiser, int]] = (),
-    references: Path | None = None,
-    inception: Path | None = None,
-    most: int = MOST_HELD_OUT,
-    device: str = "auto",
-    on_progress: MeasureProgress | None = None,
-    timed: bool = True,
+    store: str | Path, runs: Sequence[Path], out: Path, *, timed: bool = True, **how: Unpack[MeasureOptions]
 ) -> dict[str, Any]:
     """Write the report of the runs into the folder `out`; returns the figures of report.json.
 
-    Runs, and denoisers given one of so many pixels, are measured as by `evaluate.compare`. Raises SpecError if
-    the runs cannot be compared, StoreError if a folder is not a run with a readable checkpoint, for a store that cannot
-    be read or if `out` cannot be written, IncompleteError if nothing is held out.
+    Runs and denoisers are measured as by `compare`, and the times of frames if `timed`. Raises SpecError if the runs
+    cannot be compared, StoreError if a folder is not a run with a readable checkpoint, for a store that cannot be read
+    or if `out` cannot be written, IncompleteError if nothing is held out.
     """
     loaded = [TrainedRun.load(run) for run in runs]
     with store_errors("write the report", out):
         out.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=out).close()  # an unwritable folder should fail before the measurements
-    contents = gather_contents(
-        store,
-        loaded,
-        denoisers,
-        references=references,
-        inception=inception,
-        most=most,
-        device=device,
-        on_progress=on_progress,
-        timed=timed,
-    )
-    if on_progress:
+    contents = gather_contents(store, loaded, timed=timed, **how)
+    if on_progress := how.get("on_progress"):
         on_progress("plots and pages are drawn", 0, 0)
     plots, verdict = draw_plots(contents), Verdict.of(contents)
     text = json.dumps({**contents.document(), "verdict": verdict.sentence}, indent=2, ensure_ascii=False)

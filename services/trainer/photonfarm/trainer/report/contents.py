@@ -10,15 +10,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from photonfarm.core.archives import FrameCosts
 from photonfarm.core.errors import BackendError
 from photonfarm.core.records import F32, Guides, ViewBuffers
 from photonfarm.core.statistics import Estimate
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.trainer.compare import evaluate
-from photonfarm.trainer.compare.evaluate import Evaluation, MeasureProgress, PredictorRow
+from photonfarm.trainer.compare.evaluate import Evaluation, MeasureOptions, PredictorRow, compare
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.report.dataset_card import DatasetCard
@@ -31,7 +30,6 @@ from photonfarm.trainer.report.frame_times import (
 )
 from photonfarm.trainer.report.trained_runs import Baselines, RunStory, shorten_names
 from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, find_worst_cases
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,22 +138,13 @@ class ReportContents:
 
 
 def gather_contents(
-    store: str | Path,
-    runs: Sequence[TrainedRun],
-    denoisers: Sequence[tuple[ReadyDenoiser, int]],
-    *,
-    references: Path | None,
-    inception: Path | None,
-    most: int = MOST_HELD_OUT,
-    device: str = "auto",
-    on_progress: MeasureProgress | None = None,
-    timed: bool = True,
+    store: str | Path, runs: Sequence[TrainedRun], *, timed: bool, **how: Unpack[MeasureOptions]
 ) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
-    first = runs[0]
+    first, denoisers = runs[0], how.get("denoisers", ())
     card = DatasetCard.of(store, first.scene_id, first.exposure)
     kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
-    tell = on_progress or (lambda *_: None)
+    tell = how.get("on_progress") or (lambda *_: None)
     costs: FrameCosts | None = None
     untimed, worst, machine = "it was not asked for", [], Machine.here()
 
@@ -180,17 +169,7 @@ def gather_contents(
         )
         return [case.row for case in worst]
 
-    evaluation = evaluate.compare(
-        store,
-        runs,
-        denoisers,
-        references=references,
-        inception=inception,
-        most=most,
-        device=device,
-        on_progress=on_progress,
-        choose=look_closely,
-    )
+    evaluation = compare(store, runs, choose=look_closely, **how)
     tell("the mean colour and the untrained network are measured", 0, 0)
     title, table = find_published_table(card.spec)
     names = shorten_names(list(runs))

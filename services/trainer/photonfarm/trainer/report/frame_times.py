@@ -11,7 +11,7 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,6 @@ from photonfarm.core.errors import BackendError
 from photonfarm.core.processes import can_render, command
 from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.run_folder import make_environment
-
-CPU_INFO = Path("/proc/cpuinfo")
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +34,11 @@ class Machine:
     @classmethod
     def here(cls) -> Machine:
         """The machine of this process, with its present load."""
-        return cls(_read_cpu_model(), os.cpu_count() or 1, platform.machine(), os.getloadavg())
+        try:
+            model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+        except OSError:  # another system
+            model = None
+        return cls(model and model[1], os.cpu_count() or 1, platform.machine(), os.getloadavg())
 
     @property
     def sentence(self) -> str:
@@ -48,36 +50,19 @@ class Machine:
         )
 
 
-def _read_cpu_model() -> str | None:
-    try:
-        model = re.search(r"^model name\s*:\s*(.+)$", CPU_INFO.read_text(), re.MULTILINE)
-    except OSError:  # another system
-        return None
-    return model[1] if model else None
-
-
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTime:
-    """Wall seconds of one frame, by parts; None for parts that a predictor does not need.
+    """Wall seconds of one frame, by parts in the order in which they are made; None for parts that are not needed.
 
-    Editing the scene is left out, as it costs all the same.
+    These are half A at 1/k of the pixels, depth with albedo and normal, the view's guides, which points of the cloud it
+    sees, photons traced and seen, and the network. Editing the scene is left out, as it costs all the same.
     """
 
-    render: Seconds | None  # of half A, at 1/k of the pixels
-    buffers: Seconds  # depth, albedo, normal
-    guides: Seconds | None  # the guides of the view, mainly direct light
-    points: Seconds | None  # which points of the cloud the view sees
-    photons: Seconds | None  # tracing them, and which the view sees
-    network: Seconds
-
-    @property
-    def parts(self) -> dict[str, Seconds | None]:
-        """The parts by their names, in the order in which they are made."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+    parts: dict[str, Seconds | None]  # render, buffers, guides, points, photons, network
 
     @property
     def total(self) -> float:
@@ -94,9 +79,7 @@ class FrameTime:
 def measure_frame_costs(
     store: str | Path, run: TrainedRun, rows: Sequence[int], kept: Sequence[int], points: int | None
 ) -> FrameCosts:
-    """The renderer's measurement of the frames in some rows, with so many points of the cloud, or with all.
-
-    `run` is one on their scene.
+    """The renderer's measurement of the frames in some rows of a run's scene, with so many points or all of the cloud.
 
     The renderer's own messages go to stderr. Raises BackendError with the reason if there is no measurement.
     """
@@ -126,12 +109,14 @@ def assemble_frame_time(predictor: TrainedRun | ReadyPredictor, network: Seconds
     """The parts that a predictor needs, with its network's seconds."""
     needs, parts = predictor.needs, costs.parts()
     return FrameTime(
-        render=costs.renders()[needs.kept] if needs.kept else None,
-        buffers=parts["buffers_s"],
-        guides=parts["guides_s"] if needs.guides else None,
-        points=parts["points_s"] if _sees_points(predictor) else None,
-        photons=Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,
-        network=network,
+        {
+            "render": costs.renders()[needs.kept] if needs.kept else None,
+            "buffers": parts["buffers_s"],
+            "guides": parts["guides_s"] if needs.guides else None,
+            "points": parts["points_s"] if _sees_points(predictor) else None,
+            "photons": Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,
+            "network": network,
+        }
     )
 
 

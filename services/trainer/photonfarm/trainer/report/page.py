@@ -8,8 +8,9 @@ Shape letters: H W image.
 from __future__ import annotations
 
 from base64 import b64encode
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +22,7 @@ from photonfarm.core.pictures import reduce_image
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page
-from photonfarm.trainer.metrics import confidence_interval
+from photonfarm.trainer.metrics.image_metrics import confidence_interval
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.plots import PlotGroup
@@ -152,23 +153,17 @@ def format_page(
 def encode_light(views: Sequence[ShownView]) -> list[dict[str, str]]:
     """The light of each view's layers by their names, as many as fit: first those of all views that come first."""
     layers_by_view: list[dict[str, str]] = [{} for _ in views]
-    left = MOST_LIGHT
-    for place, name, light in _order_by_importance(views):
-        text = encode_half_floats(light)
-        left -= len(text)
-        if left < 0:
-            break
-        layers_by_view[place][name] = text
-    return layers_by_view
-
-
-def _order_by_importance(views: Sequence[ShownView]) -> Iterator[tuple[int, str, F32]]:
-    """The first light of every view, then the second, and so on, each with the place of its view."""
     of_views = [[each for each in (*view.images, *view.inputs) if each.light is not None] for view in views]
-    for number in range(max(map(len, of_views), default=0)):
-        for place, layers in enumerate(of_views):
-            if number < len(layers) and (light := layers[number].light) is not None:
-                yield place, layers[number].name, light
+    left = MOST_LIGHT
+    for layers in zip_longest(*of_views):  # the first of every view, then the second, and so on
+        for encoded, layer in zip(layers_by_view, layers, strict=True):
+            if layer is not None and layer.light is not None:
+                text = encode_half_floats(layer.light)
+                left -= len(text)
+                if left < 0:
+                    return layers_by_view
+                encoded[layer.name] = text
+    return layers_by_view
 
 
 def encode_half_floats(light: F32) -> str:

@@ -9,9 +9,7 @@ from functools import partial
 from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
-from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.metrics import confidence_interval
-from photonfarm.trainer.metrics.image_metrics import TITLES
+from photonfarm.trainer.metrics.image_metrics import TITLES, confidence_interval
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry
 from photonfarm.trainer.report.trained_runs import CurvePoint, RunStory
 
@@ -165,27 +163,19 @@ OF_TIME = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class PlottedPredictor:
-    """A predictor in a plot over the time of a frame."""
-
-    milliseconds: float
-    name: str
-    group: str  # of GROUPS
-    colour: str
-    value: Estimate
+Plotted = tuple[ReportEntry, str]
+"""A predictor whose frame was timed, and its colour."""
 
 
 def _draw_over_time(contents: ReportContents) -> Iterator[Plot]:
     for name, title in TITLES.items():
-        points = [
-            PlottedPredictor(1e3 * entry.time.total, entry.name, _name_group(entry), colour, entry.estimates[name])
+        plotted = [
+            (entry, colour)
             for entry, colour in zip(contents.entries, cycle(COLOURS), strict=False)
             if entry.time is not None and name in entry.estimates
         ]
-        if len(points) > 1:
-            draw = partial(_scatter, metric=name, points=points)
-            yield _draw(f"time-{name}", f"{title} over the time of a frame", draw)
+        if len(plotted) > 1:
+            yield _draw(f"time-{name}", f"{title} over the time of a frame", partial(_scatter, name, plotted))
 
 
 def _name_group(entry: ReportEntry) -> str:
@@ -195,28 +185,30 @@ def _name_group(entry: ReportEntry) -> str:
     return ready if entry.architecture is None else trained
 
 
-def _scatter(axes: Axes, metric: str, points: Sequence[PlottedPredictor]) -> None:
-    logarithmic = metric not in LINEAR and min(p.value.mean for p in points) > 0
+def _place(entry: ReportEntry, metric: str) -> tuple[float, float]:
+    """The time of a frame in milliseconds, and the metric."""
+    return 1e3 * entry.time.total if entry.time else 0.0, entry.estimates[metric].mean
+
+
+def _scatter(metric: str, plotted: Sequence[Plotted], axes: Axes) -> None:
     for name, (marker, line) in GROUPS.items():
-        members = sorted((p for p in points if p.group == name), key=lambda p: (p.milliseconds, p.name))
-        places = [p.milliseconds for p in members], [p.value.mean for p in members]
-        axes.plot(*places, linestyle=line, color="#999999", linewidth=1)
-        for p in members:
-            reach = p.value.mean - (confidence_interval(p.value) or (p.value.mean,))[0]
-            axes.errorbar(
-                p.milliseconds,
-                p.value.mean,
-                reach,
-                fmt=marker,
-                color=p.colour,
-                label=p.name,
-                markersize=5,
-                elinewidth=0.8,
-            )
+        members = sorted((each for each in plotted if _name_group(each[0]) == name), key=lambda e: _place(e[0], metric))
+        places = [_place(entry, metric) for entry, _ in members]
+        axes.plot([x for x, _ in places], [y for _, y in places], linestyle=line, color="#999999", linewidth=1)
+        for entry, colour in members:
+            interval = confidence_interval(entry.estimates[metric])
+            reach = entry.estimates[metric].mean - interval[0] if interval else 0.0
+            look: dict[str, Any] = {
+                "fmt": marker,
+                "color": colour,
+                "label": entry.name,
+                "markersize": 5,
+                "elinewidth": 0.8,
+            }
+            axes.errorbar(*_place(entry, metric), reach, **look)
     axes.set_xscale("log")
-    if logarithmic:
+    least = min(_place(entry, metric)[1] for entry, _ in plotted)
+    if metric not in LINEAR and least > 0:
         axes.set_yscale("log", nonpositive="clip")
-        least = min(p.value.mean for p in points)
-        if axes.get_ylim()[0] < least / 2:
-            axes.set_ylim(bottom=least / 2)
+        axes.set_ylim(bottom=max(axes.get_ylim()[0], least / 2))
     axes.set(xlabel="time per frame, ms", ylabel=TITLES[metric])

@@ -10,8 +10,7 @@ from photonfarm.core.archives import Seconds
 from photonfarm.core.formatting import format_bytes, format_count, format_milliseconds
 from photonfarm.core.page import Table
 from photonfarm.trainer.compare.evaluation_page import METRICS, describe_device, list_notes, make_table
-from photonfarm.trainer.metrics import format_with_interval
-from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE
+from photonfarm.trainer.metrics.image_metrics import HEADLINE, NOT_AVAILABLE, format_with_interval
 from photonfarm.trainer.predictors.evaluation import TIMED_ROUNDS
 from photonfarm.trainer.report.contents import Published, ReportContents, ReportEntry
 

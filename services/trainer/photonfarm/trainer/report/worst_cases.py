@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from photonfarm.core.pictures import display_values
 from photonfarm.core.records import F32, ViewBuffers
 
 Mask = NDArray[np.bool_]
+Values = NDArray[Any]
 
 CLOSE = 0.05  # quantile of all depths below which a pixel is close to the camera
 MIRRORS, SPECULAR, NEAR, SHADOWS, THIN, ALL = KINDS = (
@@ -102,16 +104,29 @@ def find_shadow_edges(view: HeldOutView) -> Mask:
 
     It must step the same way in both halves of the reference: their noise is independent, and agrees only by chance.
     """
-    albedo = np.log(view.buffers.albedo.mean(axis=-1) + 1e-2)
+    buffers = view.buffers
+    albedo = np.log(buffers.albedo.mean(axis=-1) + 1e-2)
     irradiance = np.stack([np.log(half.mean(axis=-1) + 1e-3) - albedo for half in (view.half_a, view.half_b)])
     edges = np.zeros(albedo.shape, np.bool_)
     for axis in (0, 1):
-        first, second = _pair_neighbours(edges.shape[axis], axis)
-        steps = irradiance[:, *second] - irradiance[:, *first]
-        edges[first] |= ((steps > STEP).all(axis=0) | (steps < -STEP).all(axis=0)) & _find_alike(
-            view.buffers, first, second
-        )
+        # of all pixels but the last along this axis, and of the next of each
+        depth, next_depth = _pair_neighbours(buffers.depth, axis)
+        colour, next_colour = _pair_neighbours(buffers.albedo, axis)
+        normal, next_normal = _pair_neighbours(buffers.normal, axis)
+        alike = (depth > 0) & (next_depth > 0)
+        alike &= np.abs(depth - next_depth) < SAME_DEPTH * np.maximum(depth, next_depth)
+        alike &= (np.abs(colour - next_colour).max(axis=-1) < SAME_ALBEDO) & (colour.max(axis=-1) > 0)
+        alike &= (normal * next_normal).sum(axis=-1) > SAME_NORMAL
+        steps = np.diff(irradiance, axis=axis + 1)
+        stepped = (steps > STEP).all(axis=0) | (steps < -STEP).all(axis=0)
+        _pair_neighbours(edges, axis)[0][...] |= stepped & alike
     return edges
+
+
+def _pair_neighbours(values: Values, axis: int) -> tuple[Values, Values]:
+    """Views of all but the last along an axis, and of all but the first."""
+    along = np.moveaxis(values, axis, 0)
+    return np.moveaxis(along[:-1], 0, axis), np.moveaxis(along[1:], 0, axis)
 
 
 def find_thin_objects(depth: F32) -> Mask:
@@ -122,29 +137,7 @@ def find_thin_objects(depth: F32) -> Mask:
     far = np.where(depth > 0, depth, np.inf)
     thin = np.zeros(depth.shape, np.bool_)
     for axis in (0, 1):
-        widths = [(THIN_PIXELS, THIN_PIXELS) if other == axis else (0, 0) for other in (0, 1)]
-        padded = np.pad(far, widths, mode="edge")
-        sides = [np.take(padded, np.arange(depth.shape[axis]) + start, axis) for start in (0, 2 * THIN_PIXELS)]
+        places = np.arange(depth.shape[axis])
+        sides = [far.take((places + by).clip(0, places[-1]), axis) for by in (-THIN_PIXELS, THIN_PIXELS)]
         thin |= far < THIN_DEPTH * np.minimum(*sides)
     return thin
-
-
-Part = tuple[slice, slice]
-
-
-def _pair_neighbours(length: int, axis: int) -> tuple[Part, Part]:
-    """All pixels but the last of an axis, and the next of each."""
-    first, second = slice(0, length - 1), slice(1, length)
-    every = slice(None)
-    return ((first, every), (second, every)) if axis == 0 else ((every, first), (every, second))
-
-
-def _find_alike(buffers: ViewBuffers, first: Part, second: Part) -> Mask:
-    """Whether two pixels show the same surface and colour."""
-    depth, other = buffers.depth[first], buffers.depth[second]
-    near = (depth > 0) & (other > 0) & (np.abs(depth - other) < SAME_DEPTH * np.maximum(depth, other))
-    colour = np.abs(buffers.albedo[first] - buffers.albedo[second]).max(axis=-1) < SAME_ALBEDO
-    turned = (buffers.normal[first] * buffers.normal[second]).sum(axis=-1) > SAME_NORMAL
-    diffuse = buffers.albedo[first].max(axis=-1) > 0
-    mask: Mask = near & colour & turned & diffuse
-    return mask

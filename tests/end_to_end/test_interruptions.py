@@ -113,7 +113,7 @@ def started(folder: Path, *verb: str, **environment: str) -> subprocess.Popen[by
 def wait_for_native_code(folder: Path) -> None:
     """The base is written right before the first sample is rendered."""
     wait_until(lambda: list(folder.glob("store/scenes/*/base/zarr.json")))
-    time.sleep(2)
+    time.sleep(1)
 
 
 def assert_nothing_is_torn(folder: Path) -> None:
@@ -126,7 +126,10 @@ def assert_nothing_is_torn(folder: Path) -> None:
 
 @pytest.mark.parametrize(
     ("signals", "code", "within_s"),
-    [([signal.SIGTERM], 143, DOCKER_S), ([signal.SIGINT, signal.SIGINT], 130, 4)],
+    [
+        pytest.param([signal.SIGTERM], 143, DOCKER_S, marks=pytest.mark.slow),
+        ([signal.SIGINT, signal.SIGINT], 130, 4),
+    ],
 )
 def test_up_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trace(
     tmp_path: Path, endless_room: Path, signals: list[signal.Signals], code: int, within_s: float
@@ -148,7 +151,7 @@ def test_up_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trace(
     assert_nothing_is_torn(tmp_path)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_work_in_the_middle_of_a_long_job_ends_within_seconds_and_without_a_trace(
     tmp_path: Path, endless_room: Path, number: signal.Signals
 ) -> None:

@@ -5,7 +5,6 @@
 
 import contextlib
 import json
-import resource
 import socket
 import subprocess
 import sys
@@ -38,13 +37,9 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("submit . --no-queue", 3, [".: no such spec, as it is a folder"]),
         ("submit '' --no-queue", 3, ["an empty name"]),
         ("status --store typo", 4, ["typo: there is no store", "photonfarm submit"]),
-        ("store check --store typo", 4, ["typo: there is no store"]),
         ("store find --store typo", 4, ["typo: there is no store"]),
-        ("store merge --out o --store typo", 4, ["typo: there is no store"]),
-        ("preview room --store typo", 4, ["typo: there is no store"]),
         ("top-up room --spp 8 --store typo", 4, ["typo: there is no store"]),
         ("buffers --scene room --orbit 2 --store typo", 4, ["typo: there is no store"]),
-        ("work --until-complete --store typo", 4, ["typo: there is no store"]),
         ("train --seconds 0.2 --store typo", 7, ["typo: no scene to train on"]),
         ("status --store s3:/bucket", 2, ["'--store'", "s3://BUCKET"]),
         ("submit room --no-queue --store /proc/store", 4, ["/proc/store: cannot make a store"]),
@@ -53,6 +48,7 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("redis --port 70000", 2, ["'--port'"]),
         ("up room --modifications 1", 3, ["1 configuration is planned", "--modifications 2 plans enough"]),
         ("up room --hold-out 0.1 --modifications 3", 3, ["hold_out = 0.1: of the 3", "--hold-out 0.16", "tions 4"]),
+        ("up cornell --modifications 3 --views 2 --hold-out 0.9999", 3, ["6 views planned all"]),
         ("--config none.toml status", 3, ["none.toml"]),
         ("infer --row 0", 4, ["run: there is no such folder"]),
     ],
@@ -116,12 +112,6 @@ def test_in_a_spec(here: Path, spec: str, names: list[str]) -> None:
     assert not (here / "store").exists()
 
 
-@pytest.mark.parametrize(("name", "content"), [("photo.toml", bytes(range(256))), ("a.json", b"[1]"), ("b.json", b"{")])
-def test_files_that_are_no_specs(here: Path, name: str, content: bytes) -> None:
-    (here / name).write_bytes(content)
-    refused(f"scene show {name}", 3, name)
-
-
 @pytest.mark.parametrize(
     ("settings", "command", "code", "names"),
     [
@@ -130,11 +120,14 @@ def test_files_that_are_no_specs(here: Path, name: str, content: bytes) -> None:
         ("[train]\nstep = 1\n", "status", 3, ["train.step = 1", "steps"]),
         ('[train]\nsteps = "many"\n', "train", 2, ["'--steps'", "'many'"]),
         ("[submit]\nviews = 1.5\n", "submit room", 2, ["'--views'", "1.5 is not a whole number"]),
+        ("[train]\nthreads = 0\n", "up room", 2, ["'--threads'"]),
+        ('[work]\nreserve = "much"\n', "up room --train-steps 0", 2, ["'--reserve'"]),
     ],
 )
 def test_in_the_configuration_file(here: Path, settings: str, command: str, code: int, names: list[str]) -> None:
     (here / "photonfarm.toml").write_text(settings)
     refused(command, code, *names)
+    assert [file.name for file in here.iterdir()] == ["photonfarm.toml"]
 
 
 def test_a_number_may_be_written_as_people_write_it(here: Path) -> None:
@@ -150,22 +143,6 @@ def test_submit_says_so_if_training_will_refuse_what_it_plans(here: Path) -> Non
         assert "--hold-out 0.16 holds out one of these, and --modifications 4 plans enough" in line
     for enough in (4, 2):  # the second time the store has the others
         assert said(f"submit room --modifications {enough} --no-queue")[2] == ""
-
-
-def test_a_full_disk_is_told(here: Path) -> None:
-    command = [sys.executable, "-m", "photonfarm.cli", "submit", "room", "--no-queue"]
-    full = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        check=False,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0)),
-    )
-    assert (full.returncode, full.stderr) == (
-        4,
-        "photonfarm: store: cannot make a store here: File too large (store)\n",
-    )
-    assert said("submit room --no-queue")[0] == 0
 
 
 def test_a_folder_that_is_gone(here: Path) -> None:
@@ -201,3 +178,53 @@ def test_up_finds_a_place_that_it_cannot_write_before_it_renders(here: Path) -> 
     refused("up room --run file/run", 4, "file/run: cannot keep the logs of a run here")
     refused("up room --out file/out", 4, "file/out: cannot keep preview and report here")
     assert not (here / "store").exists()
+
+
+@pytest.mark.parametrize(
+    ("package", "command", "said"),
+    [
+        (
+            "torch",
+            ["up", "room"],
+            "`photonfarm train` needs the package torch: pip install 'photonfarm[train]'; --train",
+        ),
+        ("mitsuba", ["up", "room"], "`photonfarm work` needs the package mitsuba: pip install 'photonfarm[render]'"),
+        ("torch", ["evaluate"], "pip install 'photonfarm[train]'"),
+    ],
+)
+def test_a_verb_that_lacks_a_package_names_the_extra_that_brings_it(
+    here: Path, package: str, command: list[str], said: str
+) -> None:
+    code = f"""
+import sys
+from photonfarm.cli import farm_verbs, main
+sys.modules[{package!r}] = None
+farm_verbs.find_spec = lambda name: None if name == {package!r} else name
+main.main({command})
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert said in " ".join(done.stderr.replace("│", " ").split())
+    assert not (here / "store").exists()
+
+
+def test_no_llvm_is_exit_code_6_and_says_what_to_install(photonfarm, tmp_path: Path) -> None:
+    result = photonfarm("doctor", DRJIT_LIBLLVM_PATH=str(tmp_path / "none.so"))
+    assert result.returncode == 6
+    assert "libllvm19" in result.stdout + result.stderr
+    assert "Traceback" not in result.stderr
+
+
+def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_find_that(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (here / "mine").mkdir()
+    ball = '<shape type="sphere" id="Ball"><emitter type="area"/></shape>'
+    (here / "mine/ball.xml").write_text(f'<scene version="3.0.0">{ball}</scene>')
+    (here / "mine/ball.toml").write_text('name = "ball"\nscene.file = "ball.xml"\n' + VIEW)
+    found = here / "mine"
+    assert (
+        said("submit mine/ball.toml --no-queue")[2] == f"workers find its scene file with PHOTONFARM_SCENES={found}\n"
+    )
+    monkeypatch.setenv("PHOTONFARM_SCENES", str(found))
+    assert said("submit mine/ball.toml --no-queue")[2] == ""

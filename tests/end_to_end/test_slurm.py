@@ -6,9 +6,6 @@ make test-slurm
 import json
 import os
 import re
-import shutil
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -223,32 +220,3 @@ def test_the_trainer_begins_with_the_first_worker_and_trains_on_what_arrives(
     assert first["StartTime"] <= about["StartTime"]
     assert (folder / "run/checkpoint.safetensors").exists()
     assert scene_of(folder).missing_jobs() == []
-
-
-def test_a_request_for_gpus_is_one_that_slurm_takes_and_a_wrong_one_is_told(
-    photonfarm_in: Any, folder: Path, cluster: Cluster
-) -> None:
-    for option, code in ((), 0), (("--sbatch=--gres=gpu:9",), 1):
-        script = photonfarm_in(folder)("slurm", "small.toml", "--gpus", "--time", "10", *option, "--dry-run").stdout
-        (folder / "gpu.sh").write_text(script)
-        environment = os.environ | cluster.environment
-        done = subprocess.run(["sbatch", "--test-only", folder / "gpu.sh"], env=environment, check=False)
-        assert (done.returncode != 0) == bool(code)
-    refused = photonfarm_in(folder)("slurm", "small.toml", "--partition", "none", "--no-queue", **cluster.environment)
-    assert refused.returncode == 9
-    assert "invalid partition" in refused.stderr
-
-
-def test_the_example_for_submitit_runs_on_slurm(folder: Path, photonfarm_in: Any, cluster: Cluster) -> None:
-    pytest.importorskip("submitit", reason="submitit is not installed")
-    say("--- submitit")
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs/slurm.md").read_text(), re.DOTALL)
-    request = ("--modifications", "24", "--views", "1", "--shard-rows", "6", "--no-queue")
-    assert photonfarm_in(folder)("submit", "small.toml", *request).returncode == 0
-    script = f"{example}\nprint([job.result() for job in jobs], [job.job_id for job in jobs])\n"
-    environment = os.environ | cluster.environment
-    done = subprocess.run([sys.executable, "-c", script], cwd=folder, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    say(f"submitit's jobs gave {done.stdout.strip()}")
-    assert scene_of(folder).missing_jobs() == []
-    shutil.rmtree(folder / "slurm")

@@ -45,11 +45,11 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--help"], HEAVY | {"numpy", "redis", "rq"}),
         (["submit", "--help"], HEAVY | {"numpy", "redis", "rq", "pydantic"}),
         (["train", "--help"], HEAVY | {"numpy", "redis", "rq"}),
-        (["scene", "plan", "--help"], HEAVY | {"numpy", "redis", "rq", "pydantic"}),
         (["scene", "show", "room"], HEAVY | {"redis", "rq"}),
         (["status"], HEAVY - {"zarr"} | {"redis", "rq"}),  # nothing listens there
         (["store", "find"], HEAVY - {"zarr"} | {"redis", "rq"}),
         (["submit", "room", "--dry-run", "--no-measure"], HEAVY - {"zarr"}),
+        (["slurm", "cornell", "--no-queue", "--dry-run"], HEAVY | {"redis", "rq"}),
     ],
 )
 def test_a_verb_loads_only_what_it_needs_and_starts_soon(store: Path, command: list[str], needless: set[str]) -> None:

@@ -21,12 +21,10 @@ from prometheus_client.parser import text_string_to_metric_families
 from photonfarm import queue
 from photonfarm.cli.main import main
 from photonfarm.core.errors import StoreError
-from photonfarm.farm.progress import FarmProgress
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneStore, Store
-from photonfarm.web.images import Cached
 from photonfarm.web.metrics import MOST_ERRORS, OTHER, FarmMetrics
 
 ROOT = Path(__file__).parents[2]
@@ -124,36 +122,6 @@ def test_runs_whose_folders_are_called_alike_have_a_label_each(farm: FarmWatch) 
     found = scraped(FarmMetrics(lambda: several))
     steps = {dict(labels)["run"]: step for (name, labels), step in found.items() if name == "photonfarm_trainer_step"}
     assert steps == {"run": 50, "run 2": 60, "run ?": 7}
-
-
-def test_names_have_units_and_suffixes_as_prometheus_wants_them_and_each_has_a_help_text(farm: FarmWatch) -> None:
-    families = list(text_string_to_metric_families(FarmMetrics(farm.look).answer()[1].decode()))
-    assert len(families) > 20
-    for family in families:
-        assert re.fullmatch("photonfarm_[a-z_]+", family.name)
-        assert family.documentation.endswith(".")
-        assert family.type in ("counter", "gauge")
-        assert not re.search(r"_(ms|mb|kb|minutes|hours|percent)$", family.name)
-        for sample in family.samples:
-            assert sample.name.endswith("_total") == (family.type == "counter")
-
-
-def test_several_scrapers_within_seconds_cost_one_look(farm: FarmWatch) -> None:
-    looks = []
-
-    def look() -> FarmProgress:
-        looks.append(farm.look())
-        return looks[-1]
-
-    now = [0.0]
-    metrics = FarmMetrics(Cached(look, clock=lambda: now[0], work=lambda: 0.0).get)
-    assert looks == []
-    for _ in range(5):
-        metrics.answer()
-    assert len(looks) == 1
-    now[0] = 60.0
-    metrics.answer()
-    assert len(looks) == 2
 
 
 def test_the_page_lists_every_metric_with_its_type_and_labels(farm: FarmWatch) -> None:

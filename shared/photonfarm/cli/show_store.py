@@ -187,8 +187,11 @@ def print_merged(view: WrittenView) -> None:
     click.echo(f"{view.file}: {passes}, mean {view.mean:.4g}, {error}")
 
 
-def print_joined(scenes: Sequence[JoinedScene]) -> None:
+def print_joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
     """Print what a join has copied, scene by scene."""
+    if as_json:
+        print_json([asdict(scene) for scene in scenes])
+        return
     for scene in scenes:
         known = scene.there - scene.planned
         jobs = format_count(scene.jobs, "job")
@@ -208,8 +211,11 @@ def describe_contents(store: Store, scene_id: str) -> str:
     return f"scene {scene_id} ({scene.spec.name}), of which {rendered},"
 
 
-def print_withdrawn(result: Withdrawal) -> None:
+def print_withdrawn(result: Withdrawal, as_json: bool) -> None:
     """Print what a withdrawal has forgotten, and what stays."""
+    if as_json:
+        print_json(asdict(result))
+        return
     kept = f", {result.kept} stay planned, as rendered ones show their views or configurations" if result.kept else ""
     forgotten = f"{result.samples} samples in {format_count(result.jobs, 'job')} are forgotten"
     said = f"{forgotten if result.jobs else 'nothing is left to withdraw'}; {result.rendered} are rendered and stay"

@@ -21,18 +21,6 @@ if TYPE_CHECKING:
     from photonfarm.plan.request import Request
 
 
-def _limit(ctx: click.Context, param: click.Parameter, text: str | None) -> str | None:  # noqa: ARG001
-    from photonfarm.core.errors import SpecError
-    from photonfarm.farm.slurm import LEAST_LIMIT_S, limit_s
-
-    try:
-        if text is not None and limit_s(text) < LEAST_LIMIT_S:
-            raise click.BadParameter(f"{text!r} is too short: SLURM may ask tasks to stop two minutes before the limit")
-    except SpecError as error:
-        raise click.BadParameter(str(error)) from error
-    return text
-
-
 @click.command()
 @click.argument("specs", metavar="SPEC...", nargs=-1, required=True)
 @request_options
@@ -53,7 +41,6 @@ def _limit(ctx: click.Context, param: click.Parameter, text: str | None) -> str 
 @click.option("--partition", metavar="NAME", help="SLURM's partition.  [default: the cluster's]")
 @click.option(
     "--time",
-    callback=_limit,
     metavar="LIMIT",
     help="Time limit of a task, as sbatch takes it; at least 3 "
     "minutes. A task that its limit ends puts itself back into the queue.  [default: the partition's]",

@@ -192,15 +192,13 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
     read or written, and what is copied stays.
     """
     from photonfarm.cli import show_store
-    from photonfarm.cli.show import print_json
     from photonfarm.farm.join import join as join_stores
 
     with show_store.progress("copied") as show:
-        result = join_stores(store, other, scene, on_progress=lambda name, *jobs: show(name, *jobs, 0), on_wait=tell)
-    if as_json:
-        print_json([asdict(each) for each in result])
-    else:
-        show_store.print_joined(result)
+        result = join_stores(
+            store, other, scene, on_progress=lambda name, done, jobs: show(name, done, jobs, 0), on_wait=tell
+        )
+    show_store.print_joined(result, as_json)
 
 
 @click.command()
@@ -217,17 +215,13 @@ def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> 
     again later. Refused where a later plan has passes of the plan's views: withdraw that one first.
     """
     from photonfarm.cli import show_store
-    from photonfarm.cli.show import print_json
     from photonfarm.store import Store
     from photonfarm.store.model.withdrawal import withdraw as withdraw_plan
     from photonfarm.store.read.find import scene_named
 
     opened = Store(store)
     result = withdraw_plan(opened.scene(scene_named(opened, scene)), plan, on_wait=tell)
-    if as_json:
-        print_json(asdict(result))
-    else:
-        show_store.print_withdrawn(result)
+    show_store.print_withdrawn(result, as_json)
 
 
 @click.command()

@@ -6,7 +6,6 @@ The batch scripts are made as text, written, and submitted.
 from __future__ import annotations
 
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -21,9 +20,6 @@ from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec
 
 SIGNAL_S = 60
 """The seconds before the time limit at which SLURM sends TERM, or up to a minute earlier, as it may."""
-
-LEAST_LIMIT_S = 180
-"""The shortest time limit: below it, TERM may come before the first job is rendered."""
 
 WORKER_TASK = '"${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"'
 """A worker's task, for the shell. One of an array's has the array's own SLURM_JOB_ID, by which SLURM means them all."""
@@ -54,19 +50,6 @@ class Asked:
     train_steps: int | None
     train_gpus: bool
     train_further: tuple[str, ...]  # further options for the trainer's job alone
-
-
-def limit_s(text: str) -> int:
-    """The seconds of a time limit as sbatch takes it: M, M:S, H:M:S, D-H, D-H:M or D-H:M:S; raises SpecError."""
-    if not (found := re.fullmatch(r"(?:(\d+)-)?(\d+)(?::(\d+))?(?::(\d+))?", text, re.ASCII)):
-        raise SpecError(f"time limit {text!r}: minutes, H:M:S or D-H:M:S are required")
-    days, *parts = found.groups()
-    numbers = [int(part) for part in parts if part is not None]
-    if days is not None or len(numbers) == 3:
-        hours, minutes, seconds = [*numbers, 0, 0][:3]
-    else:
-        hours, minutes, seconds = 0, numbers[0], sum(numbers[1:])
-    return ((int(days or 0) * 24 + hours) * 60 + minutes) * 60 + seconds
 
 
 def make_scripts(named: Sequence[NamedSpec], store: str | Path, redis_url: str | None, asked: Asked) -> dict[str, str]:

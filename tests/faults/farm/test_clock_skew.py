@@ -1,17 +1,19 @@
-"""A store whose machines have clocks a year apart: nothing is lost, numbered or ordered by what these tell."""
+"""A farm whose machines have clocks a year apart: nothing is lost, numbered or ordered by what these tell."""
 
 import os
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+import queue_samples
 import store_samples as samples
 from skewed_clock import SKEWS, YEAR_S, Machine, root_of, rows_read
 
+from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.queue import WorkerReport, connect, queue_status, read_workers, reconcile
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.io.storage import FOREIGN_AGE_S, STRAY_AGE_S
@@ -41,78 +43,43 @@ print(*now, path.stat().st_mtime)
 
 
 @SKEWS
-def test_a_sweep_by_a_machine_with_a_wrong_clock_leaves_what_living_writers_need(
-    machine: Machine, scene: SceneStore, skew_s: int
-) -> None:
-    """A job here, in the middle of its rows, and parts of other machines: all fresh, by the file system's clock."""
-    given = samples.outputs(scene, 0)
-    mine = scene.storage.part()
-    foreign = mine.with_name("another-machine-1a2b3c4d5e-17-0-0.partial")
-    folder = mine.with_name("another-machine-1a2b3c4d5e-17-1-0.partial")  # a plan, on its way
-    foreign.write_bytes(b"half a file")
-    folder.mkdir()
-    with scene.job_writer(scene.job_rows(0)) as out:
-        for row, photons in given.photons.items():
-            out.photons(row, photons)
-        for row, buffers in given.buffers.items():
-            out.view(row, buffers, given.guides[row], given.visibility[row])
-        first, *others = given.radiance
-        out.radiance(first, given.radiance[first])
-        assert machine(skew_s, root_of(scene), "print(store.sweep(), store.sweep(stray_age_s=0))") == "0 0"
-        for row in others:
-            out.radiance(row, given.radiance[row])
-        assert out.commit(samples.FIGURES)
-    assert foreign.exists()
-    assert folder.exists()
-    assert len(rows_read(scene)) == 2
-
-
-@SKEWS
 def test_a_sweep_by_a_machine_with_a_wrong_clock_takes_what_is_old_by_the_file_systems(
     machine: Machine, scene: SceneStore, skew_s: int
 ) -> None:
-    mine = scene.storage.part()
+    """And leaves a job here, in the middle of its rows, and fresh parts of other machines."""
+    given, mine = samples.outputs(scene, 0), scene.storage.part()
     dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", "-4194999-"))  # no process has this number
     foreign = mine.with_name("another-machine-1a2b3c4d5e-17-0-0.partial")
+    folder = mine.with_name("another-machine-1a2b3c4d5e-17-1-0.partial")  # a plan, on its way
+    folder.mkdir()
     ages = {dead: STRAY_AGE_S, foreign: FOREIGN_AGE_S}
     for path, age_s in ages.items():
         path.write_bytes(b"half a file")
         os.utime(path, (0, time.time() - age_s + 30))
-    assert machine(skew_s, root_of(scene), "print(store.sweep())") == "0"
-    for path, age_s in ages.items():
-        os.utime(path, (0, time.time() - age_s - 1))
-    assert machine(skew_s, root_of(scene), "print(store.sweep())") == "2"
+    with scene.job_writer(scene.job_rows(0)) as out:
+        samples.give(out, given)
+        assert machine(skew_s, root_of(scene), "print(store.sweep())") == "0"
+        for path, age_s in ages.items():
+            os.utime(path, (0, time.time() - age_s - 1))
+        assert machine(skew_s, root_of(scene), "print(store.sweep())") == "2"
+        assert out.commit(samples.FIGURES)
+    assert folder.exists()
+    assert len(rows_read(scene)) == 2
 
 
-@pytest.mark.parametrize("ahead_s", [1, 3600, YEAR_S])
-def test_a_part_whose_stamp_lies_in_the_future_is_left_until_that_is_past(scene: SceneStore, ahead_s: int) -> None:
+def test_a_part_whose_stamp_lies_in_the_future_is_left_until_that_is_past(scene: SceneStore) -> None:
     """Some file systems let machines stamp their files themselves; a negative age is not taken for a great one."""
     mine = scene.storage.part()
     foreign = mine.with_name("another-machine-1a2b3c4d5e-17-0-0.partial")
     dead = mine.with_name(mine.name.replace(f"-{os.getpid()}-", "-4194999-"))
     for path in (mine, foreign, dead):
         path.write_bytes(b"half a file")
-        os.utime(path, (0, time.time() + ahead_s + 30))
+        os.utime(path, (0, time.time() + YEAR_S))
     assert scene.storage.sweep() == 0
     for path in (mine, foreign, dead):
         os.utime(path, (0, time.time() - STRAY_AGE_S - 1))
     assert scene.storage.sweep() == 1
     assert not dead.exists()
-
-
-@pytest.mark.parametrize("hours", [1, 12, 23])
-def test_a_part_stamped_by_a_machine_that_is_hours_behind_is_left_to_its_writer(scene: SceneStore, hours: int) -> None:
-    """This holds up to a day, the documented age: clocks of one farm differ by less, or its stamps are the server's."""
-    given = samples.outputs(scene, 0)
-    with scene.job_writer(scene.job_rows(0)) as out:
-        samples.give(out, given)
-        foreign = scene.storage.part().with_name("another-machine-1a2b3c4d5e-17-0-0.partial")
-        foreign.write_bytes(b"half a file")
-        for path in (root_of(scene) / "tmp").iterdir():
-            os.utime(path, (0, time.time() - hours * 3600))
-        assert Store(root_of(scene)).sweep(stray_age_s=0) == 0
-        assert foreign.exists()
-        assert out.commit(samples.FIGURES)
 
 
 # ---------------------------------------------------------------------------------------------- commits, plans, repairs
@@ -142,30 +109,6 @@ def test_jobs_of_machines_a_year_apart_are_all_committed_once_and_are_what_one_m
     assert check_store(Store(root), when="now").exit_code == 0
 
 
-def test_what_is_committed_is_the_same_whatever_the_stamps_of_its_files_are(scene: SceneStore) -> None:
-    """A marker older than its files, or than its plan, and all of them older or younger than now."""
-    samples.commit_all(scene)
-    scene.write_base(*_base(scene))
-    before = rows_read(scene)
-    files = [path for path in root_of(scene).rglob("*") if path.is_file()]
-    for i, order in enumerate([files, list(reversed(files))]):
-        for n, path in enumerate(order):
-            os.utime(path, (0, time.time() + (n - len(files) / 2) * 86400 * (i + 1)))
-        assert Store(root_of(scene)).scene(scene.scene_id).missing_jobs() == []
-        assert rows_read(scene) == before
-        assert check_store(Store(root_of(scene)), when="now", repair=True).exit_code == 0
-        assert Store(root_of(scene)).sweep() == 0
-
-
-def _base(scene: SceneStore) -> Any:
-    geometry, cloud = samples.base()
-    return geometry, type(cloud)(**{f: np.resize(getattr(cloud, f), _shape(cloud, f, scene)) for f in cloud.__slots__})
-
-
-def _shape(cloud: Any, name: str, scene: SceneStore) -> tuple[int, ...]:
-    return (scene.spec.points, *getattr(cloud, name).shape[1:])
-
-
 def test_plans_of_machines_a_year_apart_are_numbered_in_their_order_and_plan_nothing_twice(
     machine: Machine, scene: SceneStore
 ) -> None:
@@ -183,17 +126,46 @@ def test_plans_of_machines_a_year_apart_are_numbered_in_their_order_and_plan_not
     assert len(np.unique(keys, axis=0)) == len(keys) == 28 + 2
 
 
-def test_repairs_of_machines_a_year_apart_are_numbered_in_their_order_and_lose_nothing(
-    machine: Machine, scene: SceneStore
+# ----------------------------------------------------------------------------------------------------------- the queue
+
+
+@SKEWS
+def test_a_heartbeat_ends_by_the_servers_clock(
+    machine: Machine, scene: SceneStore, redis_server: EmbeddedRedis, skew_s: int
 ) -> None:
-    root = root_of(scene)
-    machine(0, root, RENDER.format(jobs=[0, 1, 2, 3]))
-    repair = "print(check_store(store, when='then', repair=True).quarantine)"
-    for number, (skew_s, job) in enumerate([(YEAR_S, 1), (-YEAR_S, 1), (0, 2)]):
-        file = scene.folder / next(name for name in scene.marker(job)["files"] if "depth" in name)
-        content = b"x" + file.read_bytes()[1:]
-        file.write_bytes(content)
-        assert machine(skew_s, root, repair) == f"quarantine/{number:06d}"
-        assert (root / f"quarantine/{number:06d}" / file.relative_to(root)).read_bytes() == content
-        assert machine(-skew_s, root, RENDER.format(jobs=[job])) == "True"
-    assert len(rows_read(scene)) == 8
+    connection = connect(redis_server.url)
+    assert reconcile(Store(root_of(scene)), connection) == 4
+    code = "told(connect(url), 'ada', WorkerReport(), ttl_s={ttl_s}); taken(connect(url), 'ada', ttl_s={ttl_s})"
+    machine(skew_s, root_of(scene), code.format(ttl_s=60), redis_server.url)
+    assert list(read_workers(connection)) == ["ada"]
+    (execution,) = connection.keys("rq:execution:*")
+    assert all(30_000 < connection.pttl(key) <= 60_000 for key in (execution, "rq:worker:ada"))
+    assert queue_status(connection).running == 1
+    machine(skew_s, root_of(scene), code.format(ttl_s=1), redis_server.url)
+    connection.delete(execution)
+    time.sleep(1.1)
+    assert read_workers(connection) == {}
+    assert queue_status(connection).running == 0
+    assert machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", redis_server.url) == "0"
+    assert queue_status(connection).queued == 4, "both jobs are in the queue again"
+
+
+@SKEWS
+def test_who_is_alive_here_is_alive_for_a_machine_with_a_wrong_clock_and_who_is_dead_is_dead(
+    machine: Machine, scene: SceneStore, redis_server: EmbeddedRedis, skew_s: int
+) -> None:
+    """Its reconciliation queues again what nobody renders, and nothing else."""
+    connection, url = connect(redis_server.url), redis_server.url
+    assert reconcile(Store(root_of(scene)), connection) == 4
+    queued = machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", url)
+    assert queued == "0"
+    connection.flushall()
+    reconcile(Store(root_of(scene)), connection)
+    for worker, ttl_s in (("ada", 60), ("bob", 1)):
+        queue_samples.told(connection, worker, WorkerReport(), ttl_s=ttl_s)
+        queue_samples.taken(connection, worker, ttl_s=ttl_s)
+    time.sleep(1.1)
+    assert machine(skew_s, root_of(scene), "print(reconcile(store, connect(url)))", url) == "0"
+    assert (queue_status(connection).queued, queue_status(connection).running) == (3, 1)
+    told = machine(skew_s, root_of(scene), "print(queue_status(connect(url)).workers)", url)
+    assert told == "1"

@@ -13,7 +13,7 @@ from photonfarm.store import SceneStore, Store
 from photonfarm.store.model.lease import hold_lease
 
 
-@pytest.mark.parametrize("share", [None, "0/1"])
+@pytest.mark.parametrize("share", [None, pytest.param("0/1", marks=pytest.mark.slow)])
 def test_a_worker_leaves_a_scene_that_somebody_has_for_itself_until_it_is_free(
     analytic: ModuleType,
     planned: Callable[..., SceneStore],
@@ -24,7 +24,7 @@ def test_a_worker_leaves_a_scene_that_somebody_has_for_itself_until_it_is_free(
     scene, connection, log = planned(4), connect(redis_server.url), tmp_path / "log"
     store, url = Store(scene.folder.parent.parent), None if share else redis_server.url
     with analytic.start_worker(
-        store.root, url, analytic.command(0.3), log, share=share, until_complete=True, name="ada"
+        store.root, url, analytic.command(0.15), log, share=share, until_complete=True, name="ada"
     ) as worker:
         try:
             analytic.wait_for(lambda: len(scene.committed_jobs()) == 1, 60)

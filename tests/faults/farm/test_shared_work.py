@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import random
 import signal
 import subprocess
 import time
@@ -68,33 +67,6 @@ def test_a_worker_renders_its_share_first_and_then_that_of_one_who_has_not_come(
     assert "ended: 8 jobs done, 16 samples" in (tmp_path / "worker-1.log").read_text()
 
 
-@pytest.mark.slow
-def test_workers_under_a_hail_of_kills_complete_the_plan_bit_for_bit(
-    analytic: ModuleType,
-    planned: Callable[..., SceneStore],
-    clean_bytes: Callable[[int], dict[str, bytes]],
-    stored_bytes: Callable[[SceneStore], dict[str, bytes]],
-    start: Starter,
-) -> None:
-    """Supervisors are killed too, and nobody starts them again; the last one renders what is left."""
-    scene, rng = planned(24), random.Random(0)
-    workers = [start(scene, f"{number}/3", 0.08, until_complete=True) for number in range(3)]
-    analytic.wait_for(lambda: len(scene.committed_jobs()) >= 3)
-    for victim in workers[1:]:
-        child = analytic.child_of(victim)
-        victim.kill()
-        if child is not None:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(child, signal.SIGKILL)
-        time.sleep(rng.uniform(0.1, 0.3))
-    assert workers[0].wait(60) == 0
-    assert scene.missing_jobs() == []
-    Store(scene.folder.parent.parent).sweep(stray_age_s=0)
-    stored, clean = stored_bytes(scene), clean_bytes(24)
-    assert stored.keys() == clean.keys()
-    assert [name for name in clean if stored[name] != clean[name]] == []
-
-
 def test_a_job_that_another_worker_commits_meanwhile_is_given_up(
     analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter, tmp_path: Path
 ) -> None:
@@ -114,20 +86,6 @@ def test_a_job_that_another_worker_commits_meanwhile_is_given_up(
     log = (tmp_path / "worker-0.log").read_text()
     assert "gives up" in log
     assert "failed" not in log
-
-
-def test_sigterm_lets_the_job_at_hand_be_finished(
-    analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter
-) -> None:
-    scene = planned(8)
-    running = start(scene, "0/1", 0.2)
-    analytic.wait_for(lambda: scene.committed_jobs())
-    analytic.wait_for(lambda: list((scene.folder.parent.parent / "tmp").glob("*.partial")))  # rows of the next one
-    done = len(scene.committed_jobs())
-    running.send_signal(signal.SIGTERM)
-    assert running.wait(20) == 0
-    assert done + 1 <= len(scene.committed_jobs()) <= done + 2
-    assert read_kept_failures(Store(scene.folder.parent.parent)) == {}
 
 
 def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_a_retry(
@@ -162,15 +120,6 @@ def test_a_job_whose_process_is_killed_comes_last_and_is_tried_again(
     assert int(committed[-1].stem) == 0
     (failure,) = read_kept_failures(Store(scene.folder.parent.parent)).values()
     assert "SIGKILL" in failure.reason
-
-
-@pytest.mark.slow
-def test_a_job_that_hangs_has_failed_at_the_deadline(planned: Callable[..., SceneStore], start: Starter) -> None:
-    scene = planned(1)
-    assert start(scene, "0/1", 60, until_complete=True, deadline_s=0.5, steady_s=0.1).wait(120) == 7
-    kept = read_kept_failures(Store(scene.folder.parent.parent)).values()
-    assert {failure.times for failure in kept} == {TRIES}
-    assert all("took longer than --deadline 0.5 s" in failure.reason for failure in kept)
 
 
 def test_looks_of_a_worker_cost_little_and_the_last_one_sees_all(

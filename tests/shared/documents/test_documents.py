@@ -12,8 +12,7 @@ import click
 import pytest
 from pydantic import BaseModel
 
-from photonfarm.cli.main import options_by_command, umbrella
-from photonfarm.cli.settings import file_defaults
+from photonfarm.cli.main import file_defaults, options_by_command, umbrella
 from photonfarm.core import errors
 from photonfarm.scene import spec as scene_spec
 from photonfarm.scene.free_space import FreeSpace

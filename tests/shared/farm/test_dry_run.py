@@ -14,9 +14,9 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.farm_verbs import submit
 from photonfarm.cli.show import bytes_per_sample
-from photonfarm.core.errors import BackendError, SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.farm import dry_run
-from photonfarm.farm.dry_run import DryRun, costs_by_renderer, rehearse
+from photonfarm.farm.dry_run import DryRun, rehearse
 from photonfarm.plan.allocation import KAPPA, Allocation, excess, seconds
 from photonfarm.plan.request import Extent, Request
 from photonfarm.plan.sample_costs import SampleCosts
@@ -121,13 +121,6 @@ def test_of_a_grown_request_only_what_is_new_counts(
     assert (found.suggestion, found.reduction) == (None, None)  # it would render again what is planned
 
 
-def test_equal_configurations_are_counted_once(tmp_path: Path) -> None:
-    store = Store(tmp_path / "store", create=True)
-    removed = {**samples.small_spec().objects[0].model_dump(), "removal_probability": 1.0}
-    found = rehearsed(tmp_path, Path(store.root), spec=spec_file(tmp_path, objects=[removed]), measure=False)
-    assert (found.planned, found.extent) == (12, Extent(1, 1, 12))
-
-
 # --------------------------------------------------------------------------------------------- cost, and suggestions
 
 
@@ -226,11 +219,6 @@ def test_nothing_is_measured_where_it_is_not_wanted_or_the_request_is_wrong(
     assert not asked.exists()
 
 
-def test_a_verb_of_this_machine_that_is_not_there_is_named() -> None:
-    with pytest.raises(BackendError, match=r"photonfarm scene cost|not installed"):
-        costs_by_renderer("no-such-spec", 20.0)
-
-
 # -------------------------------------------------------------------------------------------------------- as printed
 
 
@@ -242,18 +230,6 @@ def test_the_command_prints_what_when_and_what_would_be_better(tmp_path: Path, v
     assert third.startswith("suggested at this cost: half_spp = ")
     assert "% less excess error predicted for light_transport" in third
     assert not (tmp_path / "none").exists()
-
-
-def test_the_command_says_when_nothing_better_is_known(tmp_path: Path, verb: Verb) -> None:
-    verb(replace(COSTS, spp_s=0.0, relative_variance=0.0, configuration_s=0.0).json())
-    lines = run(spec_file(tmp_path), tmp_path / "none", "--views", "1").stdout.splitlines()
-    assert lines[2] == "what is asked for is within 5 % of the best at this cost"
-
-
-def test_of_a_static_scene_the_command_speaks_of_samples_alone(tmp_path: Path, verb: Verb) -> None:
-    verb(replace(COSTS, relative_variance=STATIC_NOISE).json())
-    static = run(spec_file(tmp_path, objects=[]), tmp_path / "none", "--modifications", "50").stdout.splitlines()[2]
-    assert "half_spp = 32 in [transport], 20 views of one pass: " in static
 
 
 def test_where_samples_are_planned_the_command_says_why_it_suggests_nothing(tmp_path: Path, verb: Verb) -> None:

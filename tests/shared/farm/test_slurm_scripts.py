@@ -3,7 +3,6 @@
 import os
 import re
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,7 +11,7 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SchedulerError, SpecError, StoreError
-from photonfarm.farm.slurm import check_slurm, limit_s
+from photonfarm.farm.slurm import check_slurm
 
 Launcher = Callable[..., Result]
 
@@ -98,19 +97,6 @@ def test_what_is_no_option_of_sbatch_is_refused(slurm: Launcher, option: str) ->
     assert isinstance(done.exception, SpecError)
 
 
-@pytest.mark.parametrize(
-    ("text", "seconds"),
-    [("3", 180), ("4:30", 270), ("1:00:00", 3600), ("1-2", 93600), ("1-2:30", 95400), ("1-0:0:30", 86430)],
-)
-def test_time_limits_are_read_as_sbatch_reads_them(text: str, seconds: int) -> None:
-    assert limit_s(text) == seconds
-
-
-@pytest.mark.parametrize("limit", ["2", "2:59", "0:2:00", "soon", "1:2:3:4"])
-def test_a_limit_that_is_none_or_too_short_for_a_signal_is_refused(slurm: Launcher, limit: str) -> None:
-    assert slurm("cornell", "--time", limit, "--dry-run").exit_code == 2
-
-
 def test_without_sbatch_nothing_is_written(slurm: Launcher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     assert isinstance(slurm("cornell").exception, SchedulerError)
@@ -160,14 +146,3 @@ scontrol() {{ echo "scontrol $*" >> {tmp_path}/asked; }}
         f"squeue --noheader --jobs {task} --format %T",
         f"scontrol requeue {task}",
     ]
-
-
-def test_the_launcher_needs_neither_mitsuba_nor_torch(tmp_path: Path) -> None:
-    code = """
-import sys
-from photonfarm.cli.main import umbrella
-umbrella.main(["slurm", "cornell", "--dry-run"], standalone_mode=False)
-assert not {"mitsuba", "torch", "redis", "zarr"} & sys.modules.keys(), sorted(sys.modules)
-"""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PHOTONFARM_")}
-    subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, check=True, stdout=subprocess.PIPE)

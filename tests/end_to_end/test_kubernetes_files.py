@@ -4,7 +4,6 @@
 test_kubernetes.py compares the file with the chart.
 """
 
-import json
 import re
 import tomllib
 from collections.abc import Iterator
@@ -74,17 +73,6 @@ def test_every_command_and_probe_of_photonfarm_has_a_verb_and_options_that_there
     assert len(ours) == len(PODS) - 1 + 2  # all but Redis, and two probes
     for arguments in ours:
         parse(arguments)
-
-
-def test_commands_and_probes_are_those_of_the_compose_file() -> None:
-    for part in ("renderer", "trainer"):
-        service, (container,) = COMPOSE["services"][part], PODS[f"photonfarm-{part}"]["spec"]["containers"]
-        said = service.get("command", ["photonfarm", "work"])  # of its image
-        assert container["command"] == said + ["--until-complete"] * (part == "trainer")
-        assert container["readinessProbe"]["exec"]["command"] == service["healthcheck"]["test"][1:]
-    (container,) = PODS["photonfarm-redis"]["spec"]["containers"]
-    for probe in ("readinessProbe", "livenessProbe"):
-        assert container[probe]["exec"]["command"][2] == COMPOSE["services"]["redis"]["healthcheck"]["test"][1]
 
 
 def test_variables_are_those_of_the_compose_file_and_on_the_page_of_the_configuration() -> None:
@@ -185,26 +173,3 @@ def test_keda_watches_the_queue_and_the_started_jobs_of_the_redis_that_there_is(
     assert keys == {"username": "username", "password": "redis_password"}
     assert scaled["spec"]["minReplicaCount"] == 0
     assert find("CronJob", "photonfarm-reconcile"), "nothing would wake the workers again"
-
-
-def test_every_value_has_a_schema_and_every_schema_a_value() -> None:
-    values = yaml.safe_load((CHART / "values.yaml").read_text())
-    schema = json.loads((CHART / "values.schema.json").read_text())
-    assert list_schema_keys(schema, schema) - {"global"} == list_keys(values)
-
-
-def list_keys(values: dict[str, Any], before: str = "") -> set[str]:
-    """The dotted keys of values, as deep as they are the chart's."""
-    keys = set()
-    for key, value in values.items():
-        free = key in {"resources", "nodeSelector"}
-        keys |= list_keys(value, f"{before}{key}.") if isinstance(value, dict) and not free else {before + key}
-    return keys
-
-
-def list_schema_keys(schema: dict[str, Any], root: dict[str, Any], before: str = "") -> set[str]:
-    """The same of the schema; what lies below a reference is not the chart's."""
-    keys = set()
-    for key, value in schema["properties"].items():
-        keys |= list_schema_keys(value, root, f"{before}{key}.") if "properties" in value else {before + key}
-    return keys

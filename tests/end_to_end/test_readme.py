@@ -130,32 +130,6 @@ def test_the_commands_of_a_page_have_verbs_and_options_that_there_are(parse, pag
             parse(arguments)
 
 
-MADE_UP = """
-    $ A=b photonfarm train room \\
-        --run run &                                          # photonfarm goes on
-    row 80: output of the page's
-    torchrun --nproc-per-node 2 -- photonfarm train room && photonfarm report | tee 'a # b'
-
-```python
-    photonfarm of_no_shell
-```
-"""
-
-
-def test_commands_are_found_behind_prompts_comments_and_other_commands() -> None:
-    found = [arguments for line in shell(MADE_UP) for arguments in commands(line)]
-    assert found == [["train", "room", "--run", "run"], ["train", "room"], ["report"]]
-    assert in_passing("`photonfarm store\ncheck --repair`, `photonfarm`") == [["store", "check", "--repair"]]
-    showing = {page for page in PAGES if any(map(commands, shell((ROOT / page).read_text())))}
-    assert showing > {"README.md", "docs/tutorial.md"}
-
-
-@pytest.mark.parametrize("wrong", ["fly", "store fly", "work --fly", "store check --fly", "train --batch x", "submit"])
-def test_a_command_that_there_is_not_would_be_found(parse, wrong: str) -> None:
-    with pytest.raises(click.UsageError):
-        parse(wrong.split())
-
-
 SMALLER = {
     "make setup": ":",  # the tests' own environment is set up
     ". .venv/bin/activate": ":",

@@ -74,18 +74,3 @@ def test_a_scene_that_is_not_here_costs_no_scene_that_is_loaded(
         renderer.render(elsewhere.scene_id, 0)
     assert renderer.render(here, 1)
     assert len(loaded) == 1
-
-
-def test_a_job_asks_for_its_own_scene_alone(
-    analytic: ModuleType, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Each scene that is listed in a bucket costs a request."""
-    here = store.plan(analytic.small_spec(), Request(modifications=2), shard_rows=2).scene_id
-    asked, exists = [], store.storage.exists
-    for spec in (analytic.small_spec(film={"width": width, "height": 8}) for width in (16, 24)):
-        store.plan(spec, Request(modifications=2), shard_rows=2)
-    monkeypatch.setattr(store.storage, "exists", lambda name: asked.append(name) or exists(name))
-    renderer = ShardRenderer(store, worker="test", load=analytic.AnalyticScene.load)
-    assert renderer.render(here, 0)
-    assert {name.split("/")[1] for name in asked if name.startswith("scenes/")} == {here}
-    assert not renderer.render("0" * 32, 0)

@@ -18,7 +18,6 @@ from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import AHEAD_LOOK_S, TrainerPace
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.model.scene_store import Progress
 
 
 class Clock:
@@ -92,26 +91,6 @@ def test_each_scene_is_held_against_its_own_trainer(
     assert TrainerPace(store, connection, 1.0).ahead().keys() == {ahead.scene_id}
     assert TrainerPace(store, connection, 1.0, scene_id=new.scene_id).ahead() == {}
     assert TrainerPace(store, connection, 1.0, scene_id=ahead.scene_id).ahead().keys() == {ahead.scene_id}
-
-
-def test_where_a_look_takes_long_looks_are_rare(
-    store: Store, add: Callable[..., SceneStore], connection: redis.Redis, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A look takes 3 s here; a worker that is asked each second for ten minutes spends a twentieth of them on looks."""
-    add("one", 8, 0)
-    clock, plain, looks = Clock(), SceneStore.progress, []
-
-    def slow(scene: SceneStore, **how: bool) -> Progress:
-        looks.append(clock.now)
-        clock.now += 3.0
-        return plain(scene, **how)
-
-    monkeypatch.setattr(SceneStore, "progress", slow)
-    pace = TrainerPace(store, connection, 1.0, clock=clock)
-    while clock.now < 1600.0:
-        pace.ahead()
-        clock.now += 1.0
-    assert len(looks) == 10
 
 
 def test_a_ratio_below_one_is_refused_as_it_would_stop_for_good() -> None:

@@ -106,13 +106,13 @@ class SceneSamples:
     # ---------------------------------------------------------------------------------------------------------- points
 
     def points(self, row: int) -> bytes:
-        """The points of a sample's configuration, as `images.pack_points` has them."""
+        """The points of a sample's configuration, by `images.pack_points`."""
         cloud = self._open(row).point_cloud
         colour, there = images.colour_points(cloud.albedo, cloud.emission), cloud.present
         return images.pack_points(cloud.position[there], cloud.normal[there], colour[there], cloud.seen[there])
 
     def photons(self, row: int) -> bytes:
-        """The photons of a sample's configuration, as `images.pack_points` has them; none for a scene without photons."""
+        """The photons of a sample's configuration, by `images.pack_points`; none for a scene without photons."""
         if not self._reader.spec.photons.paths:
             return b""
         sample = self._open(row)

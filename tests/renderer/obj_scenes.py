@@ -12,17 +12,17 @@ import numpy as np
 from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
+Obj = Callable[[str | bytes], Path]
+Read = Callable[[Path], ImportedScene]
+Write = Callable[[str, str], Path]
 
-
-SQUARE = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
-
+FOUR_V = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"
+SQUARE = f"{FOUR_V}vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 
 FOUR = {"red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1), "white": (1, 1, 1)}
 
-
 CORNERS = ((0.25, 0.75), (0.75, 0.75), (0.25, 0.25), (0.75, 0.25))
 """Where four.png has the middles of its texels on the square."""
-
 
 WHOLE = "usemtl it\nf 1/1 2/2 3/3 4/4"
 
@@ -55,13 +55,6 @@ def emission(made: Any, x: float, y: float, side: float = 5) -> np.ndarray:
     return np.array(si.emitter(made).eval(si)).ravel()
 
 
-def scattered(made: Any, *light: float) -> float:
-    """What of light from a direction the square at (0.4, 0.3) sends upwards."""
-    si = hit(made, 0.4, 0.3)
-    towards = si.to_local(mi.Vector3f(*(part / float(np.linalg.norm(light)) for part in light)))
-    return float(np.array(si.bsdf().eval(mi.BSDFContext(), si, towards)).ravel()[0])
-
-
 def area(made: Any) -> float:
     """The area of all shapes."""
     return sum(float(np.array(shape.surface_area()).ravel()[0]) for shape in made.shapes())
@@ -75,12 +68,3 @@ def said(scene: ImportedScene) -> str:
 def lost(scene: ImportedScene) -> dict[str, str]:
     """The effects of all changes that are refused, by their names."""
     return {change.name: change.effect for change in scene.changes if change.effect is not None}
-
-
-Obj = Callable[[str | bytes], Path]
-
-
-Write = Callable[[str, str], Path]
-
-
-FOUR_V = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\n"

@@ -38,10 +38,8 @@ def make(job: dict[str, Any]) -> None:
     for name, value in wanted.get("set", {}).items():
         setattr(data, name, value)
     lamp = bpy.data.objects.new("Lamp", data)
-    lamp.location, lamp.scale = wanted.get("at", (1.8, 1.2, 2.2)), wanted.get("scale", (1, 1, 1))
+    lamp.location, lamp.scale = (1.8, 1.2, 2.2), wanted.get("scale", (1, 1, 1))
     lamp.rotation_euler = wanted.get("rotation", (0, 0, 0))
-    for name, value in wanted.get("object", {}).items():
-        setattr(lamp, name, value)
     _place(lamp, wanted.get("place", ""))
     if "nodes" in wanted:
         data.use_nodes = True
@@ -69,24 +67,18 @@ def _box(
 
 
 def _place(lamp: Any, place: str) -> None:
-    """Put a lamp into the scene, or where it is drawn in another way, or not at all."""
+    """Put a lamp into the scene, or into a collection there, which may be drawn by an instance alone."""
     collection = bpy.context.scene.collection
-    if place in ("collection", "excluded", "instanced"):
+    if place:
         collection = bpy.data.collections.new("Lamps")
-        if place == "instanced":
-            holder = bpy.data.objects.new("Holder", None)
-            holder.instance_type, holder.instance_collection = "COLLECTION", collection
-            holder.location = (0.5, 0, 0)
-            bpy.context.scene.collection.objects.link(holder)
-        else:
-            bpy.context.scene.collection.children.link(collection)
-            collection.hide_render = place == "excluded"
+    if place == "instanced":
+        holder = bpy.data.objects.new("Holder", None)
+        holder.instance_type, holder.instance_collection = "COLLECTION", collection
+        holder.location = (0.5, 0, 0)
+        bpy.context.scene.collection.objects.link(holder)
+    elif place:
+        bpy.context.scene.collection.children.link(collection)
     collection.objects.link(lamp)
-    if place == "parented":
-        parent = bpy.data.objects.new("Parent", None)
-        bpy.context.scene.collection.objects.link(parent)
-        parent.location, parent.scale, parent.rotation_euler = (0.3, 0.2, 0), (1.5, 1, 1), (0, 0, 0)
-        lamp.parent = parent
 
 
 def _add_nodes(tree: Any, nodes: dict[str, Any]) -> None:
@@ -131,7 +123,7 @@ def look(job: dict[str, Any]) -> dict[str, Any]:
     if job.get("sky"):
         _make_world({"Color": (1, 1, 1, 1)})
     views = job.get("views") or [_view(low, high)]
-    pictures = [_render(scene, view, Path(job["pictures"]) / f"{number}.exr", job) for number, view in enumerate(views)]
+    pictures = [_render(scene, view, Path(job["pictures"]) / f"{number}.exr") for number, view in enumerate(views)]
     return {"objects": objects, "low": low, "high": high, "views": views, "pictures": pictures}
 
 
@@ -148,15 +140,13 @@ def _open(file: Path) -> None:
 
 def _view(low: list[float], high: list[float]) -> list[list[float]]:
     """From a corner of what is drawn to its middle; from beside it if it is flat."""
-    middle, size = (
-        [(a + b) / 2 for a, b in zip(low, high, strict=True)],
-        [b - a for a, b in zip(low, high, strict=True)],
-    )
+    middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
+    size = [b - a for a, b in zip(low, high, strict=True)]
     away = [0.45 * part if part > 1e-3 * max(size) else 0.9 * max(size) for part in size]
     return [[a + b for a, b in zip(middle, away, strict=True)], middle]
 
 
-def _render(scene: Any, view: list[list[float]], file: Path, job: dict[str, Any]) -> str:
+def _render(scene: Any, view: list[list[float]], file: Path) -> str:
     origin, target = (Vector((x, -z, y)) for x, y, z in view)
     camera = bpy.data.cameras.new("looker")
     camera.angle, camera.clip_start = math.radians(FIELD), 1e-3
@@ -165,13 +155,13 @@ def _render(scene: Any, view: list[list[float]], file: Path, job: dict[str, Any]
     scene.camera.location = origin
     scene.camera.rotation_euler = (target - origin).to_track_quat("-Z", "Y").to_euler()
     render, cycles = scene.render, scene.cycles
-    render.engine, cycles.device, cycles.samples = "CYCLES", "CPU", job.get("samples", SAMPLES)
+    render.engine, cycles.device, cycles.samples = "CYCLES", "CPU", SAMPLES
     cycles.use_adaptive_sampling = cycles.use_denoising = False
     for name in ("max_bounces", "diffuse_bounces", "glossy_bounces", "transmission_bounces", "transparent_max_bounces"):
         setattr(cycles, name, 32)
     cycles.blur_glossy = cycles.sample_clamp_direct = cycles.sample_clamp_indirect = 0
     cycles.pixel_filter_type = "BOX"
-    render.resolution_x = render.resolution_y = job.get("size", SIZE)
+    render.resolution_x = render.resolution_y = SIZE
     render.resolution_percentage, render.film_transparent = 100, False
     render.use_compositing = render.use_sequencer = False
     for layer in scene.view_layers:

@@ -70,24 +70,16 @@ def imported(file: Path, scratch: Path, *, sky: bool = False) -> tuple[ImportedS
     return scene, load(scene, scratch, lambda _: None)
 
 
-def picture(scene: Any, view: list[list[float]], size: int = 24, samples: int = 256) -> np.ndarray:
+def picture(scene: Any, view: list[list[float]], size: int = 24) -> np.ndarray:
     """Radiance, diffuse reflectance and whether no light is seen (size, size, 7), as `blender_render.py` looks."""
     import mitsuba as mi
 
     film = {"type": "hdrfilm", "width": size, "height": size, "filter": {"type": "box"}, "pixel_format": "rgb"}
-    sensor = mi.load_dict(
-        {
-            "type": "perspective",
-            "fov": 60.0,
-            "near_clip": 1e-3,
-            "to_world": mi.ScalarTransform4f().look_at(*view, [0, 1, 0]),
-            "film": film,
-            "sampler": {"type": "independent", "sample_count": samples},
-        }
-    )
-    inner = {"type": "path", "max_depth": 33}
-    integrator = mi.load_dict({"type": "aov", "aovs": "a:albedo", "image": inner})
-    values = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=samples))
+    to_world = mi.ScalarTransform4f().look_at(*view, [0, 1, 0])
+    camera = {"type": "perspective", "fov": 60.0, "near_clip": 1e-3, "to_world": to_world, "film": film}
+    sensor = mi.load_dict({**camera, "sampler": {"type": "independent", "sample_count": 256}})
+    integrator = mi.load_dict({"type": "aov", "aovs": "a:albedo", "image": {"type": "path", "max_depth": 33}})
+    values = np.array(mi.render(scene, sensor=sensor, integrator=integrator, spp=256))
     lamps = np.array(mi.render(scene, sensor=sensor, integrator=mi.load_dict({"type": "path", "max_depth": 1}), spp=64))
     return np.concatenate([values[..., :6], lamps[..., :3].sum(axis=2, keepdims=True) == 0], axis=2)
 
@@ -135,11 +127,11 @@ def compare(file: Path, theirs: dict[str, Any], folder: Path, *, sky: bool = Fal
     )
 
 
-def compare_all(files: list[Path], folder: Path, *, sky: bool = False) -> Iterator[Row]:
-    """A row for each file, under a white sky or not; Blender is started once."""
-    jobs = [{"look": str(file), "pictures": str(folder / f"cycles-{k}"), "sky": sky} for k, file in enumerate(files)]
+def compare_all(files: list[Path], folder: Path) -> Iterator[Row]:
+    """A row for each file, under a white sky; Blender is started once."""
+    jobs = [{"look": str(file), "pictures": str(folder / f"cycles-{k}"), "sky": True} for k, file in enumerate(files)]
     for number, (file, theirs) in enumerate(zip(files, run_in_blender(jobs, folder), strict=True)):
-        yield compare(file, theirs, folder / str(number), sky=sky)
+        yield compare(file, theirs, folder / str(number), sky=True)
 
 
 LAMPS: dict[str, dict[str, Any]] = {
@@ -199,50 +191,10 @@ def test_a_lamp_of_blender_lights_a_room_as_in_cycles(rooms: tuple[Path, dict[st
     assert row.radiance == pytest.approx([1.0, 1.0], abs=0.05)
 
 
-def show_all(names: list[str], out: Path, size: int = 256) -> None:
-    """Write a picture of files and rooms of `LAMPS`, two a row: as imported on the left, and by Cycles on the right.
-
-    Both are looked at from one place, under a white sky unless there are lamps, and with one exposure.
-    """
-    from PIL import Image
-
-    from photonfarm.core.pictures import display_values
-
-    pairs = []
-    with TemporaryDirectory() as folder:
-        makes = [{"make": f"{folder}/{name}.blend", "lamp": LAMPS[name]} for name in names if name in LAMPS]
-        files = [Path(f"{folder}/{name}.blend" if name in LAMPS else name) for name in names]
-        looks = [
-            {
-                "look": str(file),
-                "pictures": f"{folder}/cycles-{k}",
-                "size": size,
-                "sky": file.suffix != ".blend",
-                "views": VIEWS[:1] if names[k] in LAMPS else None,
-            }
-            for k, file in enumerate(files)
-        ]
-        found = run_in_blender(makes + looks, Path(folder))[len(makes) :]
-        for number, (file, theirs) in enumerate(zip(files, found, strict=True)):
-            _, scene = imported(file, Path(folder) / str(number), sky=file.suffix != ".blend")
-            ours, other = (
-                picture(scene, theirs["views"][0], size)[..., :3],
-                cycles_picture(theirs["pictures"][0])[..., :3],
-            )
-            exposure = 0.2 / max(float(np.median(other.mean(axis=2))), 1e-6)
-            pairs.append(np.concatenate([ours, np.ones((size, 4, 3)) * 1e6, other], axis=1) * exposure)
-    rows = [np.concatenate(pairs[k : k + 2], axis=1) for k in range(0, len(pairs), 2)]
-    shown = display_values(np.concatenate(rows).astype(np.float32))
-    Image.fromarray((shown * 255).round().astype(np.uint8)).save(out)
-
-
 if __name__ == "__main__":
     import mitsuba
 
     mitsuba.set_variant("llvm_ad_rgb")
-    if sys.argv[1] == "--pictures":
-        show_all(sys.argv[3:], Path(sys.argv[2]))
-    else:
-        with TemporaryDirectory() as made_in:
-            for made_row in compare_all([Path(name) for name in sys.argv[1:]], Path(made_in), sky=True):
-                sys.stdout.write(f"{made_row}\n")
+    with TemporaryDirectory() as folder:
+        for file_row in compare_all([Path(name) for name in sys.argv[1:]], Path(folder)):
+            sys.stdout.write(f"{file_row}\n")

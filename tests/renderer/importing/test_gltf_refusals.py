@@ -32,8 +32,6 @@ def changed(**entries: Any) -> Callable[[Path], None]:
         (lambda folder: (folder / "room.bin").write_bytes(b"1234"), "needs"),
         (lambda folder: (folder / "four.png").write_bytes(b"no image"), "image 0"),
         (lambda folder: (folder / "room.gltf").write_text("{"), "room.gltf"),
-        (lambda folder: (folder / "room.gltf").write_text(""), "room.gltf: is empty"),
-        (lambda folder: (folder / "room.gltf").write_text("v 0 0 0"), "is no glTF: it is neither JSON nor binary"),
         (lambda folder: (folder / "room.gltf").write_bytes(b"\xce{"), "is no glTF: it is neither JSON nor binary"),
         (changed(extensionsRequired=["KHR_draco_mesh_compression"]), "KHR_draco_mesh_compression"),
         (changed(extensionsRequired=["EXT_of_the_future"]), "EXT_of_the_future"),
@@ -44,7 +42,6 @@ def changed(**entries: Any) -> Callable[[Path], None]:
         (changed(nodes=[{"children": [1]}, {"children": [0]}], scenes=[{"nodes": [0]}]), "below itself"),
         (changed(asset={"version": "1.0"}), "1.0"),
         (changed(meshes=[]), "room.gltf"),
-        (changed(nodes=[], scenes=[{"nodes": []}]), "room.gltf"),
     ],
 )
 def test_what_cannot_be_read_is_named(
@@ -64,7 +61,6 @@ def first(kind: str, **entries: Any) -> Callable[[Any], None]:
     ("break_it", "named"),
     [
         (first("nodes", mesh=7), r"node 'Quad': names meshes\[7\], and the file has 1 meshes"),
-        (first("nodes", mesh=-1), r"node 'Quad': names meshes\[-1\]"),
         (first("nodes", rotation=[0, 0, 0, 0]), "node 'Quad': .*rotation"),
         (first("nodes", translation=[float("nan"), 0, 0]), "node 'Quad': .*translation"),
         (first("nodes", extensions={"KHR_lights_punctual": {"light": 4}}), r"node 'Quad': names lights\[4\]"),

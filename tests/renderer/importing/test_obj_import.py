@@ -8,26 +8,12 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from obj_scenes import (
-    FOUR_V,
-    Loaded,
-    Obj,
-    area,
-    emission,
-    hit,
-    lost,
-    meets,
-    reflectance,
-    said,
-)
+from obj_scenes import FOUR_V, Loaded, Obj, Read, Write, area, emission, hit, lost, meets, reflectance, said
 
 from photonfarm.core.errors import SpecError
-from photonfarm.renderer.tools.importing.imported import ImportedScene
 
 
-def test_objects_and_materials_name_shapes_and_images_stand_upright(
-    write_obj: Callable[[str, str], Path], loaded: Loaded
-) -> None:
+def test_objects_and_materials_name_shapes_and_images_stand_upright(write_obj: Write, loaded: Loaded) -> None:
     faces = (
         "o Picture\nusemtl paint\nf 1/1 2/2 3/3 4/4\no Frame\nusemtl wood\nf 1/1 2/2 3/3\nusemtl paint\nf 1/1 3/3 4/4"
     )
@@ -43,7 +29,7 @@ def test_objects_and_materials_name_shapes_and_images_stand_upright(
     assert np.array(si.bsdf().eval_diffuse_reflectance(si)).ravel() == pytest.approx([1, 0, 0], abs=1e-6)
 
 
-def test_what_emits_is_a_light_with_flat_normals(write_obj: Callable[[str, str], Path], loaded: Loaded) -> None:
+def test_what_emits_is_a_light_with_flat_normals(write_obj: Write, loaded: Loaded) -> None:
     _, made = loaded(write_obj("vn 0 1 1\nusemtl it\nf 1//1 2//1 3//1 4//1", "newmtl it\nKe 5 4 3"))
     for shape in made.shapes():
         assert shape.is_emitter()
@@ -60,7 +46,7 @@ def test_what_emits_is_a_light_with_flat_normals(write_obj: Callable[[str, str],
     ],
 )
 def test_files_that_are_missing_change_the_picture(
-    write_obj: Callable[[str, str], Path], loaded: Loaded, faces: str, materials: str, name: str, file: str
+    write_obj: Write, loaded: Loaded, faces: str, materials: str, name: str, file: str
 ) -> None:
     scene, made = loaded(write_obj(faces, materials))
     (lost,) = [change for change in scene.changes if change.effect == "colour"]
@@ -103,7 +89,7 @@ def test_a_wall_with_an_opening_keeps_it_and_its_side(
     assert np.sign(np.ravel(hit(made, 0.5, 0.6, 50).n)[2]) == turn
 
 
-def test_faces_that_cross_themselves_or_are_none_are_said(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
+def test_faces_that_cross_themselves_or_are_none_are_said(obj: Obj, read: Read) -> None:
     scene = read(obj("v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 4\nf 1 2 3\nf 1 2\np 1\nl 1 2"))
     for text in ("cross themselves", "(line 5)", "fewer than three corners", "(line 7)", "line 8", "line 9"):
         assert text in said(scene)
@@ -165,14 +151,12 @@ def test_texts_of_all_kinds_are_read(obj: Obj, loaded: Loaded, text: bytes) -> N
         (b"v 0 0 0\0", "is no text"),
     ],
 )
-def test_what_cannot_be_read_is_refused_with_its_line(
-    obj: Obj, read: Callable[[Path], ImportedScene], text: str | bytes, fault: str
-) -> None:
+def test_what_cannot_be_read_is_refused_with_its_line(obj: Obj, read: Read, text: str | bytes, fault: str) -> None:
     with pytest.raises(SpecError, match=fault):
         read(obj(text))
 
 
-def test_statements_that_are_not_carried_over_are_said(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
+def test_statements_that_are_not_carried_over_are_said(obj: Obj, read: Read) -> None:
     others = "surf 0 1 0 1 1 2 3 4\nend\ncall x.obj\ntrace_obj y\nusemap z\nlod 1\nbogus 1\nusemtl gone\n"
     scene = read(obj(f"{FOUR_V}{others}f 1 2 3 4"))
     assert lost(scene) == {
@@ -186,7 +170,7 @@ def test_statements_that_are_not_carried_over_are_said(obj: Obj, read: Callable[
     assert "are in no material file, and their surfaces are grey ('gone', line 12)" in said(scene)
 
 
-def test_groups_are_owners_where_there_are_no_objects(obj: Obj, read: Callable[[Path], ImportedScene]) -> None:
+def test_groups_are_owners_where_there_are_no_objects(obj: Obj, read: Read) -> None:
     assert set(read(obj(f"{FOUR_V}g a b\nf 1 2 3\ng c\nf 1 3 4")).objects.values()) == {"a b", "c"}
     assert set(read(obj(f"{FOUR_V}o A B\ng c\nf 1 2 3\ng d\nf 1 3 4")).objects.values()) == {"A B"}
 
@@ -202,6 +186,6 @@ def test_groups_are_owners_where_there_are_no_objects(obj: Obj, read: Callable[[
     ],
 )
 def test_colours_of_vertices_and_smoothing_groups_without_normals_are_losses(
-    obj: Obj, read: Callable[[Path], ImportedScene], text: str, name: str
+    obj: Obj, read: Read, text: str, name: str
 ) -> None:
     assert lost(read(obj(text))) == ({name: "colour"} if name else {})

@@ -103,11 +103,11 @@ def whole_samples(scene: SceneStore, contents: Contents, folder: Path) -> Whole:
     outputs = schema.output_arrays(spec)
     points = (len(base.position), 3)
     cloud = {
-        "position": ArraySchema("position", "sample", points, np.dtype("<f4"), 0, True, ("point", "axis"), {}),
-        "normal": ArraySchema("normal", "sample", points, np.dtype("<f2"), 0, True, ("point", "axis"), {}),
-        "albedo": ArraySchema("albedo", "sample", points, np.dtype("<f2"), 0, True, ("point", "channel"), {}),
-        "emission": ArraySchema("emission", "sample", points, np.dtype("<f4"), 0, True, ("point", "channel"), {}),
-        "visible": ArraySchema("visible", "sample", points[:1], np.dtype("|b1"), 0, True, ("point",), {}),
+        "position": ArraySchema("position", "sample", points, np.dtype("<f4"), True),
+        "normal": ArraySchema("normal", "sample", points, np.dtype("<f2"), True),
+        "albedo": ArraySchema("albedo", "sample", points, np.dtype("<f2"), True),
+        "emission": ArraySchema("emission", "sample", points, np.dtype("<f4"), True),
+        "visible": ArraySchema("visible", "sample", points[:1], np.dtype("|b1"), True),
     }
     kept: dict[str, list[Mapping[str, Any]]] = {"radiance": [], "buffers": [], "cloud": [], "photons": []}
     seen: set[Key] = set()

@@ -80,7 +80,7 @@ def reading(store: Path, scene_id: str, bare: Path) -> dict[str, Callable[..., N
     rows = reader.refresh()
     memory = {"radiance": Batch.empty(reader.spec, BATCH, buffers=False), "all": Batch.empty(reader.spec, BATCH)}
     maps = {name: np.load(bare / f"{name}.npy", mmap_mode="r") for name in ("radiance", *VIEW)}
-    into = {"radiance": memory["all"].radiance, **memory["all"].buffers, **memory["all"].seen}
+    into = {"radiance": memory["all"].radiance, **memory["all"].of_view}
     arrays: Any = zarr.open_group(store / "scenes" / scene_id / "plans/000000", mode="r")
     names = {"radiance": ("radiance",), "all": ("radiance", *VIEW)}
 
@@ -242,14 +242,14 @@ def bare_arrays(store: Path, scene_id: str, folder: Path) -> None:
     rows = reader.refresh()
     folder.mkdir()
     batch = reader.read_batch(rows[:1])
-    shapes = {"radiance": batch.radiance, **batch.buffers, **batch.seen}
+    shapes = {"radiance": batch.radiance, **batch.of_view}
     out = {
         name: np.lib.format.open_memmap(folder / f"{name}.npy", "w+", values.dtype, (len(rows), *values.shape[1:]))
         for name, values in shapes.items()
     }
     for place, row in enumerate(rows):
         batch = reader.read_batch([row], batch)
-        for name, values in {"radiance": batch.radiance, **batch.buffers, **batch.seen}.items():
+        for name, values in {"radiance": batch.radiance, **batch.of_view}.items():
             out[name][place] = values[0]
 
 

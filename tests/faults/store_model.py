@@ -12,7 +12,7 @@ from photonfarm.core.records import BasePointCloud, Geometry, Guides, ViewBuffer
 from photonfarm.plan.request import UNUSED, PlannedContent, Request, expand, sample_key
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store import SceneReader, SceneStore
+from photonfarm.store import JobWriter, SceneReader, SceneStore
 from photonfarm.store.format.shards import NOISY_GUIDES, round_to_8_bits
 
 # ------------------------------------------------------------------------------ what is rendered: a function of content
@@ -116,7 +116,7 @@ class Writer:
 
     def __init__(self, number: int, scene: SceneStore, job: int) -> None:
         self.number, self.job, self.spec = number, job, scene.spec
-        self.out = scene.job_writer(scene.job_rows(job))
+        self.out = JobWriter(scene, scene.job_rows(job))
         rows = scene.job_rows(job)
         vectors = {row: modification.vector.tobytes() for row, modification in rows.modifications.items()}
         views = {

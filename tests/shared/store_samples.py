@@ -110,7 +110,7 @@ def base() -> tuple[Geometry, BasePointCloud]:
 
 def commit(scene: SceneStore, job: int, given: Outputs, figures: Figures = FIGURES, **options: Any) -> bool:
     """Hand a job's outputs to the store, and commit them."""
-    with scene.job_writer(scene.job_rows(job)) as out:
+    with JobWriter(scene, scene.job_rows(job)) as out:
         give(out, given)
         return out.commit(figures, **options)
 

@@ -23,7 +23,7 @@ from photonfarm.plan.request import sample_key
 from photonfarm.scene.modification import Modification, rebuild, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View, sample_view
-from photonfarm.store import Figures, Sample, SceneStore
+from photonfarm.store import Figures, JobWriter, Sample, SceneStore
 from photonfarm.store.read.batch import Batch
 
 
@@ -142,7 +142,7 @@ def commit_job(scene: SceneStore, job: int) -> bool:
     photons = {}
     if scene.spec.photons.paths:
         photons = {row: trace(scene.spec, modification, row) for row, modification in rows.modifications.items()}
-    with scene.job_writer(scene.job_rows(job)) as out:
+    with JobWriter(scene, scene.job_rows(job)) as out:
         for sample in rows.samples:
             shown = rows.modifications[sample.modification_row], rows.views[sample.view_row]
             clean, buffers = render(scene.spec, *shown)

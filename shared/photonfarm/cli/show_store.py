@@ -20,7 +20,7 @@ from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import SILENCE_S
 from photonfarm.farm.join import JoinedScene
 from photonfarm.store import Store
-from photonfarm.store.check.check import CheckProgress, SceneReport, StoreReport, halves_in_words
+from photonfarm.store.check.check import CheckProgress, SceneReport, StoreReport
 from photonfarm.store.model.findings import FindingGroup, Remedy
 from photonfarm.store.model.withdrawal import Withdrawal
 from photonfarm.store.read.find import FoundSample, Matches
@@ -99,9 +99,7 @@ def _print_scene(scene: SceneReport) -> None:
     read = f"{scene.jobs} jobs, {scene.samples} samples, {format_bytes(scene.size_bytes)}"
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
-        click.echo(f"  A against B: {halves_in_words(scene.halves)}")
-    if scene.back_facing_share is not None:
-        click.echo(f"  first hits seen from behind: {scene.back_facing_share:.2%} of the pixels that meet something")
+        click.echo(f"  A against B: {scene.halves.in_words}")
     for group in scene.groups:
         click.echo(f"  {group.count} × {group.cause.label}: {group.cause.sentence} ({group.cause.remedy.value})")
         for f in group.first:

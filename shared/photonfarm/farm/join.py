@@ -15,7 +15,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Key
 from photonfarm.plan.joined import Joined, samples_to_join
 from photonfarm.plan.request import PlannedContent, SamplesToPlan
-from photonfarm.store import Figures, JobRows, SceneReader, SceneStore, Store
+from photonfarm.store import Figures, JobRows, JobWriter, SceneReader, SceneStore, Store
 from photonfarm.store.model import plans
 from photonfarm.store.model.lease import OnWait, hold_lease
 from photonfarm.store.read.find import scene_named
@@ -103,7 +103,7 @@ class _Copies:
     def commit(self, here: SceneStore, rows: JobRows) -> None:
         """Commit a job."""
         new_views, new_modifications = set(rows.new_views), set(rows.new_modifications)
-        with here.job_writer(rows) as out:
+        with JobWriter(here, rows) as out:
             for sample in rows.samples:
                 row = self._rows[sample.key]
                 if sample.modification_row in new_modifications and here.spec.photons.paths:

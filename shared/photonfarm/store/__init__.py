@@ -1,6 +1,7 @@
 """The sample store: Zarr v3 and JSON in a folder, written once and never changed: docs/store-format.md."""
 
-from photonfarm.store.model.commit import Figures, JobWriter
+from photonfarm.store.format.markers import Figures
+from photonfarm.store.model.commit import JobWriter
 from photonfarm.store.model.plans import JobRows, SampleRow
 from photonfarm.store.model.scene_store import PlanResult, Progress, SceneStore
 from photonfarm.store.model.status import SceneStatus, store_status

@@ -9,14 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import zarr
 from zarr.abc.buffer import Buffer
 from zarr.storage import LocalStore
 
+from photonfarm.store.format.metadata import new_group
 from photonfarm.store.io import object_cache
 from photonfarm.store.io.local import LocalStorage
 from photonfarm.store.io.storage import put_json
-from photonfarm.store.model.staging import group_in
 
 
 @pytest.fixture
@@ -72,8 +71,8 @@ def test_a_group_of_which_a_file_failed_is_written_no_more_once_it_is_given_up(
     part = tmp_path / "part"
 
     def build() -> None:
-        with group_in(part) as store:
-            array = zarr.open_group(store, mode="w-").create_array("values", shape=(40,), chunks=(1,), dtype="f4")
+        with new_group(part, {}) as group:
+            array = group.create_array("values", shape=(40,), chunks=(1,), dtype="f4")
             array[:] = np.ones(40)
 
     with pytest.raises(OSError, match="No space left"):

@@ -13,7 +13,7 @@ from photonfarm.core.records import LIT_POINTS, ViewBuffers, Visibility
 from photonfarm.plan.hold_out import are_held_out, rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.scene.view import Camera
-from photonfarm.store import Figures, SceneReader, Store
+from photonfarm.store import Figures, JobWriter, SceneReader, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.trainer.data.feed import Feed
 
@@ -82,7 +82,7 @@ def test_a_batch_holds_what_was_committed_exactly_also_where_float16_cannot(scen
     buffers = ViewBuffers(*(np.full((16, 16, *more), 0.25, np.float32) for more in ((), (3,), (3,))))
     guides = known(bright[0], buffers, min(LIT_POINTS, scene.spec.points))
     seen = np.random.default_rng(0).random(256) < 0.5
-    with scene.job_writer(scene.job_rows(0)) as out:
+    with JobWriter(scene, scene.job_rows(0)) as out:
         for sample in rows.samples:
             out.radiance(sample.row, bright if sample.row == 1 else 0 * bright + 0.5)
             out.view(sample.view_row, buffers, guides, Visibility(seen, np.zeros(0, bool)))

@@ -1,14 +1,14 @@
 """The check of stored values: images and views that are certainly or probably wrong, of one sample and of all together.
 
-Shape letters: H W image, P pixels, T tests.
+Shape letters: H W image, T tests.
 """
 
 from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
-from math import log, sqrt
+from dataclasses import dataclass, field
+from math import ceil, log, sqrt
 from typing import Any
 
 import numpy as np
@@ -40,7 +40,6 @@ class HalvesResult:
     limit: float  # what |S| reaches by chance with probability SIGNIFICANCE at most, over all tests together
     where: str  # the block of the largest |S|, or the whole image
     difference: float  # mean over the samples of (A − B) / (A + B) of whole images
-    standard_error: float  # of `difference`; 0 for a single sample
     allowed: float  # how far `difference` may be from 0 by chance, as `statistic` may be up to `limit`
 
     @property
@@ -49,9 +48,17 @@ class HalvesResult:
         return self.statistic < self.limit
 
     @property
-    def is_conclusive(self) -> bool:
-        """Whether there are enough samples for a difference to show: |S| is √n at most."""
-        return sqrt(self.samples) >= self.limit
+    def in_words(self) -> str:
+        """The outcome, in words; there may be too few samples for a difference to show, as |S| is √n at most."""
+        verdict = "no difference beyond chance" if self.passed else "they differ by more than chance"
+        if sqrt(self.samples) < self.limit:
+            verdict = f"too few samples to tell, {ceil(self.limit**2)} are needed at least"
+        return (
+            f"{verdict}: |S| = {self.statistic:.2f} in {self.where}, {'below' if self.passed else 'above'} "
+            f"{self.limit:.2f}, which chance reaches with probability {SIGNIFICANCE:g} at most; of whole images "
+            f"(A − B)/(A + B) = {self.difference:+.2%}, and chance allows ± {self.allowed:.2%} over {self.samples} "
+            "samples"
+        )
 
 
 class HalvesTest:
@@ -67,6 +74,7 @@ class HalvesTest:
 
     def __init__(self, scenes: int = 1) -> None:
         """Begin without samples; the significance is shared with the tests of other scenes."""
+        self.scenes = scenes
         self._tests = scenes * (BLOCKS * BLOCKS + 1)
         self._samples = 0
         self._sum, self._squares = np.zeros((2, BLOCKS * BLOCKS + 1))
@@ -99,12 +107,9 @@ class HalvesTest:
         place = int(np.argmax(np.abs(s)))
         y, x = divmod(place, BLOCKS)
         where = "the whole image" if place == BLOCKS * BLOCKS else f"block x {x}, y {y} of {BLOCKS} × {BLOCKS}"
-        mean = float(self._sum[-1] / n)
-        variance = max(float(self._squares[-1] / n) - mean**2, 0.0)
-        error = sqrt(variance / (n - 1)) if n > 1 else 0.0
         limit = sqrt(2 * log(2 * self._tests / SIGNIFICANCE))
         allowed = limit * sqrt(float(self._squares[-1])) / n
-        return HalvesResult(n, float(abs(s[place])), limit, where, mean, error, allowed)
+        return HalvesResult(n, float(abs(s[place])), limit, where, float(self._sum[-1] / n), allowed)
 
 
 class Fingerprints:
@@ -142,83 +147,58 @@ class Fingerprints:
 
 @dataclass(slots=True)
 class CheckTotals:
-    """Totals over the jobs of a scene."""
+    """Totals over jobs of a scene."""
 
     halves: HalvesTest
     fingerprints: Fingerprints = field(default_factory=Fingerprints)
     jobs: int = 0
     samples: int = 0
     size_bytes: int = 0
-    hit_pixels: int = 0  # first hits, of all views
-    back_facing_pixels: int = 0  # of these, seen from behind
 
     def add(self, other: CheckTotals) -> None:
         """Add the totals of other jobs of the scene."""
         self.halves.merge(other.halves)
         self.fingerprints.merge(other.fingerprints)
-        for name in ("jobs", "samples", "size_bytes", "hit_pixels", "back_facing_pixels"):
+        for name in ("jobs", "samples", "size_bytes"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
 
-class ContentCheck:
-    """Checks the rows of a scene, one after the other; yields each finding as a cause and a detail."""
+def check_radiance(row: int, halves: NDArray[Any], totals: CheckTotals) -> Iterator[tuple[Cause, str]]:
+    """Check the halves of a sample, (2, H, W, 3), whose values are finite and scaled as they are stored."""
+    totals.samples += 1
+    totals.halves.add(halves)
+    black = [half for half, values in zip("AB", halves, strict=True) if not largest(values)]
+    prints = [totals.fingerprints.add(row, values) for values in halves if largest(values)]
+    if not prints:
+        yield Cause.BLACK, "all zero"
+    elif black:
+        yield Cause.BLACK_HALF, f"{black[0]} is all zero"
+    elif prints[0] == prints[-1] and np.array_equal(*halves) and not is_constant(halves[0]):
+        yield Cause.EQUAL_HALVES, "A = B in every pixel"
 
-    def __init__(self, spec: SceneSpec) -> None:
-        self._spec = spec
-        self._rays: NDArray[np.float32] | None = None
 
-    def radiance(self, row: int, halves: NDArray[Any], totals: CheckTotals) -> Iterator[tuple[Cause, str]]:
-        """Check the halves of a sample, (2, H, W, 3), whose values are finite and scaled as they are stored."""
-        totals.samples += 1
-        totals.halves.add(halves)
-        black = [half for half, values in zip("AB", halves, strict=True) if not largest(values)]
-        prints = [totals.fingerprints.add(row, values) for values in halves if largest(values)]
-        if not prints:
-            yield Cause.BLACK, "all zero"
-        elif black:
-            yield Cause.BLACK_HALF, f"{black[0]} is all zero"
-        elif prints[0] == prints[-1] and np.array_equal(*halves) and not is_constant(halves[0]):
-            yield Cause.EQUAL_HALVES, "A = B in every pixel"
+def check_view(
+    depth: NDArray[Any], normal: NDArray[Any], view: View | None, spec: SceneSpec
+) -> Iterator[tuple[Cause, str]]:
+    """Check the buffers of a view: depth (H, W) and the modelled normals (H, W, 3).
 
-    def view(
-        self, depth: NDArray[Any], normal: NDArray[Any], view: View | None, totals: CheckTotals
-    ) -> Iterator[tuple[Cause, str]]:
-        """Check the buffers of a view: depth (H, W) and the modelled normals (H, W, 3).
+    Normals are not turned to the camera, so the inside of a box or the back of a leaf is rightly seen from behind, and
+    so are all of them from inside an object. A view is reported if it shows nothing else.
+    """
+    hit = depth > 0
+    if not hit.any():
+        yield Cause.EMPTY_VIEW, "depth is 0 in every pixel"
+    elif view is not None:
+        cosine = (Camera.of(view, spec).rays() * normal.astype(np.float32)).sum(axis=-1)  # (H, W) above 0: from behind
+        if (cosine[hit] > 0).all():
+            yield Cause.BACK_FACING, f"all {np.count_nonzero(hit)} pixels that meet something"
 
-        Normals are not turned to the camera, so the inside of a box or the back of a leaf is rightly seen from behind.
-        Views from inside an object are allowed too. So such pixels are only counted, and a view is reported only if it
-        shows nothing else.
-        """
-        hit = depth > 0
-        hits = int(np.count_nonzero(hit))
-        if not hits:
-            yield Cause.EMPTY_VIEW, "depth is 0 in every pixel"
-        elif view is not None:
-            behind = int(np.count_nonzero((self._cosine(normal, view) > 0) & hit.reshape(-1)))
-            totals.hit_pixels += hits
-            totals.back_facing_pixels += behind
-            if behind == hits:
-                yield Cause.BACK_FACING, f"all {hits} pixels that meet something"
 
-    def bits(self, name: str, packed: NDArray[np.uint8]) -> Iterator[tuple[Cause, str]]:
-        """Check the stored bits of which points or photons a view sees: `point_seen` or `photon_seen`."""
-        count = bit_counts(self._spec)[name]
-        if count % 8 and packed[-1] >> count % 8:
-            yield Cause.UNUSED_BIT, f"{name} has a bit above those of {count}"
-
-    def _cosine(self, normal: NDArray[Any], view: View) -> NDArray[np.float32]:
-        """The cosine between each pixel's normal and the ray through its centre, (P,): positive where seen from behind.
-
-        It is computed in the camera's axes, in which the rays are the same for every view.
-        """
-        camera = Camera.of(view, self._spec)
-        if self._rays is None:
-            x, y, z = np.eye(3)
-            rays = replace(camera, right=x, down=y, forward=z).rays()
-            self._rays = np.ascontiguousarray(rays.reshape(-1, 3).T)  # (3, P)
-        axes = camera.world_to_camera[:, :3].astype(np.float32)
-        cosine: NDArray[np.float32] = (axes @ normal.reshape(-1, 3).astype(np.float32).T * self._rays).sum(axis=0)
-        return cosine
+def check_bits(name: str, packed: NDArray[np.uint8], spec: SceneSpec) -> Iterator[tuple[Cause, str]]:
+    """Check the stored bits of which points or photons a view sees: `point_seen` or `photon_seen`."""
+    count = bit_counts(spec)[name]
+    if count % 8 and packed[-1] >> count % 8:
+        yield Cause.UNUSED_BIT, f"{name} has a bit above those of {count}"
 
 
 def is_constant(half: NDArray[Any]) -> bool:

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Set
-from dataclasses import fields
-from itertools import chain
+from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -18,198 +18,211 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.core.records import BasePointCloud, Geometry
-from photonfarm.plan.request import UNUSED, sample_keys
+from photonfarm.plan.request import UNUSED, PlannedContent, sample_keys
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store.check.job_check import CheckTarget
 from photonfarm.store.format import markers, schema
 from photonfarm.store.io.storage import Storage
 from photonfarm.store.model import findings, plans
 from photonfarm.store.model.findings import Cause, Finding
 from photonfarm.store.model.plans import StoredPlan
-from photonfarm.store.model.scene_store import read_base
+from photonfarm.store.model.scene_store import SCENES, read_base
 
 UNREADABLE = (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError)
 """What zarr-python raises for damaged metadata and chunks; a group in place of an array lacks its attributes."""
 
 
-class PlanCheck:
-    """Checks the plans and the base of one scene."""
+@dataclass(eq=False)
+class CheckedScene:
+    """A scene that is being checked, and what `check_plans` has learned of its plans."""
 
-    def __init__(self, storage: Storage, spec: SceneSpec, scene: str) -> None:
-        self._storage = storage
-        self._spec = spec
-        self._scene = scene  # its folder
-        self.shard_rows: int | None = None  # as the first readable plan states
-        self.plans: list[StoredPlan] | None = None  # once checked; None if one is damaged
-        self.lost: set[str] = set()  # folders of plans that are missing
-
-    # ------------------------------------------------------------------------------------------------------------ plans
-
-    def check_plans(self) -> Iterator[Finding]:
-        """Yield what is wrong with the plans."""
-        found: list[Finding] = []
-        for number in range(plans.count(self._storage, self._scene)):
-            folder = plans.folder(self._scene, number)
-            try:
-                found += self._plan(folder)
-            except OSError as error:
-                found.append(self._unreadable(folder, error))
-        if not found:
-            try:
-                self.plans = plans.load_all(self._storage, self._scene, [])
-            except StoreError as error:
-                found.append(Finding(Cause.PLAN, str(error), self._id))
-        yield from found
-        if self.plans:
-            references = list(self._references(self.plans))
-            yield from references or self._keys(self.plans)
-            self.plans = None if references else self.plans
+    storage: Storage
+    spec: SceneSpec
+    plans: list[StoredPlan] | None = None  # None if one is damaged: then only what markers state can be checked
+    shard_rows: int | None = None  # as the first readable plan states
+    lost: set[str] = field(default_factory=set)  # folders of plans that are missing
 
     @property
-    def _id(self) -> str:
-        return self._spec.scene_id
+    def scene_id(self) -> str:
+        """The scene's id."""
+        return self.spec.scene_id
 
-    def _unreadable(self, folder: str, error: OSError) -> Finding:
-        return Finding(Cause.UNREADABLE, error.strerror or str(error), self._id, file=folder)
+    @property
+    def name(self) -> str:
+        """The name of its folder."""
+        return f"{SCENES}/{self.scene_id}"
 
-    def _plan(self, folder: str) -> Iterator[Finding]:
-        """Yield what is wrong with the files of a plan."""
-        if not self._storage.exists(f"{folder}/zarr.json"):
-            self.lost.add(folder)
-            yield Finding(Cause.PLAN, findings.MISSING, self._id, file=f"{folder}/zarr.json")
-            return
+    @cached_property
+    def arrays(self) -> dict[str, schema.ArraySchema]:
+        """The arrays that jobs store there, by name."""
+        return schema.output_arrays(self.spec)
+
+    def finding(
+        self, cause: Cause, detail: str, file: str | None = None, *, job: int | None = None, row: int | None = None
+    ) -> Finding:
+        """A finding about the scene, or about a job of it."""
+        return Finding(cause, detail, self.scene_id, job, row, file)
+
+    def unreadable(self, file: str, error: OSError, job: int | None = None) -> Finding:
+        """The finding for a file that cannot be read; raises OSError if the whole store cannot be read."""
+        self.storage.names(self.name)
+        return self.finding(Cause.UNREADABLE, error.strerror or str(error), file, job=job)
+
+    def files_of(self, job: int) -> dict[str, str]:
+        """The names that a job's files may have, by array; empty for a job of no known plan."""
+        for plan in self.plans or []:
+            if job in plan.own_jobs:
+                return {name: plan.shard(name, array, job) for name, array in self.arrays.items()}
+        return {}
+
+
+# ---------------------------------------------------------------------------------------------------------------- plans
+
+
+def check_plans(scene: CheckedScene) -> list[Finding]:
+    """What is wrong with the plans; the scene then has them, unless one is damaged."""
+    scene.plans, scene.lost = None, set()
+    found: list[Finding] = []
+    for number in range(plans.count(scene.storage, scene.name)):
+        folder = plans.folder(scene.name, number)
         try:
-            group, about = plans.open_plan(self._storage, folder)
-        except StoreError as error:
-            yield Finding(Cause.PLAN, str(error).partition(": ")[2], self._id, file=f"{folder}/zarr.json")
-            return
-        self.shard_rows = self.shard_rows or about.shard_rows
-        remedy = plans.rewritten(about.request)
-        for name in plans.INPUTS:
-            if detail := self._array(group, folder, name):
-                yield Finding(Cause.PLAN_INPUTS, f"{detail}; {remedy}", self._id, file=f"{folder}/{name}")
-        for file in about.checksums:
-            name = file.partition("/")[0]
-            if name not in (file, *plans.INPUTS) and (detail := declaration(group, name)):
-                yield Finding(Cause.PLAN_INPUTS, f"{detail}; {remedy}", self._id, file=f"{folder}/{file}")
-
-    def _array(self, group: Any, folder: str, name: str) -> str:
-        """What is wrong with an array of inputs or of the base; empty if nothing."""
-        try:
-            values = schema.read_input(self._storage, f"{folder}/{name}", group[name])
-        except CorruptError as error:
-            return f"chunk {str(error).rpartition('/')[2].replace(':', '')}"
-        except UNREADABLE as error:
-            return f"cannot be read: {plans.reason(error)}"
-        may_be_nan = name in plans.INPUTS or values.dtype.kind != "f"
-        return "" if may_be_nan or np.isfinite(values).all() else "is not finite"
-
-    def _references(self, found: list[StoredPlan]) -> Iterator[Finding]:
-        """Find rows and jobs out of sequence, and samples that refer to rows that hold nothing."""
-        modification, view = _stack(found)
-        first_job = 0
-        for plan in found:
-            used = plan.rows.sample_modification != UNUSED
-            wrong = used != (plan.rows.sample_view != UNUSED)
-            for references, vectors in (
-                (plan.rows.sample_modification, modification),
-                (plan.rows.sample_view, view),
-            ):
-                within = used & (references >= 0) & (references < plan.end_row)
-                wrong |= used & ~within
-                wrong[within] |= np.isnan(vectors[references[within]]).any(axis=tuple(range(1, vectors.ndim)))
-            if wrong.any():
-                row = plan.first_row + int(np.argmax(wrong))
-                detail = f"{np.count_nonzero(wrong)} samples refer to rows that hold no modification or view"
-                yield Finding(Cause.PLAN, detail, self._id, row=row, file=plan.folder)
-            if plan.first_job != first_job or plan.shard_rows != found[0].shard_rows:
-                detail = f"begins at job {plan.first_job}; the plan before it ends at {first_job}"
-                yield Finding(Cause.PLAN, detail, self._id, file=plan.folder)
-            first_job = plan.end_job
-
-    def _keys(self, found: list[StoredPlan]) -> Iterator[Finding]:
-        """Find samples whose content key does not match their content, or belongs to another sample as well."""
-        modification, view = _stack(found)
-        for plan in found:
-            rows = plan.rows
-            used = np.flatnonzero(rows.sample_modification != UNUSED)
-            contents = modification[rows.sample_modification[used]], view[rows.sample_view[used]]
-            keys = sample_keys(self._spec.radiance_id, *contents, rows.sample_pass[used])
-            stored = (rows.sample_key[i].tobytes() for i in used)
-            wrong = [plan.first_row + int(i) for i, key, kept in zip(used, keys, stored, strict=True) if key != kept]
-            if wrong:
-                detail = f"{len(wrong)} samples have a key that is not of their modification, view and pass"
-                yield Finding(Cause.PLAN, detail, self._id, row=wrong[0], file=f"{plan.folder}/sample_key")
-        every = np.concatenate([plan.rows.sample_key[plan.rows.sample_modification != UNUSED] for plan in found])
-        if repeated := len(every) - len(np.unique(every, axis=0)):
-            detail = f"{repeated} keys are planned more than once"
-            yield Finding(Cause.PLAN, detail, self._id, file=f"{self._scene}/plans")
-
-    # ------------------------------------------------------------------------------------------------------------- base
-
-    def check_base(self, committed: Set[int]) -> Iterator[Finding]:
-        """Yield what is wrong with geometry and base point cloud, which are there once a job is committed.
-
-        Any job writes them when it is rendered: if they are missing and a planned job is still to come, workers
-        repair that.
-        """
-        folder = f"{self._scene}/base"
-        try:
-            yield from self._base(folder, committed)
+            found += _check_plan(scene, folder)
         except OSError as error:
-            yield self._unreadable(folder, error)
-
-    def _base(self, folder: str, committed: Set[int]) -> Iterator[Finding]:
-        from photonfarm.store.format.metadata import open_group
-
-        if not self._storage.exists(f"{folder}/zarr.json"):
-            if committed:
-                wanted = jobs_to_render(self.plans or [])
-                waits = not self._storage.names(folder) and not committed >= wanted
-                cause = Cause.BASE_TO_COME if waits else Cause.BASE
-                yield Finding(cause, "is missing, and jobs are committed", self._id, file=folder)
-            return
-        found = []
-        for part, record in (("geometry", Geometry), ("cloud", BasePointCloud)):
-            try:
-                group, _ = open_group(self._storage, folder)
-                names = [(field.name, group[part]) for field in fields(record)]
-            except (StoreError, *UNREADABLE) as error:
-                found.append(
-                    Finding(Cause.BASE, f"cannot be read: {plans.reason(error)}", self._id, file=f"{folder}/{part}")
-                )
-                continue
-            for name, parent in names:
-                if detail := self._array(parent, f"{folder}/{part}", name):
-                    found.append(Finding(Cause.BASE, detail, self._id, file=f"{folder}/{part}/{name}"))
-        yield from found
-        if not found and (detail := _base_references(*read_base(self._storage, self._scene), len(self._spec.groups))):
-            yield Finding(Cause.BASE, detail, self._id, file=folder)
-
-
-def jobs_to_render(found: list[StoredPlan]) -> set[int]:
-    """All jobs of plans but the withdrawn ones."""
-    return {job for plan in found for job in range(plan.first_job, plan.end_job) if job not in plan.withdrawn}
-
-
-def declaration(group: Any, name: str) -> str:
-    """What is wrong with the declaration of an array, by which other programs read it; empty if nothing."""
+            found.append(scene.unreadable(folder, error))
+    if found:
+        return found
     try:
-        _ = group[name]
+        there = plans.load_all(scene.storage, scene.name, [])
+    except StoreError as error:
+        return [scene.finding(Cause.PLAN, str(error))]
+    inputs = plans.content(there)
+    found = list(_check_references(scene, there, inputs)) if there else []
+    if not found:
+        scene.plans = there
+    return found or (list(_check_keys(scene, there, inputs)) if there else [])
+
+
+def _check_plan(scene: CheckedScene, folder: str) -> Iterator[Finding]:
+    """Yield what is wrong with the files of a plan."""
+    document = f"{folder}/zarr.json"
+    if not scene.storage.exists(document):
+        scene.lost.add(folder)
+        yield scene.finding(Cause.PLAN, findings.MISSING, document)
+        return
+    try:
+        group, about = plans.open_plan(scene.storage, folder)
+    except StoreError as error:
+        yield scene.finding(Cause.PLAN, str(error).partition(": ")[2], document)
+        return
+    scene.shard_rows = scene.shard_rows or about.shard_rows
+    remedy = plans.rewritten(about.request)
+    for name in plans.INPUTS:
+        if detail := _describe_damage(scene.storage, f"{folder}/{name}", group, name):
+            yield scene.finding(Cause.PLAN_INPUTS, f"{detail}; {remedy}", f"{folder}/{name}")
+    for file in about.checksums:
+        name = file.partition("/")[0]
+        if name in (file, *plans.INPUTS):
+            continue
+        try:  # the declaration of an output, by which other programs read it
+            _ = group[name]
+        except UNREADABLE as error:
+            detail = f"cannot be read: {plans.reason(error)}; {remedy}"
+            yield scene.finding(Cause.PLAN_INPUTS, detail, f"{folder}/{file}")
+
+
+def _describe_damage(storage: Storage, folder: str, group: Any, name: str, *, may_be_nan: bool = True) -> str:
+    """What is wrong with an array of inputs or of the base, in its folder; empty if nothing."""
+    try:
+        values = schema.read_input(storage, folder, group[name])
+    except CorruptError as error:
+        return f"chunk {str(error).rpartition('/')[2].replace(':', '')}"
     except UNREADABLE as error:
         return f"cannot be read: {plans.reason(error)}"
-    return ""
+    return "" if may_be_nan or values.dtype.kind != "f" or np.isfinite(values).all() else "is not finite"
 
 
-def _stack(found: list[StoredPlan]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The modification vectors (R, G, 4) and view vectors (R, 6) of all rows of a scene."""
-    return (
-        np.concatenate([plan.rows.modification for plan in found]),
-        np.concatenate([plan.rows.view for plan in found]),
-    )
+def _check_references(scene: CheckedScene, found: list[StoredPlan], inputs: PlannedContent) -> Iterator[Finding]:
+    """Find rows and jobs out of sequence, and samples that refer to rows that hold nothing."""
+    first_job = 0
+    for plan in found:
+        used = plan.rows.sample_modification != UNUSED
+        wrong = used != (plan.rows.sample_view != UNUSED)
+        for kind, references in (("modification", plan.rows.sample_modification), ("view", plan.rows.sample_view)):
+            vectors = inputs.column(kind)
+            within = used & (references >= 0) & (references < plan.end_row)
+            wrong |= used & ~within
+            wrong[within] |= np.isnan(vectors[references[within]]).any(axis=tuple(range(1, vectors.ndim)))
+        if wrong.any():
+            row = plan.first_row + int(np.argmax(wrong))
+            detail = f"{np.count_nonzero(wrong)} samples refer to rows that hold no modification or view"
+            yield scene.finding(Cause.PLAN, detail, plan.folder, row=row)
+        if plan.first_job != first_job or plan.shard_rows != found[0].shard_rows:
+            detail = f"begins at job {plan.first_job}; the plan before it ends at {first_job}"
+            yield scene.finding(Cause.PLAN, detail, plan.folder)
+        first_job = plan.end_job
 
 
-def _base_references(geometry: Geometry, cloud: BasePointCloud, groups: int) -> str:
+def _check_keys(scene: CheckedScene, found: list[StoredPlan], inputs: PlannedContent) -> Iterator[Finding]:
+    """Find samples whose content key does not match their content, or belongs to another sample as well."""
+    modification, view = inputs.column("modification"), inputs.column("view")
+    stored: list[bytes] = []
+    for plan in found:
+        rows = plan.rows
+        used = np.flatnonzero(rows.sample_modification != UNUSED)
+        contents = modification[rows.sample_modification[used]], view[rows.sample_view[used]]
+        keys = sample_keys(scene.spec.radiance_id, *contents, rows.sample_pass[used])
+        own = [key.tobytes() for key in rows.sample_key[used]]
+        wrong = [plan.first_row + int(i) for i, key, kept in zip(used, keys, own, strict=True) if key != kept]
+        if wrong:
+            detail = f"{len(wrong)} samples have a key that is not of their modification, view and pass"
+            yield scene.finding(Cause.PLAN, detail, f"{plan.folder}/sample_key", row=wrong[0])
+        stored += own
+    if repeated := len(stored) - len(set(stored)):
+        yield scene.finding(Cause.PLAN, f"{repeated} keys are planned more than once", f"{scene.name}/plans")
+
+
+# ----------------------------------------------------------------------------------------------------------------- base
+
+
+def check_base(scene: CheckedScene, committed: Set[int]) -> list[Finding]:
+    """What is wrong with geometry and base point cloud, which are there once a job is committed.
+
+    Any job writes them when it is rendered: if they are missing and a planned job is still to come, workers repair
+    that.
+    """
+    folder = f"{scene.name}/base"
+    try:
+        if scene.storage.exists(f"{folder}/zarr.json"):
+            return list(_check_arrays_of_base(scene, folder))
+        if not committed:
+            return []
+        waits = not scene.storage.names(folder) and not committed >= jobs_to_render(scene.plans or [])
+        cause = Cause.BASE_TO_COME if waits else Cause.BASE
+        return [scene.finding(cause, "is missing, and jobs are committed", folder)]
+    except OSError as error:
+        return [scene.unreadable(folder, error)]
+
+
+def _check_arrays_of_base(scene: CheckedScene, folder: str) -> Iterator[Finding]:
+    from photonfarm.store.format.metadata import open_group
+
+    is_whole = True
+    for part, record in (("geometry", Geometry), ("cloud", BasePointCloud)):
+        try:
+            parent = open_group(scene.storage, folder)[0][part]
+        except (StoreError, *UNREADABLE) as error:
+            is_whole = False
+            yield scene.finding(Cause.BASE, f"cannot be read: {plans.reason(error)}", f"{folder}/{part}")
+            continue
+        for each in fields(record):
+            file = f"{folder}/{part}/{each.name}"
+            if detail := _describe_damage(scene.storage, file, parent, each.name, may_be_nan=False):
+                is_whole = False
+                yield scene.finding(Cause.BASE, detail, file)
+    if is_whole and (detail := _find_wrong_index(*read_base(scene.storage, scene.name), len(scene.spec.groups))):
+        yield scene.finding(Cause.BASE, detail, folder)
+
+
+def _find_wrong_index(geometry: Geometry, cloud: BasePointCloud, groups: int) -> str:
     """Which index is out of range; empty if none is."""
     limits: dict[str, tuple[NDArray[Any], int]] = {
         "geometry/faces": (geometry.faces, len(geometry.vertices)),
@@ -224,30 +237,30 @@ def _base_references(geometry: Geometry, cloud: BasePointCloud, groups: int) -> 
     return ""
 
 
-def find_unplanned_files(scene: CheckTarget) -> Iterator[Finding]:
+def jobs_to_render(found: list[StoredPlan]) -> set[int]:
+    """All jobs of plans but the withdrawn ones."""
+    return {job for plan in found for job in plan.own_jobs if job not in plan.withdrawn}
+
+
+# ---------------------------------------------------------------------------------------------------------- other files
+
+
+def find_unplanned_files(scene: CheckedScene) -> Iterator[Finding]:
     """Yield files of jobs that are not committed, and files that are not ours."""
     left: dict[int, str] = {}
-    foreign = [
-        f"{scene.name}/{markers.COMMITTED}/{name}"
-        for name in scene.storage.names(f"{scene.name}/{markers.COMMITTED}")
-        if not re.fullmatch(r"\d+\.json", name)
-    ]
-    for folder, first_job, end_job, array in _array_folders(scene):
-        for name in sorted(set(scene.storage.names(folder)) - {"zarr.json"}):
-            number = name.split(".")[1] if name.startswith("c.") else ""
-            job = first_job + int(number) if number.isdecimal() else end_job
-            if job >= end_job or name != array.shard_name(job - first_job):
-                foreign.append(f"{folder}/{name}")
-            else:
-                left.setdefault(job, f"{folder}/{name}")
+    committed = f"{scene.name}/{markers.COMMITTED}"
+    names = scene.storage.names(committed)
+    foreign = [f"{committed}/{name}" for name in names if not re.fullmatch(r"\d+\.json", name)]
+    for plan in scene.plans or []:
+        for array in scene.arrays.values():
+            folder = f"{plan.folder}/{array.name}"
+            for name in sorted(set(scene.storage.names(folder)) - {"zarr.json"}):
+                number = name.split(".")[1] if name.startswith("c.") else ""
+                job = plan.first_job + int(number) if number.isdecimal() else plan.end_job
+                if job >= plan.end_job or name != array.shard_name(job - plan.first_job):
+                    foreign.append(f"{folder}/{name}")
+                else:
+                    left.setdefault(job, f"{folder}/{name}")
     for job in sorted(left.keys() - markers.list_jobs(scene.storage, scene.name)):  # now: a worker may have been at it
-        yield scene.finding(Cause.NO_MARKER, job, "not a sample yet", left[job])
-    yield from (Finding(Cause.FOREIGN_FILE, "left alone", scene.scene_id, file=file) for file in foreign)
-
-
-def _array_folders(scene: CheckTarget) -> Iterator[tuple[str, int, int, schema.ArraySchema]]:
-    arrays = scene.arrays.values()
-    return chain.from_iterable(
-        ((f"{plan.folder}/{array.name}", plan.first_job, plan.end_job, array) for array in arrays)
-        for plan in scene.plans or []
-    )
+        yield scene.finding(Cause.NO_MARKER, "not a sample yet", left[job], job=job)
+    yield from (scene.finding(Cause.FOREIGN_FILE, "left alone", file) for file in foreign)

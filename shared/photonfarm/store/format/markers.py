@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from photonfarm.core.errors import CorruptError, StoreError, store_errors
 from photonfarm.core.models import sentences
-from photonfarm.store.io.storage import Ordered, Storage, put_json
+from photonfarm.store.io.storage import Storage, put_json
 
 COMMITTED = "committed"
 _DIGITS = 12
@@ -40,40 +40,36 @@ class _File(_Stored):
     crc32c: Annotated[str, Field(pattern=r"^[0-9a-f]{8}$")]  # of its rows' checksums and its index's
 
 
-class _Figures(_Stored):
-    core_s: _Seconds
+class Figures(_Stored):
+    """The cost of a job, and what rendered it."""
+
+    core_s: _Seconds  # processor time, all threads
     wall_s: _Seconds
-    redrawn: Annotated[int, Field(ge=0)]
+    redrawn: Annotated[int, Field(ge=0)]  # renders thrown away for a non-finite value, and drawn again
     worker: str
-    versions: dict[str, str]  # of the packages that rendered
-    device: str = CPU  # what rendered
-    driver: str = ""
-    strategy: dict[str, Any] = {}
-    taken_over: Annotated[int, Field(ge=0)] = 0
+    versions: Mapping[str, str]  # of the packages that rendered
+    device: str = CPU  # what rendered; otherwise the name of a card
+    driver: str = ""  # the version of the card's driver
+    strategy: dict[str, Any] = {}  # how light was sampled, as `SceneSpec.strategy`
+    taken_over: Annotated[int, Field(ge=0)] = 0  # samples whose halves were copied from another scene
 
 
 class _Marker(_Stored):
     job: Annotated[int, Field(ge=0)]
     files: dict[_ShardName, _File] = Field(min_length=1)  # by path below the scene's folder
-    figures: _Figures
+    figures: Figures
 
 
 def marker_name(scene: str, job: int) -> str:
     """The name of a job's marker; `scene` is the scene's folder."""
-    return f"{scene}/{COMMITTED}/{marker_file(job)}"
-
-
-def marker_file(job: int) -> str:
-    """The file of a job's marker, in the folder of markers."""
-    return f"{job:0{_DIGITS}d}.json"
+    return f"{scene}/{COMMITTED}/{job:0{_DIGITS}d}.json"
 
 
 def place_marker(
-    storage: Storage, scene: str, job: int, files: Mapping[str, Mapping[str, Any]], figures: Mapping[str, Any]
+    storage: Storage, scene: str, job: int, files: Mapping[str, Mapping[str, Any]], figures: Figures
 ) -> bool:
-    """Place the marker of a job, whose files have settled; False if it was there already."""
-    below = {name.removeprefix(f"{scene}/"): about for name, about in files.items()}
-    return put_json(storage, {"job": job, "files": below, "figures": figures}, marker_name(scene, job))
+    """Place the marker of a job, whose files, named below the scene's folder, have settled; False if it was there."""
+    return put_json(storage, {"job": job, "files": files, "figures": figures.model_dump()}, marker_name(scene, job))
 
 
 def read_marker(storage: Storage, scene: str, job: int) -> dict[str, Any]:
@@ -82,49 +78,38 @@ def read_marker(storage: Storage, scene: str, job: int) -> dict[str, Any]:
     Raises CorruptError, with the file and the broken rule, for content that no job of ours has written.
     """
     name = marker_name(scene, job)
-    where = f"{storage.where}/{name}"
     try:
         content = storage.read(name)
     except OSError as error:
-        raise StoreError(f"{where}: cannot be read: {error.strerror}") from error
-    return parse_marker(content, job, where)
+        raise StoreError(f"{storage.where}/{name}: cannot be read: {error.strerror}") from error
+    return parse_marker(content, job, f"{storage.where}/{name}")
 
 
 def parse_marker(content: bytes, job: int, where: str) -> dict[str, Any]:
-    """The marker in a job's bytes, which are stored at `where`; raises CorruptError as `read` does."""
+    """The marker in a job's bytes, which are stored at `where`; raises CorruptError as `read_marker` does."""
     try:
-        document = json.loads(content)
-    except (ValueError, RecursionError) as error:
-        raise CorruptError(f"{where}: is not a marker: {error}") from error
-    return _check(document, job, where)
-
-
-def parse_files(content: bytes, scene: str, job: int) -> dict[str, dict[str, Any]]:
-    """The files that a marker names, with their sizes and checksums, by their names in the store; raises as `parse`."""
-    named = parse_marker(content, job, marker_name(scene, job))["files"]
-    return {f"{scene}/{name}": about for name, about in named.items()}
-
-
-def _check(document: Any, job: int, where: str) -> dict[str, Any]:
-    if not isinstance(document, dict):
-        raise CorruptError(f"{where}: is not a marker: it holds no JSON object")
-    try:
-        marker = _Marker.model_validate(document)
+        marker = _Marker.model_validate_json(content)
     except ValidationError as error:
         raise CorruptError(f"{where}: is not a marker: {'; '.join(sentences(error))}") from error
     if marker.job != job:
         raise CorruptError(f"{where}: is not a marker: job = {marker.job}: its name says {job}")
-    return document
+    return marker.model_dump(exclude_unset=True)
+
+
+def parse_files(content: bytes, scene: str, job: int) -> dict[str, dict[str, Any]]:
+    """The files that a marker names, with their sizes and checksums, by their names in the store."""
+    named = parse_marker(content, job, marker_name(scene, job))["files"]
+    return {f"{scene}/{name}": about for name, about in named.items()}
 
 
 def list_jobs(storage: Storage, scene: str) -> set[int]:
     """The jobs of a scene that have a marker; costs one listing."""
     with store_errors("list the markers", f"{storage.where}/{scene}"):
         names = storage.names(f"{scene}/{COMMITTED}")
-    return parse_jobs(names)
+    return _parse_jobs(names)
 
 
-def parse_jobs(names: Iterable[str]) -> set[int]:
+def _parse_jobs(names: Iterable[str]) -> set[int]:
     """The jobs of those names in a folder of markers that are names of markers."""
     return {int(found[1]) for name in names if (found := _NAME.fullmatch(name))}
 
@@ -160,15 +145,15 @@ class FollowedMarkers:
         In a bucket, one that was there at an earlier look is taken to be there for WHOLE_S, unless there is a doubt.
         """
         now = self._clock()
-        if not self._known or now >= self._whole_due or not isinstance(self._storage, Ordered):
+        if not self._known or now >= self._whole_due or not self._storage.lists_behind:
             self._known = list_jobs(self._storage, self._scene)
             self._whole_due = now + WHOLE_S
         else:
             with store_errors("look for markers", f"{self._storage.where}/{self._scene}"):
-                self._known |= self._new(self._storage)
+                self._known |= self._list_new()
         return set(self._known)
 
-    def _new(self, storage: Ordered) -> set[int]:
+    def _list_new(self) -> set[int]:
         """The jobs that were committed since the last look, by the fewest requests."""
         last = max(self._known)
         seen = np.zeros(last + 1, np.bool_)
@@ -177,8 +162,9 @@ class FollowedMarkers:
         behind = np.append(missing, last + 1) - 1  # for 0, 1, 2, … of the missing asked for: the name to list behind
         asked = int(np.argmin(np.arange(len(behind)) + (last - behind) // LISTED_AT_ONCE))
         new = {job for job in missing[:asked].tolist() if self._storage.exists(marker_name(self._scene, job))}
-        after = marker_file(int(behind[asked])) if behind[asked] >= 0 else ""
-        return new | parse_jobs(storage.names_behind(f"{self._scene}/{COMMITTED}", after))
+        after = int(behind[asked])
+        name = marker_name(self._scene, after).rpartition("/")[2] if after >= 0 else ""
+        return new | _parse_jobs(self._storage.names_behind(f"{self._scene}/{COMMITTED}", name))
 
 
 def withdrawn_file(plan: str) -> str:

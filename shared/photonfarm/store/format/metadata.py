@@ -1,20 +1,23 @@
-"""The checksums of a Zarr group's metadata: its attribute `checksums` has one of each zarr.json in it.
+"""Zarr groups: written whole, and read with the checksums of their metadata.
 
-Each is the CRC-32C of the file's bytes; that of the group's own zarr.json, which holds them, is of its bytes with zeros
-for the digits of that one.
+The attribute `checksums` of a group has the CRC-32C of each zarr.json in it; that of the group's own, which holds them,
+is of its bytes with zeros for the digits of that one.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import json
-from collections.abc import Mapping
+import threading
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import zarr
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import WrapperStore
+from zarr.storage import LocalStore, WrapperStore
 
 from photonfarm.store.format.declarations import check_version
 from photonfarm.store.format.shards import crc_of
@@ -27,8 +30,22 @@ ROOT = "zarr.json"
 _ZEROS = "0" * 8
 
 
+@contextlib.contextmanager
+def new_group(folder: Path, attributes: dict[str, Any]) -> Iterator[zarr.Group]:
+    """A new group to fill, in a folder that is not adopted yet; at the end it gets the checksums of its metadata.
+
+    After the block nothing more is written, however it ends.
+    """
+    store = _Part(LocalStore(folder))
+    try:
+        yield zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
+    finally:
+        store.end()
+    seal(folder)
+
+
 def seal(folder: Path) -> None:
-    """Write the checksums into a new group that is otherwise complete."""
+    """Write the checksums of the metadata into a group that is otherwise complete."""
     own = folder / ROOT
     document = json.loads(own.read_bytes())
     below = {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob(ROOT)) if path != own}
@@ -80,3 +97,44 @@ class _Checked(WrapperStore[Store]):
         if content is not None and key in self._checksums:
             _check(key, content.to_bytes(), self._checksums)
         return content
+
+
+class _Part(WrapperStore[LocalStore]):
+    """A folder that can be closed to its writers.
+
+    If the disk refuses one of several files, zarr-python raises at once and goes on with the others. They would make
+    the part's folder again after its removal.
+    """
+
+    def __init__(self, store: LocalStore) -> None:
+        super().__init__(store)
+        self._changed = threading.Condition()
+        self._at_work = 0
+        self._has_ended = False
+
+    async def set(self, key: str, value: Buffer) -> None:
+        with self._writing(key):
+            await super().set(key, value)
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        with self._writing(key):
+            await super().set_if_not_exists(key, value)
+
+    def end(self) -> None:
+        """Refuse new writes, and wait for those under way."""
+        with self._changed:
+            self._has_ended = True
+            self._changed.wait_for(lambda: not self._at_work)
+
+    @contextlib.contextmanager
+    def _writing(self, key: str) -> Iterator[None]:
+        with self._changed:
+            if self._has_ended:
+                raise OSError(errno.ECANCELED, "another file of the group could not be written", key)
+            self._at_work += 1
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._at_work -= 1
+                self._changed.notify_all()

@@ -9,7 +9,7 @@ in every chain, since Blosc alone lets flipped bits through.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -19,25 +19,17 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import CorruptError
 from photonfarm.core.records import LIT_POINTS
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store.format.declarations import OUTPUTS, ArrayDeclaration
+from photonfarm.store.format.declarations import FIELDS, OUTPUTS, ArrayDeclaration
 
 if TYPE_CHECKING:
     import zarr
 
     from photonfarm.store.io.storage import Storage
 
-from collections.abc import Sequence
-
-from photonfarm.core.records import F32
-
 RowKind = Literal["sample", "view", "modification"]
 
 INPUT_ROWS_PER_CHUNK = 65536
-BLOSC: dict[str, Any] = {
-    "cname": "lz4",
-    "clevel": 1,
-    "shuffle": "shuffle",
-}  # byte shuffle: floats compress by their exponents
+BLOSC: dict[str, Any] = {"cname": "lz4", "clevel": 1, "shuffle": "shuffle"}  # bytes: floats compress by exponents
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,12 +38,9 @@ class ArraySchema:
 
     name: str
     kind: RowKind
-    shape: tuple[int, ...]
+    shape: tuple[int, ...]  # of a row
     dtype: np.dtype[Any]
-    fill: float | int  # of unwritten rows; in `photon_bounce` and bits also a legal value of written ones
     compressed: bool
-    dimensions: tuple[str, ...]  # names of the axes after the row
-    attributes: dict[str, Any]
 
     def shard_name(self, job: int) -> str:
         """File name of one shard, counted within the plan, in the array's folder."""
@@ -63,8 +52,12 @@ def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
     points, photons = (-(-count // 8) for count in bit_counts(spec).values())
     lengths = {"H": spec.film.height, "W": spec.film.width, "K": spec.photons.slots}
     lengths |= {"⌈P/8⌉": points, "⌈K/8⌉": photons, "L": min(spec.points, LIT_POINTS)}
-    wanted = [each for each in OUTPUTS if all(lengths.get(str(n), 1) for n in each.shape)]
-    return {each.name: _resolve(each, lengths, spec) for each in wanted}
+    shapes = {each: tuple(n if isinstance(n, int) else lengths[n] for n in each.shape[1:]) for each in OUTPUTS}
+    return {
+        each.name: ArraySchema(each.name, cast("RowKind", each.axes[0]), shape, np.dtype(each.dtype), each.compressed)
+        for each, shape in shapes.items()
+        if all(shape)
+    }
 
 
 def bytes_of_rows(spec: SceneSpec) -> dict[RowKind, int]:
@@ -81,40 +74,26 @@ def bit_counts(spec: SceneSpec) -> dict[str, int]:
     return {"point_seen": spec.points, "photon_seen": spec.photons.slots}
 
 
-def _resolve(declared: ArrayDeclaration, lengths: Mapping[str, int], spec: SceneSpec) -> ArraySchema:
-    exponents = {"radiance": spec.radiance_exponent, "radiance_wide": 0}
-    scale = {"radiance_exponent": exponents[declared.name]} if declared.name in exponents else {}
-    return ArraySchema(
-        declared.name,
-        cast("RowKind", declared.axes[0]),
-        tuple(n if isinstance(n, int) else lengths[n] for n in declared.shape[1:]),
-        np.dtype(declared.dtype),
-        declared.fill,
-        declared.compressed,
-        declared.axes[1:],
-        {**declared.attributes, **scale},
-    )
-
-
 # ------------------------------------------------------------------------------------------------ arrays through zarr
 
 
-def create_outputs(group: zarr.Group, arrays: Iterable[ArraySchema], rows: int, shard_rows: int) -> None:
-    """Declare arrays of a plan's outputs at their full size; nothing is ever appended or resized."""
-    for array in arrays:
-        group.create_array(
-            array.name,
-            shape=(rows, *array.shape),
-            chunks=(1, *array.shape),
-            shards=(shard_rows, *array.shape),
-            dtype=array.dtype,
-            fill_value=array.fill,
-            compressors=_codecs(compressed=array.compressed),
-            filters=None,
-            dimension_names=(array.kind, *array.dimensions),
-            attributes=array.attributes,
-            chunk_key_encoding=_FLAT,
-        )
+def create_outputs(group: zarr.Group, spec: SceneSpec, rows: int, shard_rows: int) -> None:
+    """Declare the arrays of a plan's outputs at their full size; nothing is ever appended or resized."""
+    exponents = {"radiance": spec.radiance_exponent, "radiance_wide": 0}
+    arrays = output_arrays(spec)
+    for declared in OUTPUTS:
+        if (name := declared.name) in arrays:
+            shape = arrays[name].shape
+            scale = {"radiance_exponent": exponents[name]} if name in exponents else {}
+            group.create_array(
+                name,
+                shape=(rows, *shape),
+                chunks=(1, *shape),
+                shards=(shard_rows, *shape),
+                dtype=arrays[name].dtype,
+                attributes={**declared.attributes, **scale},
+                **_layout(declared),
+            )
 
 
 def create_input(
@@ -124,23 +103,31 @@ def create_input(
 
     `more` are attributes beside the declared ones.
     """
-    chunks = (min(max(len(data), 1), INPUT_ROWS_PER_CHUNK), *(max(n, 1) for n in data.shape[1:]))
     little = data.astype(declared.dtype, casting="equiv", copy=False)
     array = group.create_array(
         declared.name,
         shape=data.shape,
-        chunks=chunks,
+        chunks=(min(max(len(data), 1), INPUT_ROWS_PER_CHUNK), *(max(n, 1) for n in data.shape[1:])),
         dtype=little.dtype,
-        fill_value=declared.fill,
-        compressors=_codecs(compressed=declared.compressed),
-        filters=None,
-        dimension_names=declared.axes,
         attributes={**declared.attributes, **(more or {})},
-        chunk_key_encoding=_FLAT,
         config={"write_empty_chunks": True},
+        **_layout(declared),
     )
     if data.size:
         array[...] = little
+
+
+def _layout(declared: ArrayDeclaration) -> dict[str, Any]:
+    """How zarr-python stores an array."""
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    return {
+        "compressors": [*([BloscCodec(**BLOSC)] if declared.compressed else []), Crc32cCodec()],
+        "filters": None,
+        "fill_value": declared.fill,
+        "dimension_names": declared.axes,
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "."}},  # one folder, synced once
+    }
 
 
 def chunk_names(array: Any) -> Iterator[str]:
@@ -155,71 +142,17 @@ def read_input(storage: Storage, folder: str, array: Any) -> NDArray[Any]:
     """Read a whole array of inputs or of the base from its folder.
 
     Raises CorruptError for a missing chunk, which zarr would read as fill values, and ValueError, with the array's
-    name, for chunks that zarr cannot read.
+    name, for chunks that zarr cannot read and for columns that this program does not know.
     """
     held = set(storage.names(folder))
     for name in chunk_names(array):
         if name not in held:
             raise CorruptError(f"{storage.where}/{folder}/{name}: is missing")
+    known = [str(field["name"]) for field in FIELDS.get(folder.rpartition("/")[2], ())]
+    if known and (there := [field["name"] for field in array.attrs["fields"]]) != known:
+        raise ValueError(f"has the fields {there}, and this program reads {known}: install a newer photonfarm")
     try:
         return np.asarray(array[...])
     except (ValueError, KeyError, RuntimeError) as error:
         reason = str(error).partition(" Stored: b")[0].rstrip(".")  # bytes of checksums tell nobody anything
         raise ValueError(f"{array.path}: {reason}") from error
-
-
-_FLAT: Any = {"name": "default", "configuration": {"separator": "."}}  # c.0.0 in one folder, which is synced once
-
-
-def _codecs(*, compressed: bool) -> list[Any]:
-    from zarr.codecs import BloscCodec, Crc32cCodec
-
-    return [BloscCodec(**BLOSC), Crc32cCodec()] if compressed else [Crc32cCodec()]
-
-
-FIELDS = {
-    "modification": (
-        {"name": "x", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
-        {"name": "y", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
-        {"name": "z", "unit": "scene units", "rest": 0.0, "zero": "where the group was modelled"},
-        {"name": "present", "unit": "1", "rest": 1.0, "zero": "removed"},
-    ),
-    "view": tuple(
-        {"name": f"{point}_{axis}", "unit": "scene units", "rest": 0.0, "zero": "the origin of world coordinates"}
-        for point in ("origin", "look_at")
-        for axis in "xyz"
-    ),
-}
-"""What the columns of `modification`, for each group, and of `view` hold, by name; part of the format's version.
-
-More may follow; a plan names those it has. A field that a plan lacks is at `rest` in all of its rows. `zero` says what
-0 means.
-"""
-
-
-def vector_attributes(name: str, groups: Sequence[str]) -> dict[str, Any]:
-    """The attributes that describe the columns of an array of inputs; empty for one that holds no vectors."""
-    described: dict[str, Any] = {"fields": list(FIELDS[name])} if name in FIELDS else {}
-    return described | ({"groups": list(groups)} if name == "modification" else {})
-
-
-def select_columns(name: str, values: F32, attributes: Mapping[str, Any]) -> F32:
-    """Stored vectors (…, F) with the columns that this program knows; raises as `by_name` does."""
-    return select_by_name(values, [str(field["name"]) for field in attributes["fields"]], FIELDS[name])
-
-
-def select_by_name(values: F32, stored: Sequence[str], known: Sequence[Mapping[str, Any]]) -> F32:
-    """Vectors (…, F) whose columns have the names `stored`, with the `known` fields; those not stored are at rest.
-
-    Unused rows stay NaN. Raises ValueError for a field that is not known.
-    """
-    names = [field["name"] for field in known]
-    if list(stored) == names:
-        return values
-    if unknown := [name for name in stored if name not in names]:
-        raise ValueError(f"has the field {unknown[0]}, which this program does not know: install a newer photonfarm")
-    found = np.empty((*values.shape[:-1], len(names)), np.float32)
-    for place, field in enumerate(known):
-        at_rest = np.where(np.isnan(values[..., 0]), np.float32(np.nan), np.float32(field["rest"]))
-        found[..., place] = values[..., stored.index(field["name"])] if field["name"] in stored else at_rest
-    return found

@@ -4,21 +4,14 @@ A shard (Zarr v3 `sharding_indexed`, index at the end) is the inner chunks in an
 and length as little-endian uint64 (both 2^64 − 1 for an empty one), then the CRC-32C of that index. Each inner chunk
 is its bytes, compressed or not, then their CRC-32C. The tests compare with zarr-python and tensorstore.
 
-A row is read from the file the first time. Later, while the page cache holds it, it is copied out of a map of the file,
-which takes two thirds of the time. Otherwise reading is faster. It is safer, too: if the file is cut or its disk fails,
-reading raises an error, but a map ends the process.
-
 The end of the module says what becomes of values that are stored in fewer bits.
 """
 
 from __future__ import annotations
 
 import errno
-import mmap
 import os
-import threading
 import weakref
-from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +29,11 @@ _BLOSC_HEADER_BYTES = 16
 _FLUSH_BYTES = 4 << 20
 """The bytes after which the disk is asked to write them, so that little is left to the sync of a commit."""
 
+OPEN_SHARDS = 400
+"""The most shards that a reader keeps open, with a file descriptor each; a usual limit is 1024."""
+
 _DAMAGED = (errno.EIO, errno.EBADMSG, errno.EUCLEAN)
 """The errors of a file system for a file that exists but is damaged: a disk error, or a wrong checksum of its own."""
-
-_PIECE_BYTES = 256 << 10
-"""The bytes that are copied at a time, and then checked while the core's own cache still holds them."""
-
-_NO_WAIT: int | None = getattr(os, "RWF_NOWAIT", None)
-"""The flag to read only what the page cache holds. Only Linux has it; elsewhere nothing is mapped."""
 
 
 def encode(array: ArraySchema, values: NDArray[Any]) -> memoryview:
@@ -118,8 +108,6 @@ class Shard:
         self._array = array
         self._size = os.fstat(self._descriptor).st_size
         self._index: list[list[int]] = self._read_index(shard_rows)  # offset and length of each row
-        self._read_before = bytearray(shard_rows)
-        self._map: NDArray[np.uint8] | None = None
 
     def _read_index(self, shard_rows: int) -> list[list[int]]:
         wanted = 16 * shard_rows + _CRC_BYTES
@@ -168,17 +156,9 @@ class Shard:
         The check is on what is returned: the copy in memory, not the file that it was read from.
         """
         offset, length = self._index[row]
-        end, crc = offset + length - _CRC_BYTES, bytearray(_CRC_BYTES)
-        if (mapped := self._mapped(row, end, crc)) is None:
-            content = np.empty(length - _CRC_BYTES, np.uint8) if memory is None else memory
-            whole = self._read_at(offset, content.data, crc) == length and crc_of(content) == crc
-        elif memory is None:
-            content = mapped[offset:end]
-            whole = crc_of(content) == crc
-        else:
-            content = memory
-            whole = _copy(mapped[offset:end], memory) == crc
-        if not whole:
+        crc = bytearray(_CRC_BYTES)
+        content = np.empty(length - _CRC_BYTES, np.uint8) if memory is None else memory
+        if self._read_at(offset, content.data, crc) != length or crc_of(content) != crc:
             raise self._damaged(f"row {row} of the shard")
         return content
 
@@ -188,23 +168,6 @@ class Shard:
             return os.preadv(self._descriptor, memory, offset)
         except OSError as error:
             raise self._refused(error) from error
-
-    def _mapped(self, row: int, end: int, crc: bytearray) -> NDArray[np.uint8] | None:
-        """The file in memory, if the row should be taken from there, with the row's checksum read into `crc`.
-
-        If the checksum can be read without waiting, the row is in the page cache and the file has not been cut.
-        """
-        if not self._read_before[row] or _NO_WAIT is None:
-            self._read_before[row] = True
-            return None
-        try:
-            if os.preadv(self._descriptor, [crc], end, _NO_WAIT) != _CRC_BYTES:
-                return None
-            if self._map is None:
-                self._map = np.frombuffer(mmap.mmap(self._descriptor, self._size, prot=mmap.PROT_READ), np.uint8)
-        except (OSError, ValueError):  # not in the cache, no such reading or mapping on this file system, or cut
-            return None
-        return self._map
 
     def _decompress(self, content: NDArray[np.uint8], row: int, memory: NDArray[np.uint8]) -> None:
         """Decompress a row. If the sizes in Blosc's header are right, it writes no less and reads no more."""
@@ -233,61 +196,15 @@ class Shard:
         return {"size": os.fstat(self._descriptor).st_size, "crc32c": checksum.hex()}
 
 
-def _copy(content: NDArray[np.uint8], memory: NDArray[np.uint8]) -> bytes:
-    """Copy bytes; returns the CRC-32C of the copy."""
-    checksum = 0
-    for start in range(0, len(memory), _PIECE_BYTES):
-        piece = memory[start : start + _PIECE_BYTES]
-        np.copyto(piece, content[start : start + _PIECE_BYTES])
-        checksum = _crc32c(piece, checksum)
-    return checksum.to_bytes(_CRC_BYTES, "little")
-
-
 def crc_of(data: bytes | memoryview | NDArray[np.uint8]) -> bytes:
-    """The CRC-32C of contiguous bytes, as it is stored."""
-    return _crc32c(data).to_bytes(_CRC_BYTES, "little")
-
-
-def _crc32c(data: bytes | memoryview | NDArray[np.uint8], before: int = 0) -> int:
-    """The CRC-32C of contiguous bytes, after others with the checksum `before`.
+    """The CRC-32C of contiguous bytes, as it is stored.
 
     Of the kept libraries with this checksum, the AWS runtime's is ten times as fast as google-crc32c (60 against 6 GB/s
     in the cache) and lets other threads run meanwhile.
     """
     from awscrt.checksums import crc32c  # type: ignore[import-untyped]
 
-    return int(crc32c(data, before))
-
-
-OPEN_SHARDS = 400
-"""The most shards that a reader keeps open, with a file descriptor each, two once mapped; a usual limit is 1024."""
-
-
-class OpenShards:
-    """The most recently used shards, by array and job; a dropped one is closed once its last reader is done."""
-
-    def __init__(self) -> None:
-        self._shards: OrderedDict[tuple[str, int], Shard] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def get(self, key: tuple[str, int]) -> Shard | None:
-        """The shard of an array and a job; None if it is not open."""
-        with self._lock:
-            if key in self._shards:
-                self._shards.move_to_end(key)
-            return self._shards.get(key)
-
-    def put(self, key: tuple[str, int], shard: Shard) -> None:
-        """Keep a shard open, instead of the one that was used the longest ago."""
-        with self._lock:
-            self._shards[key] = shard
-            while len(self._shards) > OPEN_SHARDS:
-                self._shards.popitem(last=False)
-
-    def clear(self) -> None:
-        """Keep none."""
-        with self._lock:
-            self._shards.clear()
+    return int(crc32c(data)).to_bytes(_CRC_BYTES, "little")
 
 
 NOISY_GUIDES = ("direct", "gloss", "point_light")

@@ -29,6 +29,8 @@ _counter = itertools.count()
 class LocalStorage:
     """`storage.Storage` in a folder, which need not exist yet."""
 
+    lists_behind = False
+
     def __init__(self, root: Path, mark: str | None = None) -> None:
         """Take the folder, and the name of a file in it without which it counts as gone; None: it may be made."""
         self.root = root
@@ -45,6 +47,10 @@ class LocalStorage:
     def local(self, name: str) -> Path:
         """The file itself."""
         return self.root / name
+
+    def renew(self, name: str) -> bool:  # noqa: ARG002
+        """Do nothing: there are no copies."""
+        return False
 
     def read(self, name: str) -> bytes:
         """The bytes of a name; raises FileNotFoundError."""
@@ -66,6 +72,10 @@ class LocalStorage:
             if folder:  # the root is listed to see whether anything is there
                 self.require()
             return []
+
+    def names_behind(self, folder: str, name: str) -> list[str]:
+        """The names right below a folder that come after a name."""
+        return [each for each in self.names(folder) if each > name]
 
     def zarr(self, folder: str) -> LocalStore:
         """A folder in the form that zarr-python reads."""

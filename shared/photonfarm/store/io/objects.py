@@ -68,6 +68,8 @@ ROOT = "zarr.json"
 class ObjectStorage:
     """`storage.Storage` in a bucket, below a prefix. Endpoint and credentials come from the usual variables."""
 
+    lists_behind = True
+
     def __init__(self, url: str) -> None:
         """Take the bucket, without a request. Raises StoreError for an invalid URL."""
         self._url = url.rstrip("/")
@@ -87,9 +89,10 @@ class ObjectStorage:
         """A copy on this machine, fetched if there is none of the object's current version; always costs a request."""
         return self._copy(name)
 
-    def renew(self, name: str) -> None:
+    def renew(self, name: str) -> bool:
         """Fetch an object again: this machine's copy of it is or may be damaged."""
         self._copy(name, anew=True)
+        return True
 
     def _copy(self, name: str, *, anew: bool = False) -> Path:
         with os_errors(name):
@@ -155,14 +158,7 @@ class ObjectStorage:
 
         Costs a request per thousand of these names. There are none if the store is gone.
         """
-        offset = f"{folder}/{name}"
-        with os_errors(folder):
-            found = patiently(
-                lambda: [
-                    about["path"] for batch in obstore.list(self._objects, folder, offset=offset) for about in batch
-                ]
-            )
-        return [path.rpartition("/")[2] for path in found]
+        return [path.rpartition("/")[2] for path in self._below(folder, f"{folder}/{name}")]
 
     def zarr(self, folder: str) -> ObjectStore[Any]:
         """A folder in the form that zarr-python reads."""
@@ -242,11 +238,13 @@ class ObjectStorage:
         for name in self._below(folder):
             self.delete(name)
 
-    def _below(self, folder: str) -> list[str]:
-        """The names of all objects below a folder."""
+    def _below(self, folder: str, offset: str | None = None) -> list[str]:
+        """The names of all objects below a folder, or of those that come after an offset."""
         with os_errors(folder):
             return patiently(
-                lambda: [about["path"] for batch in obstore.list(self._objects, folder) for about in batch]
+                lambda: [
+                    about["path"] for batch in obstore.list(self._objects, folder, offset=offset) for about in batch
+                ]
             )
 
     def settle(self, names: Iterable[str]) -> None:

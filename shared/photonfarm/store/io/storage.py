@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.errors import CorruptError, StoreError, store_errors
 
 if TYPE_CHECKING:
     import zarr.abc.store
@@ -38,8 +38,14 @@ class Storage(Protocol):
     def where(self) -> str:
         """The store's folder or URL, for messages."""
 
+    lists_behind: bool
+    """Whether names are listed in order, so that listing those behind a name costs nothing for those before it."""
+
     def local(self, name: str) -> Path:
         """A file of this machine with the bytes of a name; it may be missing if the name is."""
+
+    def renew(self, name: str) -> bool:
+        """Make this machine's damaged copy of a name again; False if `local` gives the file itself."""
 
     def read(self, name: str) -> bytes:
         """The bytes of a name; raises FileNotFoundError."""
@@ -52,6 +58,9 @@ class Storage(Protocol):
 
     def names(self, folder: str) -> list[str]:
         """The last parts of the names and folders right below a folder, in no order; none if it does not exist."""
+
+    def names_behind(self, folder: str, name: str) -> list[str]:
+        """The names right below a folder without folders that come after a name, which need not be there."""
 
     def zarr(self, folder: str) -> zarr.abc.store.Store:
         """A folder in the form that zarr-python reads."""
@@ -99,28 +108,20 @@ class Storage(Protocol):
         """Raise StoreError if the store is gone, so that its files are not taken for missing."""
 
 
-@runtime_checkable
-class Copying(Protocol):
-    """A storage whose `local` files are copies, which may be damaged while the store is whole."""
-
-    def renew(self, name: str) -> None:
-        """Make the copy of a name again, as `local` made it."""
+T = TypeVar("T")
 
 
-@runtime_checkable
-class Ordered(Protocol):
-    """A storage that lists names in order: listing those behind a name costs nothing for those before it."""
+def look_into(storage: Storage, name: str, look: Callable[[Path], T]) -> T:
+    """What `look` gives for a file of the store; if it finds a damaged copy of this machine, for a new copy.
 
-    def names_behind(self, folder: str, name: str) -> list[str]:
-        """The names right below a folder without folders that come after a name, which need not be there."""
-
-
-def renew_copy(storage: Storage, name: str) -> bool:
-    """Make this machine's damaged copy of a name again; False if the storage has no copies."""
-    if not isinstance(storage, Copying):
-        return False
-    storage.renew(name)
-    return True
+    Raises CorruptError if the store's own bytes are damaged.
+    """
+    try:
+        return look(storage.local(name))
+    except CorruptError:
+        if not storage.renew(name):
+            raise
+    return look(storage.local(name))
 
 
 SCHEMES = ("s3", "gs", "az")

@@ -10,18 +10,17 @@ import contextlib
 import queue
 import threading
 from collections.abc import Callable, Mapping, Set
-from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from types import TracebackType
-from typing import Any, Protocol, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, IncompleteError, store_errors
 from photonfarm.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.format import markers, schema
+from photonfarm.store.format.markers import Figures
 from photonfarm.store.format.shards import (
     NOISY_GUIDES,
     Shard,
@@ -31,10 +30,11 @@ from photonfarm.store.format.shards import (
     scale_to_array,
     stays_finite,
 )
-from photonfarm.store.io.storage import Storage, discard, renew_copy
+from photonfarm.store.io.storage import discard, look_into
 from photonfarm.store.model.findings import Cause, Finding
 from photonfarm.store.model.plans import JobRows
 from photonfarm.store.model.quarantine import Quarantine
+from photonfarm.store.model.scene_store import SceneStore
 
 WAITING_ROWS = 8
 """The most rows that wait to be written: more would only hide for a while that the disk is slower than the renderer."""
@@ -46,55 +46,11 @@ ATTEMPTS = 3
 """The attempts to commit while other processes change the job's files; a second such change takes two attempts."""
 
 
-@dataclass(frozen=True, slots=True)
-class Figures:
-    """The cost of a job, and its worker; kept in its marker."""
-
-    core_s: float  # processor time, all threads
-    wall_s: float
-    redrawn: int  # renders thrown away for a non-finite value, and drawn again with another seed
-    worker: str
-    versions: Mapping[str, str]
-    device: str = markers.CPU  # what rendered; otherwise the name of a card
-    driver: str = ""  # the version of the card's driver
-    strategy: Mapping[str, Any] = field(default_factory=dict)  # how light was sampled, as `SceneSpec.strategy`
-    taken_over: int = 0  # samples whose halves were copied from another scene
-
-
 Clock = Callable[[], datetime]
 
 
 def _utc_now() -> datetime:
     return datetime.now(UTC)
-
-
-class CommitTarget(Protocol):
-    """The scene that a job is committed to."""
-
-    @property
-    def storage(self) -> Storage:
-        """The storage of its files."""
-
-    @property
-    def name(self) -> str:
-        """The name of its folder."""
-
-    @property
-    def scene_id(self) -> str:
-        """The scene's id."""
-
-    @property
-    def spec(self) -> SceneSpec:
-        """The scene's spec."""
-
-    def is_committed(self, job: int) -> bool:
-        """Whether a job has its marker."""
-
-    def is_forgotten(self, rows: JobRows) -> bool:
-        """Whether the scene was forgotten since a job was planned with these rows."""
-
-    def is_still_to_do(self, rows: JobRows) -> bool:
-        """Whether a job is planned with these rows, and neither committed nor withdrawn."""
 
 
 class JobWriter:
@@ -108,14 +64,15 @@ class JobWriter:
     StoreError once the disk has refused something.
     """
 
-    def __init__(self, scene: CommitTarget, rows: JobRows) -> None:
-        """Begin; `SceneStore.job_writer` calls this."""
+    def __init__(self, scene: SceneStore, rows: JobRows) -> None:
+        """Begin a job of a scene, with its rows."""
         self._scene = scene
         self._rows = rows
         self._plan = rows.plan
         self._storage = scene.storage
         self._arrays = schema.output_arrays(scene.spec)
-        self._given: dict[str, set[int]] = {"sample": set(), "view": set(), "modification": set()}
+        self._wanted: dict[schema.RowKind, set[int]] = rows.wanted(photons=bool(scene.spec.photons.paths))
+        self._missing = {kind: set(wanted) for kind, wanted in self._wanted.items()}
         self._shards: dict[str, ShardWriter] = {}
         self._waiting: queue.Queue[tuple[str, int, memoryview] | None] = queue.Queue(WAITING_ROWS)
         self._error: Exception | None = None
@@ -140,12 +97,12 @@ class JobWriter:
 
     def radiance(self, row: int, halves: F32) -> None:
         """Add the half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
-        self._claim("sample", row, "radiance", {sample.row for sample in self._rows.samples})
+        self._claim("sample", row)
         self._put(row, *scale_to_array(halves, self._scene.spec.radiance_exponent))
 
     def view(self, row: int, buffers: ViewBuffers, guides: Guides, visibility: Visibility) -> None:
         """Add a new view row: its buffers, its guides, and which points and photons it sees."""
-        self._claim("view", row, "view", self._rows.new_views)
+        self._claim("view", row)
         for name, values in arrays_of(buffers).items():
             self._put(row, name, values)
         for name, values in arrays_of(guides).items():
@@ -155,12 +112,9 @@ class JobWriter:
 
     def photons(self, row: int, photons: Photons) -> None:
         """Add the photons of a new modification row."""
-        self._claim("modification", row, "photons", self._photon_rows())
+        self._claim("modification", row)
         for name, values in arrays_of(photons).items():
             self._put(row, f"photon_{name}", values)
-
-    def _photon_rows(self) -> frozenset[int]:
-        return self._rows.new_modifications if self._scene.spec.photons.paths else frozenset()
 
     def _put_bits(self, row: int, name: str, seen: NDArray[np.bool_]) -> None:
         count = schema.bit_counts(self._scene.spec)[name]
@@ -169,10 +123,10 @@ class JobWriter:
         if count:
             self._put(row, name, np.packbits(seen, bitorder="little"))
 
-    def _claim(self, kind: schema.RowKind, row: int, what: str, expected: set[int] | frozenset[int]) -> None:
-        if row not in expected or row in self._given[kind]:
-            raise IncompleteError(f"{what} of job {self._rows.job}: row {row} is not the job's, or is there already")
-        self._given[kind].add(row)
+    def _claim(self, kind: schema.RowKind, row: int) -> None:
+        if row not in self._missing[kind]:
+            raise IncompleteError(f"{kind} {row} of job {self._rows.job}: is not the job's, or is there already")
+        self._missing[kind].remove(row)
 
     def _put(self, row: int, name: str, values: NDArray[Any]) -> None:
         array = self._arrays[name]
@@ -224,7 +178,9 @@ class JobWriter:
         and checks afterwards, so that one of them sees the other: whoever met a foreign file compares marker and files
         after placing the marker.
         """
-        self._check_complete()
+        for kind, missing in self._missing.items():
+            if missing:
+                raise IncompleteError(f"{kind} {min(missing)} of job {self._rows.job}: is missing")
         self._join()
         self._raise_error()
         with self._errors():
@@ -239,7 +195,8 @@ class JobWriter:
                 self._storage.settle([self._file(name) for name in described])
                 if not alone and not (self._is_readable() and self._summaries() == described):
                     continue
-                placed = self._place(described, figures)
+                files = {self._plan_file(name): about for name, about in described.items()}
+                placed = markers.place_marker(self._storage, self._scene.name, self._rows.job, files, figures)
                 if self._scene.is_forgotten(self._rows):  # while this process was suspended: nothing here is the plan's
                     for name in (*map(self._file, described), markers.marker_name(self._scene.name, self._rows.job)):
                         self._storage.delete(name)
@@ -280,10 +237,6 @@ class JobWriter:
                     found[name] = self._look(name, Shard.summary)
         return found
 
-    def _place(self, described: Mapping[str, Mapping[str, Any]], figures: Figures) -> bool:
-        files = {self._file(name): about for name, about in described.items()}
-        return markers.place_marker(self._storage, self._scene.name, self._rows.job, files, asdict(figures))
-
     def _is_marker_right(self, clock: Clock) -> bool:
         """Whether the job's marker, ours or not, matches the files that are there; one that does not is set aside.
 
@@ -297,7 +250,7 @@ class JobWriter:
             return False
         named = markers.parse_marker(marker, self._rows.job, f"{self._storage.where}/{name}")["files"]
         wrong = self._mismatched(named)
-        renewed = [renew_copy(self._storage, self._file(name)) for name in wrong]  # all of them, damaged or not
+        renewed = [self._storage.renew(self._file(name)) for name in wrong]  # all of them, damaged or not
         if any(renewed):
             wrong = self._mismatched(named)
         if not wrong:
@@ -317,32 +270,13 @@ class JobWriter:
     def _plan_file(self, name: str) -> str:
         return self._file(name).removeprefix(f"{self._scene.name}/")
 
-    def _expected(self) -> dict[schema.RowKind, tuple[str, Set[int]]]:
-        return {
-            "sample": ("radiance", {sample.row for sample in self._rows.samples}),
-            "view": ("view", self._rows.new_views),
-            "modification": ("photons", self._photon_rows()),
-        }
-
-    def _check_complete(self) -> None:
-        for kind, (what, rows) in self._expected().items():
-            if missing := rows - self._given[kind]:
-                raise IncompleteError(f"{what} of job {self._rows.job}: row {min(missing)} is missing")
-
     def _file(self, name: str) -> str:
         return self._plan.shard(name, self._arrays[name], self._rows.job)
 
-    def _shard(self, name: str) -> Shard:
-        return Shard(self._storage.local(self._file(name)), self._arrays[name], self._plan.shard_rows)
-
     def _look(self, name: str, look: Callable[[Shard], T]) -> T:
         """Apply `look` to an array's file; in a bucket, to a new copy if this machine's is damaged."""
-        try:
-            return look(self._shard(name))
-        except CorruptError:
-            if not renew_copy(self._storage, self._file(name)):
-                raise
-        return look(self._shard(name))
+        array, rows = self._arrays[name], self._plan.shard_rows
+        return look_into(self._storage, self._file(name), lambda file: look(Shard(file, array, rows)))
 
     def _is_readable(self) -> bool:
         try:
@@ -353,11 +287,10 @@ class JobWriter:
 
     def _check_readable(self) -> None:
         """Read every row of the job from the files that are there; raises CorruptError if one is damaged or missing."""
-        wanted = {"view": self._rows.new_views, "modification": self._rows.new_modifications}
         for name, array in self._arrays.items():
             if array.kind != "sample":
-                self._check_rows(name, wanted[array.kind])
-        samples = {sample.row for sample in self._rows.samples}
+                self._check_rows(name, self._wanted[array.kind])
+        samples = self._wanted["sample"]
         if self._storage.exists(self._file("radiance")):
             samples = self._check_rows("radiance", samples, may_be_missing=True)
         self._check_rows("radiance_wide", samples)

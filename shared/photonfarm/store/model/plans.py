@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,6 @@ from pydantic import Field, TypeAdapter, ValidationError
 from photonfarm.core.errors import CorruptError, SpecError, store_errors
 from photonfarm.core.keys import Key
 from photonfarm.core.models import sentences
-from photonfarm.core.records import F32
 from photonfarm.plan.joined import Joined
 from photonfarm.plan.request import (
     UNUSED,
@@ -45,23 +44,31 @@ FORGOTTEN = "forgotten."
 INPUTS = [field.name for field in fields(PlannedRows)]
 """The names of a plan's arrays of inputs."""
 
-_REQUEST: TypeAdapter[Request | TopUp | Joined] = TypeAdapter(
-    Annotated[Request | TopUp | Joined, Field(discriminator="kind")]
-)
+AnyRequest: TypeAlias = Request | TopUp | Joined
+
+_REQUEST: TypeAdapter[AnyRequest] = TypeAdapter(Annotated[AnyRequest, Field(discriminator="kind")])
+
+
+@dataclass(frozen=True, slots=True)
+class PlanAttributes:
+    """The attributes of a plan's group."""
+
+    request: AnyRequest
+    first_job: int
+    jobs: int
+    shard_rows: int
+    radiance_exponent: int  # the power of two by which radiance is stored
+    halves_from: str | None  # another scene, whose halves its jobs take over
+    checksums: Mapping[str, str]  # of each zarr.json, by its name in the folder
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class StoredPlan:
+class StoredPlan(PlanAttributes):
     """One plan of a scene with its inputs."""
 
     number: int
     folder: str  # its name in the storage
-    request: Request | TopUp | Joined
-    first_job: int
-    jobs: int
-    shard_rows: int
     rows: PlannedRows
-    halves_from: str | None = None  # another scene, whose halves its jobs take over
     withdrawn: frozenset[int] = frozenset()  # jobs whose rows count as unused
     named: int = 0  # samples that it was made with, withdrawn or not
     forgotten: int = 0  # how often the scene had been forgotten when it was made
@@ -82,6 +89,11 @@ class StoredPlan:
         return self.end_job * self.shard_rows
 
     @property
+    def own_jobs(self) -> range:
+        """The numbers of its jobs."""
+        return range(self.first_job, self.end_job)
+
+    @property
     def samples(self) -> int:
         """The number of samples that it holds; the rest of its last job's rows is unused."""
         return int(np.count_nonzero(self.rows.sample_modification != UNUSED))
@@ -94,19 +106,6 @@ class StoredPlan:
     def shard(self, name: str, array: schema.ArraySchema, job: int) -> str:
         """The file of one job's rows of an array."""
         return f"{self.folder}/{name}/{array.shard_name(job - self.first_job)}"
-
-
-@dataclass(frozen=True, slots=True)
-class PlanAttributes:
-    """The attributes of a plan's group."""
-
-    request: Request | TopUp | Joined
-    first_job: int
-    jobs: int
-    shard_rows: int
-    radiance_exponent: int  # the power of two by which radiance is stored
-    halves_from: str | None
-    checksums: Mapping[str, str]  # of each zarr.json, by its name in the folder
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +131,15 @@ class JobRows:
     new_modifications: frozenset[int]  # rows whose photons this job produces
     new_views: frozenset[int]  # rows whose buffers this job produces
 
+    def wanted(self, *, photons: bool = True) -> dict[schema.RowKind, set[int]]:
+        """The rows that the job stores of each kind; of modifications none in a scene without `photons`."""
+        modifications = set(self.new_modifications) if photons else set()
+        return {
+            "sample": {each.row for each in self.samples},
+            "view": set(self.new_views),
+            "modification": modifications,
+        }
+
 
 def folder(scene: str, number: int) -> str:
     """The folder of a plan, in the scene's."""
@@ -144,7 +152,7 @@ def content(plans: list[StoredPlan]) -> PlannedContent:
 
 
 def expand_again(
-    spec: SceneSpec, request: Request | TopUp | Joined, before: list[StoredPlan], *, first_job: int, shard_rows: int
+    spec: SceneSpec, request: AnyRequest, before: list[StoredPlan], *, first_job: int, shard_rows: int
 ) -> Expansion:
     """The rows of a request that the earlier plans do not have: a function of these, the same each time.
 
@@ -161,7 +169,7 @@ def expand_again(
 def build(
     part: Path,
     spec: SceneSpec,
-    request: Request | TopUp | Joined,
+    request: AnyRequest,
     rows: PlannedRows,
     *,
     first_job: int,
@@ -169,10 +177,7 @@ def build(
     halves_from: str | None = None,
 ) -> None:
     """Write a complete plan into a new folder: its inputs, and its outputs declared at full size."""
-    import zarr
-
-    from photonfarm.store.format.metadata import seal
-    from photonfarm.store.model.staging import group_in
+    from photonfarm.store.format.metadata import new_group
 
     count = len(rows.sample_modification)
     attributes: Any = {
@@ -189,13 +194,11 @@ def build(
         "shard_rows": shard_rows,
         **({} if halves_from is None else {"halves_from": halves_from}),
     }
-    with group_in(part) as store:
-        group = zarr.open_group(store, mode="w-", zarr_format=3, attributes=attributes)
+    with new_group(part, attributes) as group:
         for declared in declarations.PLAN_INPUTS:
-            more = schema.vector_attributes(declared.name, [each.name for each in spec.groups])
+            more = declarations.vector_attributes(declared.name, [each.name for each in spec.groups])
             schema.create_input(group, declared, getattr(rows, declared.name), more)
-        schema.create_outputs(group, schema.output_arrays(spec).values(), count, shard_rows)
-    seal(part)
+        schema.create_outputs(group, spec, count, shard_rows)
 
 
 def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: int | None = None) -> list[StoredPlan]:
@@ -253,13 +256,13 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     name = folder(scene, number)
     group, about = open_plan(storage, name)
     with _unreadable(storage, name, rewritten(about.request)):
-        rows = PlannedRows(*(_input(storage, name, group, each) for each in INPUTS))
+        rows = PlannedRows(*(schema.read_input(storage, f"{name}/{each}", group[each]) for each in INPUTS))
+    known = {each.name: getattr(about, each.name) for each in fields(about)}
     named = int(np.count_nonzero(rows.sample_modification != UNUSED))
-    numbers = about.first_job, about.jobs, about.shard_rows
-    return StoredPlan(number, name, about.request, *numbers, rows, about.halves_from, named=named)
+    return StoredPlan(**known, number=number, folder=name, rows=rows, named=named)
 
 
-def rewritten(request: Request | TopUp | Joined) -> str:
+def rewritten(request: AnyRequest) -> str:
     """The remedy for damaged inputs of a plan."""
     return findings.rejoin(request.store) if isinstance(request, Joined) else findings.REWRITE
 
@@ -270,13 +273,11 @@ def open_plan(storage: Storage, name: str) -> tuple[Any, PlanAttributes]:
 
     with _unreadable(storage, name, findings.RESTORE):
         group, checksums = open_group(storage, name)
-        return group, _about_plan(dict(group.attrs), checksums)
-
-
-def _input(storage: Storage, folder: str, group: Any, name: str) -> NDArray[Any]:
-    """An array of inputs; one of vectors has the columns that this program knows, in their order."""
-    values = schema.read_input(storage, f"{folder}/{name}", group[name])
-    return schema.select_columns(name, values, group[name].attrs) if name in schema.FIELDS else values
+        attributes = dict(group.attrs)
+        request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
+        numbers = {name: int(attributes[name]) for name in ("first_job", "jobs", "shard_rows", "radiance_exponent")}
+        others = attributes.get("halves_from")
+        return group, PlanAttributes(request=request, **numbers, halves_from=others, checksums=checksums)
 
 
 @contextlib.contextmanager
@@ -295,15 +296,6 @@ def reason(error: Exception) -> str:
     if isinstance(error, ValidationError):
         return "; ".join(sentences(error))
     return f"{error.args[0]} is missing" if isinstance(error, KeyError) else str(error)
-
-
-def _about_plan(attributes: dict[str, Any], checksums: Mapping[str, str]) -> PlanAttributes:
-    """Read the attributes of a plan's group; raises ValueError or KeyError."""
-    request = _REQUEST.validate_python(attributes["request"], extra="ignore")  # a later program may add keys
-    first_job, jobs, shard_rows, exponent = (
-        int(attributes[name]) for name in ("first_job", "jobs", "shard_rows", "radiance_exponent")
-    )
-    return PlanAttributes(request, first_job, jobs, shard_rows, exponent, attributes.get("halves_from"), checksums)
 
 
 def plan_of(plans: list[StoredPlan], row: int) -> StoredPlan:
@@ -326,51 +318,28 @@ def view_at(plans: list[StoredPlan], row: int) -> View:
     return View.from_vector(plan.rows.view[row - plan.first_row])
 
 
-def vectors_at(plans: list[StoredPlan], kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
-    """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
-    return content(plans).vectors(kind, rows)
-
-
 def sample_at(plans: list[StoredPlan], row: int) -> SampleRow | None:
     """The inputs of the sample in a row; None for an unused row."""
     plan = plan_of(plans, row)
-    return _samples(plan, range(row, row + 1))[0]
-
-
-def _samples(plan: StoredPlan, rows: range) -> list[SampleRow | None]:
-    """The inputs of the samples in some rows of a plan, None for unused ones."""
-    own, inputs = slice(rows.start - plan.first_row, rows.stop - plan.first_row), plan.rows
-    modification, view, pass_ = (
-        each[own].tolist() for each in (inputs.sample_modification, inputs.sample_view, inputs.sample_pass)
-    )
-    keys = inputs.sample_key[own]
-    return [
-        None if modification[i] == UNUSED else SampleRow(row, modification[i], view[i], pass_[i], keys[i].tobytes())
-        for i, row in enumerate(rows)
-    ]
+    own, inputs = row - plan.first_row, plan.rows
+    if inputs.sample_modification[own] == UNUSED:
+        return None
+    modification, view, pass_ = inputs.sample_modification[own], inputs.sample_view[own], inputs.sample_pass[own]
+    return SampleRow(row, int(modification), int(view), int(pass_), inputs.sample_key[own].tobytes())
 
 
 def job_rows(plans: list[StoredPlan], job: int) -> JobRows:
     """The inputs and outputs of one job; raises IndexError for a job of no plan."""
-    for plan in plans:
-        if plan.first_job <= job < plan.first_job + plan.jobs:
-            break
-    else:
+    plan = next((plan for plan in plans if job in plan.own_jobs), None)
+    if plan is None:
         raise IndexError(f"job {job} belongs to no plan of this scene")
     own = range(job * plan.shard_rows, (job + 1) * plan.shard_rows)
-    samples = [sample for sample in _samples(plan, own) if sample]
+    samples = [sample for row in own if (sample := sample_at(plans, row))]
     samples.sort(key=lambda s: (s.modification_row, s.view_row, s.pass_))
     modifications = {s.modification_row: modification_at(plans, s.modification_row) for s in samples}
     views = {s.view_row: view_at(plans, s.view_row) for s in samples}
-    return JobRows(
-        plan,
-        job,
-        tuple(samples),
-        modifications,
-        views,
-        frozenset(row for row in modifications if row in own),
-        frozenset(row for row in views if row in own),
-    )
+    new = (frozenset(row for row in rows if row in own) for rows in (modifications, views))
+    return JobRows(plan, job, tuple(samples), modifications, views, *new)
 
 
 def complete_rows(plans: list[StoredPlan], committed: set[int]) -> NDArray[np.bool_]:
@@ -380,17 +349,9 @@ def complete_rows(plans: list[StoredPlan], committed: set[int]) -> NDArray[np.bo
     """
     if not plans:
         return np.zeros(0, np.bool_)
-    shard_rows = plans[0].shard_rows
-    done = np.zeros(plans[-1].first_job + plans[-1].jobs, np.bool_)
+    shard_rows, inputs = plans[0].shard_rows, content(plans)
+    done = np.zeros(plans[-1].end_job, np.bool_)
     done[[job for job in committed if job < len(done)]] = True
-    complete = np.zeros(plans[-1].end_row, np.bool_)
-    for plan in plans:
-        modification, view = plan.rows.sample_modification, plan.rows.sample_view
-        own = np.arange(plan.first_row, plan.end_row)
-        complete[plan.first_row : plan.end_row] = (
-            (modification != UNUSED)
-            & done[own // shard_rows]
-            & done[view // shard_rows]
-            & done[modification // shard_rows]
-        )
-    return complete
+    modification, view = inputs.column("sample_modification"), inputs.column("sample_view")
+    own = done.repeat(shard_rows)
+    return (modification != UNUSED) & own & done[view // shard_rows] & done[modification // shard_rows]

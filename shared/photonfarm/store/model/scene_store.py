@@ -8,8 +8,8 @@ from __future__ import annotations
 import contextlib
 import re
 import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +20,11 @@ from pydantic import ValidationError
 from photonfarm.core.errors import CorruptError, SpecError, StoreError, store_errors
 from photonfarm.core.models import sentences
 from photonfarm.core.records import BasePointCloud, Geometry
-from photonfarm.plan.joined import Joined
 from photonfarm.plan.request import (
     MAX_SHARD_ROWS,
     SHARD_ROWS,
     Extent,
     PlannedContent,
-    Request,
     SamplesToPlan,
     expand_samples,
 )
@@ -36,8 +34,7 @@ from photonfarm.store.format import declarations, markers, schema
 from photonfarm.store.format.markers import FollowedMarkers
 from photonfarm.store.io.storage import Storage, put_json
 from photonfarm.store.model import findings, plans
-from photonfarm.store.model.commit import JobWriter
-from photonfarm.store.model.plans import JobRows, StoredPlan
+from photonfarm.store.model.plans import AnyRequest, JobRows, StoredPlan
 
 SCENES = "scenes"
 
@@ -98,7 +95,7 @@ class SceneStore:
 
     def plan(
         self,
-        request: Request | TopUp | Joined,
+        request: AnyRequest,
         *,
         shard_rows: int | None = None,
         usual_rows: int = SHARD_ROWS,
@@ -109,9 +106,9 @@ class SceneStore:
         """Plan the new samples of a request; concurrent submitters try again, each after the other's plan.
 
         `halves_from` is the id of a scene with the same radiance id, whose halves the jobs take over. `samples`
-        gives what is to be planned, instead of the request, from what is planned already. Callers are `at_work` in the
-        scene, or have its lease. Raises SpecError for an
-        invalid request or number of rows, and CorruptError if a plan is missing.
+        gives what is to be planned, instead of the request, from what is planned already. Callers are at work in the
+        scene, or have its lease. Raises SpecError for an invalid request or number of rows, and CorruptError if a plan
+        is missing.
         """
         while True:
             last = max(markers.list_jobs(self.storage, self.name), default=-1)
@@ -128,18 +125,23 @@ class SceneStore:
                 expansion = plans.expand_again(self.spec, request, found, **numbers)
             else:
                 expansion = expand_samples(samples(plans.content(found)), **numbers)
+            result = PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
             if expansion.rows is None or dry_run:
-                return PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
-            with store_errors("write a plan", self.storage.where):
-                built = self.storage.part()
-                try:
-                    plans.build(built, self.spec, request, expansion.rows, **numbers, halves_from=halves_from)
-                    if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
-                        jobs = len(expansion.rows.sample_pass) // rows_per_job
-                        new, known, extent = expansion.new, expansion.known, expansion.extent
-                        return PlanResult(self.scene_id, len(found), new, known, jobs, extent)
-                finally:
-                    shutil.rmtree(built, ignore_errors=True)
+                return result
+            with store_errors("write a plan", self.storage.where), self._building() as built:
+                plans.build(built, self.spec, request, expansion.rows, **numbers, halves_from=halves_from)
+                if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
+                    jobs = len(expansion.rows.sample_pass) // rows_per_job
+                    return replace(result, plan=len(found), jobs=jobs)
+
+    @contextlib.contextmanager
+    def _building(self) -> Iterator[Path]:
+        """A folder to build that is removed again unless it is adopted."""
+        built = self.storage.part()
+        try:
+            yield built
+        finally:
+            shutil.rmtree(built, ignore_errors=True)
 
     def _shard_rows(self, found: list[StoredPlan], wanted: int | None, usual: int) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
@@ -157,13 +159,9 @@ class SceneStore:
 
     def job_rows(self, job: int) -> JobRows:
         """The inputs and outputs of a job; raises IndexError for a job of no plan."""
-        if not any(plan.first_job <= job < plan.end_job for plan in self._plans):
+        if not any(job in plan.own_jobs for plan in self._plans):
             self.plans()
         return plans.job_rows(self._plans, job)
-
-    def job_writer(self, rows: JobRows) -> JobWriter:
-        """A writer that takes the outputs of a job with these rows, and commits them."""
-        return JobWriter(self, rows)
 
     def jobs(self) -> int:
         """The number of planned jobs; they are numbered from 0."""
@@ -239,15 +237,17 @@ class SceneStore:
 
     def write_base(self, geometry: Geometry, cloud: BasePointCloud) -> None:
         """Store geometry and base point cloud; the first ones written stay."""
+        from photonfarm.store.format.metadata import new_group
+
         if self.has_base():
             return
-        with store_errors("write the base", self.storage.where):
-            built = self.storage.part()
-            try:
-                _build_base(built, {"geometry": geometry, "cloud": cloud})
-                self.storage.adopt_folder(built, f"{self.name}/base")
-            finally:
-                shutil.rmtree(built, ignore_errors=True)
+        with store_errors("write the base", self.storage.where), self._building() as built:
+            with new_group(built, declarations.stamp()) as root:
+                for name, record in (("geometry", geometry), ("cloud", cloud)):
+                    group = root.create_group(name, attributes=declarations.stamp())
+                    for declared in declarations.BASE[name]:
+                        schema.create_input(group, declared, getattr(record, declared.name))
+            self.storage.adopt_folder(built, f"{self.name}/base")
 
 
 def scene_ids(storage: Storage) -> list[str]:
@@ -345,21 +345,6 @@ def _exponent_of_plans(storage: Storage, scene: str) -> int | None:
     return None
 
 
-def _build_base(folder: Path, records: Mapping[str, Geometry | BasePointCloud]) -> None:
-    import zarr
-
-    from photonfarm.store.format.metadata import seal
-    from photonfarm.store.model.staging import group_in
-
-    with group_in(folder) as store:
-        root = zarr.open_group(store, mode="w-", zarr_format=3, attributes=declarations.stamp())
-        for name, record in records.items():
-            group = root.create_group(name, attributes=declarations.stamp())
-            for declared in declarations.BASE[name]:
-                schema.create_input(group, declared, getattr(record, declared.name))
-    seal(folder)
-
-
 def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:
     """Geometry and base point cloud in a scene's folder; raises StoreError while they are not there."""
     from photonfarm.store.format.metadata import open_group
@@ -370,12 +355,11 @@ def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:
     try:
         root, _ = open_group(storage, folder)
 
-        def whole(part: str, record: type[Geometry] | type[BasePointCloud]) -> dict[str, NDArray[Any]]:
+        def read_arrays(part: str, record: type[Geometry] | type[BasePointCloud]) -> dict[str, NDArray[Any]]:
             names = [field.name for field in fields(record)]
             return {name: schema.read_input(storage, f"{folder}/{part}/{name}", root[part][name]) for name in names}
 
-        geometry, cloud = Geometry(**whole("geometry", Geometry)), BasePointCloud(**whole("cloud", BasePointCloud))
+        return Geometry(**read_arrays("geometry", Geometry)), BasePointCloud(**read_arrays("cloud", BasePointCloud))
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError) as error:
         why = f"{error}; {findings.BASE_ASIDE}"
         raise CorruptError(f"{storage.where}/{folder}: is not what was committed: {why}") from error
-    return geometry, cloud

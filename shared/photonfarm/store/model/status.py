@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.store.model.scene_store import SceneStore
-from photonfarm.store.model.store import Store, check_format
+from photonfarm.store.model.store import Store, check_format, name_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,26 +45,21 @@ def store_status(store: Store) -> list[SceneStatus]:
     """
     known, failed = store.each(scene_status)
     for scene_id, error in failed.items():
-        known[scene_id] = SceneStatus(
-            scene_id, _name(store, scene_id), 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error)
-        )
+        name = name_of(store, scene_id) or "unreadable"
+        known[scene_id] = SceneStatus(scene_id, name, 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error))
     return [known[scene_id] for scene_id in sorted(known)]
-
-
-def _name(store: Store, scene_id: str) -> str:
-    """A scene's name, if its spec can be read."""
-    try:
-        return store.scene(scene_id).spec.name
-    except StoreError:
-        return "unreadable"
 
 
 def scene_status(scene: SceneStore) -> SceneStatus:
     """The status of one scene, as `store_status` has it; raises StoreError if it cannot be read."""
     progress = scene.progress()
     committed = sorted(scene.committed_jobs())  # before the plans: each one's plan is there by now
-    jobs, withdrawn, sums = scene.jobs(), scene.withdrawn_jobs(), _sum_all(scene.marker, committed)
-    if sums.error is not None and not isinstance(sums.error, CorruptError):
+    jobs, withdrawn = scene.jobs(), scene.withdrawn_jobs()
+    blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
+    with ThreadPoolExecutor(_READERS) as readers:
+        sums = list(readers.map(partial(_sum_markers, scene), blocks))
+    errors = [error for *_, error in sums if error is not None]
+    if errors and not isinstance(errors[0], CorruptError):
         check_format(scene.storage)
     return SceneStatus(
         scene.scene_id,
@@ -75,57 +68,26 @@ def scene_status(scene: SceneStore) -> SceneStatus:
         progress.committed_samples,
         jobs - len(withdrawn),
         len(committed),
-        sums.size_bytes,
-        sums.core_s,
-        sums.redrawn,
-        sums.unreadable,
-        str(sums.error) if sums.error else None,
+        sum(size_bytes for size_bytes, *_ in sums),
+        sum(core_s for _, core_s, *_ in sums),
+        sum(redrawn for _, _, redrawn, *_ in sums),
+        sum(unreadable for *_, unreadable, _ in sums),
+        str(errors[0]) if errors else None,
         sum(job >= jobs or job in withdrawn for job in committed),
     )
 
 
-@dataclass(slots=True)
-class _Sums:
-    """Sums over the markers of some committed jobs."""
-
-    size_bytes: int = 0
-    core_s: float = 0.0
-    redrawn: int = 0
-    unreadable: int = 0  # markers
-    error: StoreError | None = None  # of the first of these
-
-    def add(self, other: _Sums) -> None:
-        """Add the sums over other markers."""
-        for name in ("size_bytes", "core_s", "redrawn", "unreadable"):
-            setattr(self, name, getattr(self, name) + getattr(other, name))
-        self.error = self.error or other.error
-
-
-Read = Callable[[int], dict[str, Any]]
-"""A function that reads the marker of a job."""
-
-
-def _sum_all(read: Read, committed: list[int]) -> _Sums:
-    """Sums over the markers of many jobs, read several at a time."""
-    blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
-    sums = _Sums()
-    with ThreadPoolExecutor(_READERS) as readers:
-        for each in readers.map(partial(_sum, read), blocks):
-            sums.add(each)
-    return sums
-
-
-def _sum(read: Read, jobs: Iterable[int]) -> _Sums:
-    sums = _Sums()
+def _sum_markers(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int, int, StoreError | None]:
+    """Of the markers of some jobs: bytes, core seconds and redrawn renders; unreadable ones, and the first error."""
+    size_bytes, core_s, redrawn, errors = 0, 0.0, 0, []
     for job in jobs:
         try:
-            marker = read(job)
+            marker = scene.marker(job)
         except StoreError as error:
             if not isinstance(error.__cause__, FileNotFoundError):  # else a repair has moved it since it was listed
-                sums.unreadable += 1
-                sums.error = sums.error or error
+                errors.append(error)
             continue
-        sums.size_bytes += sum(file["size"] for file in marker["files"].values())
-        sums.core_s += marker["figures"]["core_s"]
-        sums.redrawn += marker["figures"]["redrawn"]
-    return sums
+        size_bytes += sum(file["size"] for file in marker["files"].values())
+        core_s += marker["figures"]["core_s"]
+        redrawn += marker["figures"]["redrawn"]
+    return size_bytes, core_s, redrawn, len(errors), errors[0] if errors else None

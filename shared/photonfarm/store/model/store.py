@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from photonfarm.core.errors import CorruptError, SpecError, StoreError, store_errors
 from photonfarm.core.models import differing
@@ -42,20 +42,18 @@ class Store:
         self.store_id = check_format(self.storage)
 
     def _create(self) -> None:
-        with store_errors("make a store here", self.storage.where):
+        with store_errors("make a store here", where := self.storage.where):
             if self.storage.exists(FORMAT_FILE):
                 return
-            if Path(self.storage.where).is_symlink() and not Path(self.storage.where).exists():
-                raise StoreError(
-                    f"{self.storage.where}: is a link to what is not there; mend it, or name another store"
-                )
+            if Path(where).is_symlink() and not Path(where).exists():
+                raise StoreError(f"{where}: is a link to what is not there; mend it, or name another store")
             foreign = set(self.storage.names("")) - {FORMAT_FILE, SCENES, TMP}
             if foreign and not self.storage.exists(FORMAT_FILE):  # no other process made one in the meantime
-                raise StoreError(f"{self.storage.where}: is neither empty nor a store (it holds {min(foreign)!r})")
+                raise StoreError(f"{where}: is neither empty nor a store (it holds {min(foreign)!r})")
             if are_there(self.storage):
                 return  # the store has lost its document: a new one would have another id
             with self.storage.founding():
-                put_json(self.storage, _new_document(), FORMAT_FILE)
+                put_json(self.storage, declarations.new_document(), FORMAT_FILE)
 
     def check(self) -> None:
         """Check that the store is still there; raises StoreError if it is gone, or replaced by another one."""
@@ -153,16 +151,19 @@ class Store:
             return self.storage.sweep(stray_age_s=stray_age_s)
 
 
-def _new_document() -> dict[str, Any]:
-    """The document of a store made now."""
-    return {**declarations.stamp(), "id": declarations.new_store_id()}
+def name_of(store: Store, scene_id: str) -> str | None:
+    """The name of a scene; None if its spec is unreadable: then it has to be named by its id."""
+    try:
+        return store.scene(scene_id).spec.name
+    except StoreError:
+        return None
 
 
 def _put_back() -> str:
     """The remedy for a store that has lost its document."""
     return (
-        f"put it back from a copy. A new store's would be {json.dumps(_new_document())}: without a copy, write that, "
-        "if a photonfarm of this version made the store"
+        f"put it back from a copy. A new store's would be {json.dumps(declarations.new_document())}: without a copy, "
+        "write that, if a photonfarm of this version made the store"
     )
 
 

@@ -135,15 +135,12 @@ def _decoded(record: Images) -> Images:
 class Batch:
     """Samples in their stored types; `SceneReader.read_batch` fills it."""
 
-    radiance_exponent: int
-    radiance: NDArray[np.float16]  # (B, 2, H, W, 3) linear × 2^radiance_exponent, halves A and B; NaN: see `wide`
-    buffers: dict[str, NDArray[Any]]  # depth (B, H, W) float32; albedo, normal (B, H, W, 3) float16; or none of them
-    seen: dict[str, NDArray[np.uint8]]  # point_seen (B, ⌈P/8⌉), photon_seen (B, ⌈K/8⌉): bits; or none of them
-    bits: dict[str, int]  # how many there are of each: P and K
+    spec: SceneSpec
+    radiance: NDArray[np.float16]  # (B, 2, H, W, 3) linear × 1/`scale`, halves A and B; NaN: see `wide`
+    of_view: dict[str, NDArray[Any]]  # (B, …) by name: buffers and bits of what is seen, and guides; or none of these
     rows: NDArray[np.int64]  # (B,) row of each sample, of its view and of its modification
     view_rows: NDArray[np.int64]
     modification_rows: NDArray[np.int64]
-    guides: dict[str, NDArray[Any]] = field(default_factory=dict)  # as `Guides` has them, (B, …); or none of them
     wide: dict[int, F32] = field(default_factory=dict)  # by place: (2, H, W, 3) unscaled, where float16 cannot hold it
 
     @classmethod
@@ -153,12 +150,7 @@ class Batch:
         of_view = [name for name, array in arrays.items() if array.kind == "view"]
         names = [name for name in of_view if (guides if name in GUIDE_NAMES else buffers)]
         memory = {name: np.empty((size, *arrays[name].shape), arrays[name].dtype) for name in ("radiance", *names)}
-        bits = schema.bit_counts(spec)
-        seen = {name: memory.pop(name) for name in bits if name in memory}
-        of_guides = {name: memory.pop(name) for name in names if name in GUIDE_NAMES}
-        rows = np.zeros((3, size), np.int64)
-        radiance = memory.pop("radiance")
-        return cls(spec.radiance_exponent, radiance, memory, seen, bits, rows[0], rows[1], rows[2], of_guides)
+        return cls(spec, memory.pop("radiance"), memory, *np.zeros((3, size), np.int64))
 
     def __len__(self) -> int:
         """The number of samples that it holds, or has memory for."""
@@ -166,13 +158,9 @@ class Batch:
 
     def first(self, count: int) -> Batch:
         """The first samples, in the same memory."""
-        if count == len(self):
-            return self
-        rows = {name: getattr(self, name)[:count] for name in ("rows", "view_rows", "modification_rows")}
-        buffers = {name: values[:count] for name, values in self.buffers.items()}
-        seen = {name: values[:count] for name, values in self.seen.items()}
-        guides = {name: values[:count] for name, values in self.guides.items()}
-        return replace(self, radiance=self.radiance[:count], buffers=buffers, guides=guides, seen=seen, **rows)
+        own = ("radiance", "rows", "view_rows", "modification_rows")
+        of_view = {name: values[:count] for name, values in self.of_view.items()}
+        return replace(self, of_view=of_view, **{name: getattr(self, name)[:count] for name in own})
 
     def linear(self, place: int) -> F32:
         """The radiance of one sample as it was rendered, (2, H, W, 3) linear, unscaled."""
@@ -183,15 +171,23 @@ class Batch:
     @property
     def scale(self) -> float:
         """The factor from `radiance` to linear radiance, a power of two."""
-        return float(2.0**-self.radiance_exponent)
+        return float(2.0**-self.spec.radiance_exponent)
+
+    def buffers(self, place: int) -> ViewBuffers:
+        """The buffers of one sample's view, in the same memory."""
+        return ViewBuffers(**{each.name: self.of_view[each.name][place] for each in fields(ViewBuffers)})
+
+    def guides(self, place: int) -> Guides | None:
+        """The guides of one sample's view, in the same memory; None if they were not asked for."""
+        known = {name: values[place] for name, values in self.of_view.items() if name in GUIDE_NAMES}
+        return Guides(**known) if known else None
 
     def visibility(self, place: int) -> Visibility:
         """Which points and photons the view of one sample sees, unpacked into new memory."""
-        points, photons = (self._unpacked(name, place) for name in ("point_seen", "photon_seen"))
-        return Visibility(points, photons)
-
-    def _unpacked(self, name: str, place: int) -> NDArray[np.bool_]:
-        count = self.bits[name]
-        if not count:
-            return np.zeros(0, np.bool_)
-        return np.unpackbits(self.seen[name][place], count=count, bitorder="little").view(np.bool_)
+        seen = [
+            np.unpackbits(self.of_view[name][place], count=count, bitorder="little").view(np.bool_)
+            if count
+            else np.zeros(0, np.bool_)
+            for name, count in schema.bit_counts(self.spec).items()
+        ]
+        return Visibility(*seen)

@@ -23,11 +23,10 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import view_keys
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import Shard
-from photonfarm.store.io.storage import renew_copy
+from photonfarm.store.io.storage import look_into
 from photonfarm.store.model import plans
-from photonfarm.store.model.plans import StoredPlan
 from photonfarm.store.model.scene_store import SceneStore
-from photonfarm.store.model.store import Store
+from photonfarm.store.model.store import Store, name_of
 from photonfarm.store.read.other_scenes import check_scene, tell_apart
 
 _KEY = re.compile(r"[0-9a-fA-F]{32}")
@@ -46,26 +45,13 @@ class Query:
 
     @classmethod
     def of(
-        cls,
-        *,
-        modification: str | None = None,
-        view: str | None = None,
-        sample: str | None = None,
-        row: int | None = None,
-        job: int | None = None,
-        tolerance: float = 1e-3,
+        cls, *, modification: str | None = None, view: str | None = None, sample: str | None = None, **others: Any
     ) -> Query:
         """The query of the command line's options; raises SpecError for text that is neither key nor vector."""
         if sample is not None and not _KEY.fullmatch(sample):
             raise SpecError(f"--sample {sample!r}: a key of 32 hexadecimal digits is required")
-        return cls(
-            _vector_or_key("--modification", modification, 4),
-            _vector_or_key("--view", view, 6),
-            None if sample is None else bytes.fromhex(sample),
-            row,
-            job,
-            tolerance,
-        )
+        vectors = _vector_or_key("--modification", modification, 4), _vector_or_key("--view", view, 6)
+        return cls(*vectors, None if sample is None else bytes.fromhex(sample), **others)
 
 
 def _vector_or_key(option: str, text: str | None, multiple: int) -> F32 | Key | None:
@@ -84,9 +70,6 @@ def _vector_or_key(option: str, text: str | None, multiple: int) -> F32 | Key | 
     return vector
 
 
-__all__ = ["FoundSample", "Matches", "Place", "Query", "find_samples", "scene_named", "scene_or_spec"]
-
-
 @dataclass(frozen=True, slots=True)
 class Matches:
     """The result of a search."""
@@ -100,13 +83,13 @@ def scene_named(store: Store, text: str) -> str:
     """The id of a scene, given its id, the beginning of its id, or its name; StoreError unless exactly one fits."""
     ids = store.scene_ids()
     found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
-    found = found or [each for each in ids if _name(store, each) == text]
-    if len(found) > 1 and all(_name(store, each) == text for each in found):
+    found = found or [each for each in ids if name_of(store, each) == text]
+    if len(found) > 1 and all(name_of(store, each) == text for each in found):
         apart = tell_apart(store, found)
         raise StoreError(f"{store.storage.where}: {len(found)} scenes have the name {text!r}: {apart}; give an id")
     if len(found) != 1:
         held = f"{len(found)} scenes have" if found else "no scene has"
-        each_named = ", ".join(f"{each} ({_name(store, each) or 'unreadable'})" for each in found or ids)
+        each_named = ", ".join(f"{each} ({name_of(store, each) or 'unreadable'})" for each in found or ids)
         known = f"give one of the ids {each_named}" if ids else "the store has no scenes yet"
         raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
     return found[0]
@@ -126,14 +109,6 @@ def scene_or_spec(store: Store, named: str) -> SceneStore:
     return store.scene(
         check_scene(store, named, load_spec(named)) if is_spec_file(named) else scene_named(store, named)
     )
-
-
-def _name(store: Store, scene_id: str) -> str | None:
-    """The name of a scene; None if its spec is unreadable: then it has to be named by its id."""
-    try:
-        return store.scene(scene_id).spec.name
-    except StoreError:
-        return None
 
 
 def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit: int = 20) -> Matches:
@@ -213,7 +188,8 @@ class SceneMatch:
             self._look(query)
 
     def _look(self, query: Query) -> None:
-        modification, view = (_inputs(self._plans, f"sample_{name}") for name in ("modification", "view"))
+        inputs = plans.content(self._plans)
+        modification, view = inputs.column("sample_modification"), inputs.column("sample_view")
         rows = np.flatnonzero(modification != UNUSED)
         if query.row is not None:
             rows = rows[rows == query.row]
@@ -221,44 +197,38 @@ class SceneMatch:
             rows = rows[rows // self._plans[0].shard_rows == query.job]
         if query.sample is not None:
             wanted = np.frombuffer(query.sample, "<u8")
-            rows = rows[(_inputs(self._plans, "sample_key")[rows].view("<u8") == wanted).all(axis=1)]
+            rows = rows[(inputs.column("sample_key")[rows].view("<u8") == wanted).all(axis=1)]
         distance = np.zeros(len(rows))
-        for condition, references, of_row in (
-            (query.modification, modification, self._from_modification),
-            (query.view, view, self._from_view),
-        ):
-            if condition is not None and len(rows):
-                distinct, place = np.unique(references[rows], return_inverse=True)
-                distance = np.maximum(distance, of_row(distinct, condition, modification, view)[place])
+        if query.modification is not None and len(rows):
+            distinct, place = np.unique(modification[rows], return_inverse=True)
+            vectors = inputs.vectors("modification", distinct)
+            distance = self._from_modifications(vectors, query.modification)[place]
+        if query.view is not None and len(rows):
+            _, first, place = np.unique(view[rows], return_index=True, return_inverse=True)
+            seen = rows[first]  # a sample of each view
+            vectors = inputs.vectors("view", view[seen])
+            if isinstance(query.view, bytes):
+                of_view = inputs.vectors("modification", modification[seen])
+                keys = view_keys(modification_keys(self._scene.spec.radiance_id, of_view), vectors)
+                apart = _unless_equal(keys, query.view)
+            else:  # the larger of the distances of position and look-at point
+                apart = np.linalg.norm((vectors - query.view.astype(np.float64)).reshape(-1, 2, 3), axis=-1).max(axis=1)
+            distance = np.maximum(distance, apart[place])
         if np.isfinite(distance).any():
             self.nearest = float(distance.min())
         fits = distance <= query.tolerance
         order = np.argsort(distance[fits], kind="stable")
         self.rows, self.distance = rows[fits][order], distance[fits][order]
 
-    def _from_modification(self, rows: NDArray[np.int64], wanted: F32 | Key, *_: NDArray[np.int64]) -> F64:
-        """The distances of the modifications in some rows from the wanted one; infinite if other groups are present."""
-        vectors = _inputs(self._plans, "modification")[rows]
+    def _from_modifications(self, vectors: F32, wanted: F32 | Key) -> F64:
+        """The distances of modifications, (N, G, 4), from the wanted one; infinite if other groups are present."""
         if isinstance(wanted, bytes):
             return _unless_equal(modification_keys(self._scene.spec.radiance_id, vectors), wanted)
         if wanted.size != vectors[0].size:
-            return np.full(len(rows), np.inf)
+            return np.full(len(vectors), np.inf)
         target = wanted.reshape(vectors.shape[1:])
         distance = np.linalg.norm(vectors[..., :3].astype(np.float64) - target[:, :3], axis=-1).max(axis=1, initial=0)
         return np.where(((vectors[..., 3] != 0) == (target[:, 3] != 0)).all(axis=1), distance, np.inf)
-
-    def _from_view(
-        self, rows: NDArray[np.int64], wanted: F32 | Key, modification: NDArray[np.int64], view: NDArray[np.int64]
-    ) -> F64:
-        """The distances of the views in some rows from the wanted one: the larger of position and look-at point."""
-        vectors = _inputs(self._plans, "view")[rows]
-        if not isinstance(wanted, bytes):
-            apart = (vectors.astype(np.float64) - wanted).reshape(-1, 2, 3)
-            return np.asarray(np.linalg.norm(apart, axis=-1).max(axis=1))
-        seen, first = np.unique(view, return_index=True)  # by some sample
-        of_view = _inputs(self._plans, "modification")[modification[first[np.searchsorted(seen, rows)]]]
-        keys = modification_keys(self._scene.spec.radiance_id, of_view)
-        return _unless_equal(view_keys(keys, vectors), wanted)
 
     # ------------------------------------------------------------------------------------------------------- describing
 
@@ -298,36 +268,24 @@ class SceneMatch:
         found = []
         for name, array in schema.output_arrays(self._scene.spec).items():
             row = rows[array.kind]
-            place = self._place(plans.plan_of(self._plans, row), name, array, row)
-            if place.there or name != "radiance_wide":  # few samples need that one
-                found.append(place)
+            plan = plans.plan_of(self._plans, row)
+            job, chunk = divmod(row, plan.shard_rows)
+            file = plan.shard(name, array, job)
+            there = self._is_there(file, array, chunk, plan.shard_rows)
+            if there or name != "radiance_wide":  # few samples need that one
+                found.append(Place(name, file, chunk, row - plan.first_row, there))
         if any(place.array == "radiance_wide" for place in found):  # and those have nothing in `radiance`
             found = [place for place in found if place.array != "radiance" or place.there]
         return found
 
-    def _place(self, plan: StoredPlan, name: str, array: schema.ArraySchema, row: int) -> Place:
-        job, chunk = divmod(row, plan.shard_rows)
-        file = plan.shard(name, array, job)
-        return Place(name, file, chunk, row - plan.first_row, self._is_there(file, array, chunk, plan.shard_rows))
-
     def _is_there(self, file: str, array: schema.ArraySchema, chunk: int, shard_rows: int) -> bool:
         storage = self._scene.storage
-        if not storage.exists(file):
-            return False
         try:
-            return chunk in Shard(storage.local(file), array, shard_rows)
-        except CorruptError:
-            if not renew_copy(storage, file):
-                return False
-        try:
-            return chunk in Shard(storage.local(file), array, shard_rows)
+            return storage.exists(file) and look_into(
+                storage, file, lambda path: chunk in Shard(path, array, shard_rows)
+            )
         except CorruptError:
             return False
-
-
-def _inputs(found: list[StoredPlan], name: str) -> NDArray[Any]:
-    """One input of all rows of a scene, (R, …)."""
-    return np.concatenate([getattr(plan.rows, name) for plan in found])
 
 
 def _unless_equal(keys: Sequence[Key], wanted: Key) -> F64:

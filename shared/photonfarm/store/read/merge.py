@@ -6,9 +6,8 @@ Every stored value is a float16 times a power of two or a float32, so a whole mu
 2^-298, and exact in float64 (24 + 24 ≤ 53 bits, and 2^-298 … 2^256 is in its range). Sums of both are kept as whole
 numbers, cut into limbs of 32 bits: limb i counts multiples of 2^(32 i). A value is cut by division and truncation,
 which are exact for powers of two, and adds less than 2^32 to a limb of int64, which so has room for 2^31 values. Whole
-numbers add exactly, in any order: merged sums are equal bit for bit, and no value ever was rounded. Limbs that nothing
-has reached are not there: of an ordinary image there are two for the sums and three or four for the squares, of any
-image at most ten and nineteen, of 8 bytes a value each.
+numbers add exactly, in any order: merged images are equal bit for bit, and no value ever was rounded. Limbs that
+nothing has reached are not there: of an ordinary image there are two for the sums and three or four for the squares.
 
 Only the results are rounded, once: with n estimates, S₁ = Σ x and S₂ = Σ x², the mean S₁ / n and M2 = Σ (x − mean)²
 = (n S₂ − S₁²) / n are quotients of whole numbers, and Python's division rounds these correctly.
@@ -33,9 +32,6 @@ from photonfarm.store.read.find import Query, SceneMatch
 from photonfarm.store.read.reader import SceneReader
 
 F64 = NDArray[np.float64]
-
-MAX_PASSES = 1 << 30
-"""The most passes, of two halves each, for which a limb has room."""
 
 _BITS = 32
 _LOWEST = -10
@@ -94,52 +90,44 @@ class WrittenView:
 
 
 class Moments:
-    """Exact sums over passes of one view. Merge those of several workers with `update`, in any order."""
+    """Exact sums over passes of one view."""
 
     def __init__(self) -> None:
         """Begin without passes."""
         self.passes = 0
-        self._sums = _ExactSum()  # (2, H, W, 3), by half
-        self._squares = _ExactSum()  # (H, W, 3)
+        self._shape: tuple[int, ...] = ()  # (H, W, 3)
+        self._sums: _Limbs = {}  # (2, H, W, 3), by half
+        self._squares: _Limbs = {}  # (H, W, 3)
 
     def add(self, halves: F32) -> None:
-        """Add one pass, (2, H, W, 3); raises ValueError for a value that is not finite."""
+        """Add one pass, (2, H, W, 3); raises ValueError for a value that is not finite, or another size of image."""
         if not np.isfinite(halves).all():
             raise ValueError("a pass holds values that are not finite; it has no exact sum")
+        self._shape = self._shape or halves.shape[1:]
+        if halves.shape[1:] != self._shape:
+            raise ValueError(f"a pass of shape {halves.shape} does not add to images of shape {self._shape}")
+        self.passes += 1
         exact = halves.astype(np.float64)
-        self._claim(1)
-        self._sums.add(exact)
+        _add_exactly(self._sums, exact)
         for half in exact:
-            self._squares.add(half * half)
-
-    def update(self, other: Moments) -> None:
-        """Add the passes of other sums; the two must have no pass in common."""
-        self._claim(other.passes)
-        self._sums.update(other._sums)
-        self._squares.update(other._squares)
-
-    def _claim(self, passes: int) -> None:
-        if self.passes + passes > MAX_PASSES:
-            raise ValueError(f"{self.passes + passes} passes are more than the {MAX_PASSES} that are summed exactly")
-        self.passes += passes
+            _add_exactly(self._squares, half * half)
 
     def merged(self) -> MergedView:
         """The image; raises ValueError without passes."""
         if not self.passes:
             raise ValueError("no pass to merge")
-        shape = self._sums.shape[1:]
-        images = np.empty((4, int(np.prod(shape))))
+        images = np.empty((4, int(np.prod(self._shape))))
         for start in range(0, images.shape[1], _AT_ONCE):
             at = slice(start, start + _AT_ONCE)
             images[:, at] = self._quotients(at)
-        mean, m2, half_a, half_b = images.reshape(4, *shape)
+        mean, m2, half_a, half_b = images.reshape(4, *self._shape)
         return MergedView(self.passes, mean, m2, half_a, half_b)
 
     def _quotients(self, at: slice) -> list[list[float]]:
-        """Mean, M2, A and B of some values: `whole` numbers are multiples of 2^(32 · _LOWEST)."""
+        """Mean, M2, A and B of some values: whole numbers are multiples of 2^(32 · _LOWEST)."""
         n, unit = self.passes, 1 << (-_BITS * _LOWEST)
-        a, b = (self._sums.whole((half, at)) for half in (0, 1))
-        both, squares = a + b, self._squares.whole((at,))
+        (a, b), (squares,) = _whole(self._sums, 2, at), _whole(self._squares, 1, at)
+        both = a + b
         m2 = (2 * n * squares * unit - both * both).tolist()
         return [
             [total / (2 * n * unit) for total in both.tolist()],
@@ -149,65 +137,46 @@ class Moments:
         ]
 
 
-class _ExactSum:
-    """A sum of arrays of float64 whose values are multiples of 2^-320, below 2^288: see the top of this file."""
+_Limbs = dict[int, NDArray[np.int64]]
+"""A sum of arrays of float64 whose values are multiples of 2^-320, below 2^288: see the top of this file."""
 
-    def __init__(self) -> None:
-        self.shape: tuple[int, ...] = ()
-        self._limbs: dict[int, NDArray[np.int64]] = {}
 
-    def add(self, values: F64) -> None:
-        """Add one array; all must have one shape."""
-        self._take(values.shape)
-        rest = values
-        while (largest := float(np.abs(rest).max(initial=0.0))) > 0:
-            limb = (int(np.frexp(largest)[1]) - 1) // _BITS
-            whole = np.trunc(np.ldexp(rest, -_BITS * limb))
-            self._add(limb, whole.astype(np.int64))
-            rest = rest - np.ldexp(whole, _BITS * limb)
+def _add_exactly(limbs: _Limbs, values: F64) -> None:
+    """Add one array to a sum."""
+    rest = values
+    while (largest := float(np.abs(rest).max(initial=0.0))) > 0:
+        limb = (int(np.frexp(largest)[1]) - 1) // _BITS
+        whole = np.trunc(np.ldexp(rest, -_BITS * limb))
+        limbs[limb] = limbs.get(limb, 0) + whole.astype(np.int64)
+        rest = rest - np.ldexp(whole, _BITS * limb)
 
-    def update(self, other: _ExactSum) -> None:
-        """Add another sum."""
-        if other.shape:
-            self._take(other.shape)
-        for limb, counts in other._limbs.items():
-            self._add(limb, counts)
 
-    def _take(self, shape: tuple[int, ...]) -> None:
-        if self.shape not in ((), shape):
-            raise ValueError(f"an image of shape {shape} does not add to those of shape {self.shape}")
-        self.shape = shape
-
-    def _add(self, limb: int, counts: NDArray[np.int64]) -> None:
-        if limb in self._limbs:
-            self._limbs[limb] += counts
-        else:
-            self._limbs[limb] = counts.copy()
-
-    def whole(self, at: tuple[int | slice, ...]) -> NDArray[Any]:
-        """A part of the sums as Python's whole numbers, multiples of 2^(32 · _LOWEST); the image is one axis here."""
-        flat = (*self.shape[: len(at) - 1], -1)
-        total: Any = np.zeros(np.empty(self.shape, np.bool_).reshape(flat)[at].shape, object)
-        for limb, counts in self._limbs.items():
-            total = total + (counts.reshape(flat)[at].astype(object) << (_BITS * (limb - _LOWEST)))
-        return np.asarray(total)
+def _whole(limbs: _Limbs, images: int, at: slice) -> NDArray[Any]:
+    """A part of each image of a sum as Python's whole numbers, multiples of 2^(32 · _LOWEST)."""
+    total: Any = np.zeros((images, 1), object)
+    for limb, counts in limbs.items():
+        total = total + (counts.reshape(images, -1)[:, at].astype(object) << (_BITS * (limb - _LOWEST)))
+    return np.asarray(total)
 
 
 # ------------------------------------------------------------------------------------------------------------- a reader
 
 
-def merge_rows(reader: SceneReader, rows: Iterable[int]) -> Moments:
-    """The exact sums over some complete samples, one at a time in memory; they should show one view.
+def merge_view(reader: SceneReader, view_row: int) -> MergedView:
+    """All passes of a view that were complete at the reader's last refresh, one at a time in memory.
 
-    Raises StoreError for a row that is not complete, CorruptError for bytes that are not what was committed.
+    Raises StoreError if there is none, CorruptError for bytes that are not what was committed.
     """
+    rows = reader.rows_of_view(view_row).tolist()
+    if not rows:
+        raise StoreError(f"view row {view_row} has no complete pass yet")
     moments, memory = Moments(), Batch.empty(reader.spec, 1, buffers=False)
     for row in rows:
         try:
             moments.add(reader.read_batch([row], memory).linear(0))
         except ValueError as error:
             raise CorruptError(f"row {row}: {error}") from error
-    return moments
+    return moments.merged()
 
 
 def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tuple[str, MergedView]]:
@@ -235,11 +204,3 @@ def write_views(views: Iterable[tuple[str, MergedView]], folder: Path) -> Iterat
         view.write(file)
         error = float((view.standard_error**2).mean() ** 0.5)
         yield WrittenView(key, view.passes, float(view.mean.mean()), error, str(file))
-
-
-def merge_view(reader: SceneReader, view_row: int) -> MergedView:
-    """All passes of a view that were complete at the reader's last refresh; raises StoreError if there is none."""
-    rows = reader.rows_of_view(view_row).tolist()
-    if not rows:
-        raise StoreError(f"view row {view_row} has no complete pass yet")
-    return merge_rows(reader, rows).merged()

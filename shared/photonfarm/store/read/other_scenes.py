@@ -13,9 +13,6 @@ from photonfarm.store.model.store import Store
 FEW = 4
 """Up to so many differing keys are named."""
 
-FILES = "the scene's files"
-"""What the digest `content` is of."""
-
 
 def check_scene(store: Store, name: str, spec: SceneSpec) -> str:
     """The id of a spec's scene, which the store holds; StoreError if it does not. `name` is the spec's for its user."""
@@ -27,21 +24,20 @@ def check_scene(store: Store, name: str, spec: SceneSpec) -> str:
 
 def describe_scenes(store: Store, spec: SceneSpec) -> str:
     """The scenes that a store has, in words, and where one of the spec's name differs from it."""
-    nearest, others = _alike(store, spec)
-    if nearest is None:
+    alike = _alike(store, spec)
+    if not alike:
         return list_scenes(store.storage)
-    more = f"; {others} more have this name" if others else ""
-    differ = describe_differences(nearest.spec, spec)
-    return f"scene {nearest.scene_id} of this name is there and differs in {differ}{more}"
+    more = f"; {len(alike) - 1} more have this name" if alike[1:] else ""
+    differ = describe_differences(alike[0].spec, spec)
+    return f"scene {alike[0].scene_id} of this name is there and differs in {differ}{more}"
 
 
 def note_first_plan(store: Store, spec: SceneSpec) -> str | None:
     """What to say of a scene's first plan where the store has another scene of this name; None where it has none."""
-    nearest, _ = _alike(store, spec)
-    if nearest is None:
-        return None
-    differ = describe_differences(nearest.spec, spec)
-    return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {describe_samples(nearest)}"
+    for nearest in _alike(store, spec):
+        differ = describe_differences(nearest.spec, spec)
+        return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {describe_samples(nearest)}"
+    return None
 
 
 def find_same_radiance(store: Store, spec: SceneSpec) -> str | None:
@@ -78,24 +74,18 @@ def describe_samples(scene: SceneStore) -> str:
 
 def describe_differences(there: SceneSpec, here: SceneSpec) -> str:
     """Where two specs differ in what ids cover, in words."""
-    changes = differing(there.identity(), here.identity())
-    few = list(changes.items())[:FEW]
-    more = f" and {len(changes) - len(few)} more" if len(changes) > len(few) else ""
-    return (
-        ", ".join(
-            FILES if key == "content" else f"{key} ({_say(a)} in the store, {_say(b)} asked for)" for key, (a, b) in few
-        )
-        + more
-    )
+    said = [
+        "the scene's files" if key == "content" else f"{key} ({_say(a)} in the store, {_say(b)} asked for)"
+        for key, (a, b) in differing(there.identity(), here.identity()).items()
+    ]
+    return ", ".join(said[:FEW]) + (f" and {len(said) - FEW} more" if said[FEW:] else "")
 
 
-def _alike(store: Store, spec: SceneSpec) -> tuple[SceneStore | None, int]:
-    """The other scene of a spec's name that differs least from it, and how many more there are."""
+def _alike(store: Store, spec: SceneSpec) -> list[SceneStore]:
+    """The other scenes of a spec's name; the one that differs least from it is the first."""
     there, _ = store.each(lambda scene: scene)
     alike = [each for each in there.values() if each.spec.name == spec.name and each.scene_id != spec.scene_id]
-    if not alike:
-        return None, 0
-    return min(alike, key=lambda each: len(differing(each.spec.identity(), spec.identity()))), len(alike) - 1
+    return sorted(alike, key=lambda each: len(differing(each.spec.identity(), spec.identity())))
 
 
 def _say(value: object) -> str:

@@ -8,6 +8,7 @@ are read straight from the shards, every byte checked against its checksum.
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -21,14 +22,15 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, IncompleteError, StoreError, store_errors
 from photonfarm.core.keys import KEY_BYTES, Key
-from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
+from photonfarm.core.records import F32, BasePointCloud, Geometry, Photons
+from photonfarm.plan.request import PlannedContent
 from photonfarm.scene.modification import Modification, modification_keys
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View, view_keys
-from photonfarm.store.format import markers, schema
+from photonfarm.store.format import markers, schema, shards
 from photonfarm.store.format.markers import FollowedMarkers
-from photonfarm.store.format.shards import OpenShards, Shard
-from photonfarm.store.io.storage import FORMAT_FILE, open_storage, renew_copy
+from photonfarm.store.format.shards import Shard
+from photonfarm.store.io.storage import FORMAT_FILE, look_into, open_storage
 from photonfarm.store.model import plans
 from photonfarm.store.model.lease import announce_work, read_leases
 from photonfarm.store.model.plans import StoredPlan
@@ -62,8 +64,10 @@ class SceneReader:
         self.plan_requests: list[dict[str, Any]] = []  # the requests of the plans, from which all rows follow
         self._committed: set[int] = set()
         self._complete = np.zeros(0, np.bool_)
+        self._inputs, self._key = PlannedContent(), np.zeros((0, KEY_BYTES), np.uint8)
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
-        self._shards = OpenShards()
+        self._shards: dict[tuple[str, int], Shard] = {}  # open ones, by array and job
+        self._lock = threading.Lock()
         self._remembered_s = -REMEMBERED_S  # when it was last seen that the scene is not forgotten
         self._base: tuple[Geometry, BasePointCloud] | None = None
 
@@ -114,7 +118,8 @@ class SceneReader:
             return np.zeros(0, np.int64)
         complete = plans.complete_rows(self._plans, committed)
         if self._committed - committed:  # markers removed by a repair
-            self._shards.clear()
+            with self._lock:
+                self._shards.clear()
         before = np.zeros(len(complete), np.bool_)
         before[: len(self._complete)] = self._complete
         self._committed, self._complete = committed, complete
@@ -127,10 +132,9 @@ class SceneReader:
         self._plans = found
         if self._plans != known:
             self._committed = set()  # complete rows are to be counted again
-            inputs = [plan.rows for plan in self._plans]
-            self._view_row = np.concatenate([rows.sample_view for rows in inputs])
-            self._modification_row = np.concatenate([rows.sample_modification for rows in inputs])
-            self._pass = np.concatenate([rows.sample_pass for rows in inputs])
+            inputs = plans.content(self._plans)
+            self._view_row, self._modification_row = inputs.column("sample_view"), inputs.column("sample_modification")
+            self._pass, self._key, self._inputs = inputs.column("sample_pass"), inputs.column("sample_key"), inputs
             self.plan_requests = [
                 {"first_row": plan.first_row, "samples": plan.named, "request": plan.request.model_dump(mode="json")}
                 for plan in self._plans
@@ -171,7 +175,7 @@ class SceneReader:
         with self._reading(chosen, "read samples"):
             for place, row in enumerate(chosen.tolist()):
                 self._read_radiance(row, place, batch)
-            for name, memory in (*batch.buffers.items(), *batch.guides.items(), *batch.seen.items()):
+            for name, memory in batch.of_view.items():
                 for place, row in enumerate(batch.view_rows.tolist()):
                     self._read_into(name, row, memory[place])
         return batch
@@ -184,9 +188,7 @@ class SceneReader:
     def _sample(self, row: int, place: int, batch: Batch) -> Sample:
         (key,), (modification, view, pass_number) = self.sample_keys([row]), self.inputs(row)
         radiance, scale = (batch.wide[place], 1.0) if place in batch.wide else (batch.radiance[place], batch.scale)
-        buffers = ViewBuffers(**{name: values[place] for name, values in batch.buffers.items()})
-        known = {name: values[place] for name, values in batch.guides.items()}
-        of_view = buffers, batch.visibility(place), Guides(**known) if known else None
+        of_view = batch.buffers(place), batch.visibility(place), batch.guides(place)
         shared = (lambda: self.base()[1]), partial(self.read_photons, row)
         return Sample(row, key, modification, view, pass_number, radiance, *of_view, scale, *shared)
 
@@ -208,13 +210,12 @@ class SceneReader:
 
     def sample_keys(self, rows: Sequence[int]) -> list[Key]:
         """The content keys of many samples."""
-        of_plans = [(plans.plan_of(self._plans, row), row) for row in rows]
-        return [plan.rows.sample_key[row - plan.first_row].tobytes() for plan, row in of_plans]
+        return [self._key[row].tobytes() for row in rows]
 
     def rows_by_key(self) -> dict[Key, int]:
         """The rows of all complete samples by their content keys."""
-        keys = np.concatenate([np.zeros((0, KEY_BYTES), np.uint8), *(plan.rows.sample_key for plan in self._plans)])
-        return {keys[row].tobytes(): row for row in self.rows.tolist()}
+        rows = self.rows.tolist()
+        return dict(zip(self.sample_keys(rows), rows, strict=True))
 
     def inputs(self, row: int) -> tuple[Modification, View, int]:
         """The configuration, the view and the number of the noisy pass of a complete sample."""
@@ -261,7 +262,7 @@ class SceneReader:
         if not len(chosen):
             return []
         distinct, place = np.unique(self._modification_row[chosen], return_inverse=True)
-        keys = modification_keys(self.spec.radiance_id, plans.vectors_at(self._plans, "modification", distinct))
+        keys = modification_keys(self.spec.radiance_id, self._inputs.vectors("modification", distinct))
         return [keys[i] for i in place.tolist()]
 
     def view_keys(self, rows: Sequence[int]) -> list[Key]:
@@ -270,7 +271,7 @@ class SceneReader:
         if not of_row:
             return []
         distinct, first, place = np.unique(self._view_row[np.asarray(rows)], return_index=True, return_inverse=True)
-        vectors = plans.vectors_at(self._plans, "view", distinct)
+        vectors = self._inputs.vectors("view", distinct)
         keys = view_keys([of_row[i] for i in first.tolist()], vectors)
         return [keys[i] for i in place.tolist()]
 
@@ -364,7 +365,7 @@ class SceneReader:
         try:
             shard.read_into(within, values)
         except CorruptError:
-            renew_copy(self._storage, self._file(name, job))
+            self._storage.renew(self._file(name, job))
             again, _ = self._shard(name, row, anew=True)
             if again is None or within not in again:
                 raise
@@ -379,21 +380,17 @@ class SceneReader:
         job, within = divmod(row, self._plans[0].shard_rows)
         shard = None if anew else self._shards.get((name, job))
         if shard is None:
-            file, array = self._file(name, job), self._arrays[name]
+            file, array, rows = self._file(name, job), self._arrays[name], self._plans[0].shard_rows
             if array.kind == "sample" and not self._storage.exists(file):
                 return None, within
-            shard = self._open(file, array)
-            self._check_not_forgotten()
-            self._shards.put((name, job), shard)
-        return shard, within
-
-    def _open(self, file: str, array: schema.ArraySchema) -> Shard:
-        """Open a file of the store; if it is a damaged local copy, a new copy."""
-        shard_rows = self._plans[0].shard_rows
-        try:
-            return Shard(self._storage.local(file), array, shard_rows)
-        except CorruptError:
-            self._storage.require()
-            if not renew_copy(self._storage, file):
+            try:
+                shard = look_into(self._storage, file, lambda path: Shard(path, array, rows))
+            except CorruptError:
+                self._storage.require()
                 raise
-        return Shard(self._storage.local(file), array, shard_rows)
+            self._check_not_forgotten()
+            with self._lock:
+                self._shards[name, job] = shard
+                if len(self._shards) > shards.OPEN_SHARDS:  # it is closed once its last reader is done
+                    del self._shards[next(iter(self._shards))]
+        return shard, within

@@ -18,7 +18,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.check.job_check import JobCheck
+from photonfarm.store.check import job_check
 from photonfarm.store.format import schema
 from photonfarm.store.io.local import LocalStorage
 
@@ -144,8 +144,7 @@ def test_rows_that_are_missing_or_that_the_plan_does_not_use_are_found(
     """The last job has two samples; of another plan, it has three."""
     from photonfarm.store.model.commit import JobWriter
 
-    monkeypatch.setattr(JobWriter, "_claim", lambda *_: None)
-    monkeypatch.setattr(JobWriter, "_check_complete", lambda _: None)
+    monkeypatch.setattr(JobWriter, "_claim", lambda self, kind, _: self._missing[kind].clear())
 
     def misplace(given: Any) -> None:
         given.radiance[10] = given.radiance.pop(9) + np.float32(1)
@@ -211,14 +210,14 @@ def test_a_store_that_cannot_be_reached_ends_the_check(
     def failing(*_: Any) -> Any:
         raise OSError(errno.EIO, "no answer")
 
-    read = JobCheck.run
+    read = job_check._JobCheck.run
 
-    def unplugged(self: JobCheck, *given: Any) -> Any:
+    def unplugged(self: Any) -> Any:
         monkeypatch.setattr(LocalStorage, "read", failing)
         monkeypatch.setattr(LocalStorage, "names", failing)
-        return read(self, *given)
+        return read(self)
 
-    monkeypatch.setattr(JobCheck, "run", unplugged)
+    monkeypatch.setattr(job_check._JobCheck, "run", unplugged)
     with pytest.raises(StoreError):
         checked(store)
 

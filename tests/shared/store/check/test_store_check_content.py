@@ -12,8 +12,9 @@ from photonfarm.core.records import ViewBuffers
 from photonfarm.plan.request import Request
 from photonfarm.scene.view import Camera
 from photonfarm.store import JobWriter, SceneReader, SceneStore, Store
-from photonfarm.store.check import repeated_seeds
-from photonfarm.store.check.check import StoreReport, halves_in_words
+from photonfarm.store.check import job_check
+from photonfarm.store.check.check import StoreReport
+from photonfarm.store.format import markers
 
 scene = stores.scene
 samples, outputs, checked, found = stores.samples, stores.outputs, stores.checked, stores.found
@@ -96,19 +97,19 @@ def test_a_row_that_a_late_writer_needs_float32_for_and_another_does_not_is_note
     store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two renders of a job give such rows where machines differ. The late one commits first, with both arrays there."""
-    place = JobWriter._place
+    place = markers.place_marker
 
-    def sleeping(self: JobWriter, *given: Any) -> bool:
-        monkeypatch.setattr(JobWriter, "_place", place)
+    def sleeping(*given: Any) -> bool:
+        monkeypatch.setattr(markers, "place_marker", place)
         wide = outputs(scene, 0)
         wide.radiance[2][0, 0, 0, 0] = 1e9
         assert samples.commit(scene, 0, wide)
-        return place(self, *given)
+        return place(*given)
 
     for name in scene.marker(0)["files"]:
         (scene.folder / name).unlink()
     marker(scene, 0).unlink()
-    monkeypatch.setattr(JobWriter, "_place", sleeping)
+    monkeypatch.setattr(markers, "place_marker", sleeping)
     assert not samples.commit(scene, 0, outputs(scene, 0))
     report = checked(store, repair=True)
     assert (noted(report), report.exit_code, scene.missing_jobs()) == ({"twice": 1}, 0, [])
@@ -133,7 +134,7 @@ def test_samples_whose_keys_give_one_seed_are_noted_and_not_rendered_again(
 ) -> None:
     """Seeds have 32 bits; rendered again, these samples would come out the same. Here all keys give one."""
     purposes = set()
-    monkeypatch.setattr(repeated_seeds, "seed_of", lambda _, purpose: purposes.add(purpose) or 7)
+    monkeypatch.setattr(job_check, "seed_of", lambda _, purpose: purposes.add(purpose) or 7)
 
     def change(given: Any) -> None:
         given.radiance[8][0] = outputs(scene, 0).radiance[2][1]
@@ -162,7 +163,7 @@ def many(tmp_path: Path, change: Callable[[np.ndarray], None], samples_: int = 2
 def test_halves_of_heavy_tailed_noise_do_not_differ(tmp_path: Path) -> None:
     report = many(tmp_path, lambda _: None)
     assert found(report) == {}
-    assert halves_in_words(report.scenes[0].halves).startswith("no difference beyond chance: |S| = ")
+    assert report.scenes[0].halves.in_words.startswith("no difference beyond chance: |S| = ")
 
 
 @pytest.mark.parametrize(("count", "tells"), [(37, False), (38, True)])
@@ -174,9 +175,7 @@ def test_samples_too_few_for_the_halves_to_differ_are_said_to_be_too_few(
     assert noted(report)["black-half"] == count
     assert found(report) == ({"halves-differ": 1} if tells else {})
     few = "too few samples to tell, 38 are needed at least: |S| = 6.08"
-    assert halves_in_words(report.scenes[0].halves).startswith(
-        "they differ by more than chance: |S| = 6.16" if tells else few
-    )
+    assert report.scenes[0].halves.in_words.startswith("they differ by more than chance: |S| = 6.16" if tells else few)
 
 
 def test_a_half_that_is_biased_somewhere_is_found(tmp_path: Path) -> None:
@@ -234,4 +233,3 @@ def test_views_of_nothing_and_views_from_behind_are_noted_and_are_no_error(store
         "empty-view": 1,
         "back-facing": 1,
     }
-    assert report.scenes[0].back_facing_share == pytest.approx(1 / 3)

@@ -182,13 +182,13 @@ def test_a_job_that_another_repair_has_set_aside_meanwhile_is_no_error(
 
     def racing(*given: Any) -> Any:
         equal = list(plain(*given))
-        monkeypatch.setattr(check, "equal_samples", plain)
+        monkeypatch.setattr(check, "find_equal_samples", plain)
         assert checked(store, repair=True).scenes[0].set_aside == ("job 0", "job 2")
         return equal
 
     recommitted(scene, 2, change)
-    plain = check.equal_samples
-    monkeypatch.setattr(check, "equal_samples", racing)
+    plain = check.find_equal_samples
+    monkeypatch.setattr(check, "find_equal_samples", racing)
     report = checked(store, repair=True)
     assert (found(report), report.scenes[0].set_aside) == ({"equal-samples": 2}, ())
     assert scene.missing_jobs() == [0, 2]

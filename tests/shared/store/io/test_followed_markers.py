@@ -102,7 +102,7 @@ def test_in_a_folder_every_look_sees_all(tmp_path: Path) -> None:
     folder = tmp_path / SCENE / markers.COMMITTED
     folder.mkdir(parents=True)
     for job in range(3):
-        (folder / markers.marker_file(job)).touch()
+        (tmp_path / markers.marker_name(SCENE, job)).touch()
     assert followed.look() == {0, 1, 2}
-    (folder / markers.marker_file(1)).unlink()
+    (tmp_path / markers.marker_name(SCENE, 1)).unlink()
     assert followed.look() == {0, 2}

@@ -18,7 +18,7 @@ from photonfarm.core.statistics import clean_error
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.read.merge import MAX_PASSES, MergedView, Moments, merge_rows, merge_view
+from photonfarm.store.read.merge import MergedView, Moments, merge_view
 
 HALF = np.float32(np.finfo(np.float16).smallest_subnormal)
 TINY, HUGE = np.finfo(np.float32).smallest_subnormal, np.finfo(np.float32).max
@@ -62,17 +62,11 @@ def test_mean_m2_and_both_half_means_are_the_exact_ones_rounded_once(values: lis
         assert found == truth(passes, channel)
 
 
-@given(st.lists(radiance, min_size=16, max_size=16), st.permutations(range(8)), st.lists(st.integers(0, 3), min_size=8))
+@given(st.lists(radiance, min_size=16, max_size=16), st.permutations(range(8)))
 @settings(max_examples=60)
-def test_any_order_and_any_grouping_give_equal_bits(values: list[float], order: list[int], group: list[int]) -> None:
+def test_any_order_gives_equal_bits(values: list[float], order: list[int]) -> None:
     passes = passes_of(values)
-    groups = [Moments() for _ in range(4)]
-    for i in order:
-        groups[group[i]].add(passes[i])
-    total = Moments()
-    for part in groups:
-        total.update(part)
-    assert_equal(total.merged(), moments_of(passes).merged())
+    assert_equal(moments_of([passes[i] for i in order]).merged(), moments_of(passes).merged())
 
 
 def test_what_float64_would_lose_between_a_huge_and_a_tiny_value_is_kept() -> None:
@@ -114,10 +108,6 @@ def test_what_cannot_be_merged_is_refused() -> None:
     for halves, named in ((not_finite, "finite"), (other_size, r"\(2, 2, 1, 3\)")):
         with pytest.raises(ValueError, match=named):
             moments.add(halves)
-    many = moments_of(passes_of([1.0, 2.0]))
-    many.passes = MAX_PASSES
-    with pytest.raises(ValueError, match="summed exactly"):
-        many.update(moments_of(passes_of([1.0, 2.0])))
     with pytest.raises(ValueError, match="no pass"):
         Moments().merged()
 
@@ -160,17 +150,6 @@ def test_passes_in_float16_and_in_float32_merge_alike(scene: SceneStore) -> None
     others = [samples.values(int(row), (2, 8, 8, 3)) for row in reader_of(scene).rows_of_view(1) if row != 1]
     assert_equal(merged, moments_of([row_values, *others]).merged())
     assert merged.half_a[2, 3, 1] > 2e8
-
-
-def test_merging_goes_on_while_passes_arrive_and_by_several_readers(scene: SceneStore) -> None:
-    samples.commit(scene, 0, samples.outputs(scene, 0))
-    reader = reader_of(scene)
-    assert reader.rows_of_view(0).tolist() == [0]
-    first = merge_rows(reader, reader.rows_of_view(0))
-    samples.commit_all(scene)
-    reader.refresh()
-    first.update(merge_rows(reader_of(scene), reader.rows_of_view(0)[1:]))
-    assert_equal(first.merged(), merge_view(reader, 0))
 
 
 def test_a_view_without_a_complete_pass_is_a_store_error(scene: SceneStore) -> None:

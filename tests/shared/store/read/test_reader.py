@@ -44,15 +44,13 @@ def check(batch: Batch, source: SceneReader, rows: list[int]) -> None:
     """Compare with the samples read one by one."""
     assert batch.rows.tolist() == rows
     for place, row in enumerate(rows):
-        sample = source.read(row, guides=bool(batch.guides))
+        guides = batch.guides(place)
+        sample = source.read(row, guides=guides is not None)
         np.testing.assert_array_equal(batch.linear(place), sample.radiance)
-        for name, values in arrays_of(sample.buffers).items():
-            np.testing.assert_array_equal(batch.buffers[name][place], values)
-        assert set(batch.guides) == (set(arrays_of(sample.guides)) if sample.guides else set())
-        for name, values in batch.guides.items():
-            np.testing.assert_array_equal(values[place], getattr(sample.guides, name))
-        for name, seen in arrays_of(sample.visibility).items():
-            np.testing.assert_array_equal(getattr(batch.visibility(place), name), seen)
+        pairs = [(batch.buffers(place), sample.buffers), (batch.visibility(place), sample.visibility)]
+        for stored, read in [*pairs, *([] if guides is None else [(guides, sample.guides)])]:
+            for name, values in arrays_of(read).items():
+                np.testing.assert_array_equal(getattr(stored, name), values)
         assert batch.modification_rows[place] == source.modification_row(row)
 
 
@@ -70,9 +68,8 @@ def test_a_batch_is_in_the_memory_that_was_given_and_in_the_types_that_are_store
     batch = source.read_batch([3, 1], memory)
     assert len(batch) == 2
     assert np.shares_memory(batch.radiance, memory.radiance)
-    assert all(np.shares_memory(batch.buffers[name], memory.buffers[name]) for name in ("depth", "albedo", "normal"))
-    assert all(np.shares_memory(batch.seen[name], memory.seen[name]) for name in ("point_seen", "photon_seen"))
-    types = {name: values.dtype.name for name, values in batch.buffers.items()}
+    assert all(np.shares_memory(values, memory.of_view[name]) for name, values in batch.of_view.items())
+    types = {name: values.dtype.name for name, values in batch.of_view.items() if "seen" not in name}
     assert types == {"depth": "float32", "albedo": "float16", "normal": "float16"}
     expected = source.read(3).radiance * 2.0**source.spec.radiance_exponent
     assert batch.radiance.dtype == np.float16
@@ -98,7 +95,7 @@ def test_what_a_batch_has_no_memory_for_is_not_read(scene: SceneStore, source: S
         file.unlink()
     buffers, guides = gone != "depth", gone != "direct"
     batch = source.read_batch([0, 1], Batch.empty(source.spec, 2, buffers=buffers, guides=guides))
-    assert (bool(batch.buffers), bool(batch.seen), bool(batch.guides)) == (buffers, buffers, guides)
+    assert [name in batch.of_view for name in ("depth", "point_seen", "direct")] == [buffers, buffers, guides]
     with pytest.raises(CorruptError):
         source.read_batch([0, 1], Batch.empty(source.spec, 2, guides=True))
 
@@ -137,14 +134,13 @@ def test_a_bit_that_flips_while_batches_are_read_is_found(scene: SceneStore, sou
 
 
 def test_no_more_files_stay_open_than_are_allowed(source: SceneReader, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two for each shard: its own, and that of its map."""
     monkeypatch.setattr(shards, "OPEN_SHARDS", 3)
     descriptors = Path("/proc/self/fd")
     before = len(list(descriptors.iterdir()))
     memory = Batch.empty(source.spec, 8)
     for _ in range(5):
         source.read_batch(range(8), memory)
-        assert len(list(descriptors.iterdir())) <= before + 2 * 3
+        assert len(list(descriptors.iterdir())) <= before + 3
     del source
 
 
@@ -161,7 +157,7 @@ def test_threads_that_read_at_once_each_get_their_own_samples(
             rows = rng.integers(0, 8, 4)
             batch = source.read_batch(rows, memory)
             np.testing.assert_array_equal(batch.radiance, expected.radiance[rows])
-            np.testing.assert_array_equal(batch.buffers["normal"], expected.buffers["normal"][rows])
+            np.testing.assert_array_equal(batch.of_view["normal"], expected.of_view["normal"][rows])
 
     with ThreadPoolExecutor(2 * (os.cpu_count() or 1)) as threads:
         list(threads.map(read, range(6)))

@@ -5,6 +5,7 @@ import shlex
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import arrays_of
 from photonfarm.plan.request import PlannedRows, Request
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.model.plans import StoredPlan
 from photonfarm.store.read.find import Matches, Query, find_samples, scene_named
 
 
@@ -197,7 +197,7 @@ def test_half_a_million_samples_are_searched_at_once(store: Store, scene: SceneS
     large.sample_modification[:] = large.sample_view[:] = np.arange(count)
     large.sample_pass[:] = 0
     large.sample_key[:] = rng.integers(0, 256, (count, 16), np.uint8)
-    scene._plans[:] = [StoredPlan(0, scene.plans()[0].folder, Request(), 0, count // 4, 4, large)]
+    scene._plans[:] = [replace(scene.plans()[0], request=Request(), jobs=count // 4, rows=large)]
     scene.plans = lambda: scene._plans
     began = time.process_time()
     assert rows(find(store, modification=text(large.modification[123_456]), tolerance=0)) == [123_456]

@@ -150,7 +150,7 @@ class ShardRenderer:
     def _render(self, loaded: _Loaded, rows: JobRows) -> bool:
         stored, began = loaded.stored, self._now()
         cloud = loaded.cloud()
-        with stored.job_writer(rows) as out:
+        with JobWriter(stored, rows) as out:
             report = self._on_progress if loaded.compiled else self._compiles_first
             others = self._other_halves(rows.plan.halves_from)
             rendering = _Rendering(loaded.scene, cloud, stored.spec, out, report, others)

@@ -13,7 +13,7 @@ from photonfarm.cli.store_verbs import withdraw as verb
 from photonfarm.core.errors import CorruptError, SpecError
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
-from photonfarm.store import SceneStore, Store
+from photonfarm.store import JobWriter, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
 from photonfarm.store.model.lease import announce_work
@@ -73,7 +73,7 @@ def test_what_was_forgotten_is_planned_again_and_nothing_is_there_twice(scene: S
 
 def test_a_worker_that_was_at_a_withdrawn_job_throws_it_away(scene: SceneStore) -> None:
     given = samples.outputs(scene, 1)
-    with scene.job_writer(scene.job_rows(1)) as out:
+    with JobWriter(scene, scene.job_rows(1)) as out:
         samples.give(out, given)
         withdraw(fresh(scene))
         assert not out.commit(samples.FIGURES)

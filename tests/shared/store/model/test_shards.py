@@ -26,7 +26,7 @@ shapes = st.lists(st.integers(1, 9), min_size=1, max_size=4).map(tuple)
 
 
 def array_of(dtype: str, shape: tuple[int, ...], *, compressed: bool) -> ArraySchema:
-    return ArraySchema("values", "sample", shape, np.dtype(dtype), 0, compressed, ("x",) * len(shape), {})
+    return ArraySchema("values", "sample", shape, np.dtype(dtype), compressed)
 
 
 def random_rows(array: ArraySchema, rows: list[int], seed: int) -> dict[int, Any]:
@@ -105,11 +105,10 @@ def test_shards_read_equal_in_zarr_and_those_of_zarr_read_equal_here(
     for row, values in rows.items():
         theirs[row] = values
     shard = Shard(folder / "theirs" / array.shard_name(0), array, shard_rows)
-    for _ in range(2):  # from the file, then from the map
-        for row in range(shard_rows):
-            found = shard.read(row)
-            assert (found is None) == (row not in rows)
-            assert found is None or same(found, rows[row])
+    for row in range(shard_rows):
+        found = shard.read(row)
+        assert (found is None) == (row not in rows)
+        assert found is None or same(found, rows[row])
 
 
 def test_the_checksum_is_the_crc_32c_of_another_library() -> None:
@@ -118,45 +117,12 @@ def test_the_checksum_is_the_crc_32c_of_another_library() -> None:
         assert int.from_bytes(shards.crc_of(content[:length]), "little") == google_crc32c.value(content[:length])
 
 
-# ---------------------------------------------------------------------------------------------------- reading the rows
-
-
-@pytest.mark.parametrize("can_map", [True, False])
-def test_rows_read_again_and_again_come_from_a_map_where_there_can_be_one(
-    noise: tuple[Path, ArraySchema, dict[int, Any]], monkeypatch: pytest.MonkeyPatch, can_map: bool
-) -> None:
-    path, array, rows = noise
-    if not can_map:
-        monkeypatch.setattr(shards, "_NO_WAIT", None)
-    shard = Shard(path, array, SHARD_ROWS)
-    memory = np.zeros(array.shape, array.dtype)
-    for _ in range(3):
-        for row, values in rows.items():
-            shard.read_into(row, memory)
-            assert same(memory, values)
-    assert (shard._map is not None) == can_map
-
-
-def test_rows_that_have_left_the_page_cache_are_read_from_the_disk_again(
-    noise: tuple[Path, ArraySchema, dict[int, Any]],
-) -> None:
-    path, array, rows = noise
-    shard = Shard(path, array, SHARD_ROWS)
-    for _ in range(3):
-        assert all(same(shard.read(row), values) for row, values in rows.items())
-        with path.open("rb") as file:
-            os.fsync(file.fileno())
-            os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-
 # --------------------------------------------------------------------------------------------------------- damaged ones
 
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("opened", [False, True])
-def test_a_changed_bit_is_found_wherever_it_is_also_in_a_file_that_is_mapped(
-    tmp_path: Path, compressed: bool, opened: bool
-) -> None:
+def test_a_changed_bit_is_found_wherever_it_is(tmp_path: Path, compressed: bool, opened: bool) -> None:
     array = array_of("<f4", (6, 5), compressed=compressed)
     rows = random_rows(array, [2, 0, 3], seed=2)
     path = tmp_path / "shard"
@@ -189,8 +155,7 @@ def _check_equal(shard: Shard, rows: dict[int, Any]) -> None:
 
 
 @pytest.mark.parametrize("compressed", [False, True])
-def test_a_file_that_is_cut_while_it_is_mapped_raises_where_it_ends(tmp_path: Path, compressed: bool) -> None:
-    """A process that touched the map beyond the end of its file would be ended by SIGBUS."""
+def test_a_file_that_is_cut_while_it_is_open_raises_where_it_ends(tmp_path: Path, compressed: bool) -> None:
     array = array_of("<f2", (2, 64, 64, 3), compressed=compressed)
     rows = random_rows(array, [0, 1, 2], seed=3)
     path = tmp_path / "shard"

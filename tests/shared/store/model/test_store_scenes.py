@@ -15,7 +15,7 @@ from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
 from photonfarm.queue import connect, queue_status, reconcile
-from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store import JobWriter, SceneReader, SceneStore, Store, store_status
 from photonfarm.store.check.check import check_store
 from photonfarm.store.io.local import LocalStorage
 from photonfarm.store.read.find import Query, find_samples, scene_named
@@ -177,7 +177,7 @@ def test_a_store_that_goes_under_a_worker_is_told_and_not_begun_anew(
     given = samples.outputs(scene, 1)
 
     def work() -> None:
-        with scene.job_writer(scene.job_rows(1)) as out:
+        with JobWriter(scene, scene.job_rows(1)) as out:
             if when == "before a row":
                 go(store.root)
             samples.give(out, given)

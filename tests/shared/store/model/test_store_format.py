@@ -89,8 +89,8 @@ def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) ->
         attributes = dict(about["attributes"])
         exponent = attributes.pop("radiance_exponent", None)
         assert (exponent is not None) == array.name.startswith("radiance")
-        if array.name in schema.FIELDS:
-            assert attributes.pop("fields") == list(schema.FIELDS[array.name])
+        if array.name in declarations.FIELDS:
+            assert attributes.pop("fields") == list(declarations.FIELDS[array.name])
         assert attributes.pop("groups", None) == (["object"] if array.name == "modification" else None)
         assert attributes == {"unit": array.unit, "convention": array.convention}
         assert about["data_type"] == np.dtype(array.dtype).name

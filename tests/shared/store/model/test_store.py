@@ -105,7 +105,7 @@ def test_outputs_that_are_not_exactly_the_jobs_are_refused(scene: SceneStore) ->
     wide = samples.small_spec(film={"width": 16, "height": 8})
     fewer = {**given.visibility, 0: replace(given.visibility[0], points=np.ones(15, np.bool_))}
     for named, changes in {
-        "radiance": {"radiance": lacking},
+        "sample 3": {"radiance": lacking},
         "depth": {"buffers": wrong},
         "emission": {"guides": {**given.guides, 0: samples.guides(wide, 0)}},
         "point_seen": {"visibility": fewer},
@@ -127,7 +127,7 @@ def test_what_a_view_sees_is_stored_as_bits_the_least_significant_first(store: S
     np.testing.assert_array_equal(visibility.points, seen)
     np.testing.assert_array_equal(visibility.photons, np.ones(paths, np.bool_))
     assert (visibility.points.dtype, visibility.photons.dtype) == (np.bool_, np.bool_)
-    stored = read.read_batch([0]).seen
+    stored = {name: bits for name, bits in read.read_batch([0]).of_view.items() if "seen" in name}
     assert set(stored) == ({"point_seen", "photon_seen"} if paths else {"point_seen"})
     as_documented = [int(stored["point_seen"][0, i // 8]) >> i % 8 & 1 for i in range(points)]
     assert as_documented == seen.tolist()

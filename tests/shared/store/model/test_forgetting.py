@@ -15,7 +15,7 @@ from photonfarm.cli.store_verbs import forget as verb
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.queue import count_failures, job_name, keep_failure
-from photonfarm.store import SceneStore, Store
+from photonfarm.store import JobWriter, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
 from photonfarm.store.model.withdrawal import forget
@@ -108,7 +108,7 @@ def test_a_writer_that_slept_through_it_commits_nothing_of_what_it_rendered(
         assert not samples.commit(scene, 2, given)
         again = Store(scene.storage.where).scene(scene.scene_id)
     else:
-        with scene.job_writer(scene.job_rows(2)) as out:
+        with JobWriter(scene, scene.job_rows(2)) as out:
             samples.give(out, given)
             again = plan_anew(scene)
             assert not out.commit(samples.FIGURES)

@@ -106,8 +106,8 @@ def test_a_writer_whose_files_are_all_its_own_compares_them_with_a_marker_that_c
         rows = next(plan for plan in another.plans() if plan.number == 1)
         file = f"{rows.folder}/depth/c.0.0.0"
         about = {"size": 1, "crc32c": "00000000"}
-        figures = scene.marker(0)["figures"]
-        assert markers.place_marker(another.storage, another.name, 1, {file: about}, figures)
+        named = {file.removeprefix(f"{another.name}/"): about}
+        assert markers.place_marker(another.storage, another.name, 1, named, samples.FIGURES)
 
     before(monkeypatch, markers, "place_marker", meanwhile)
     assert samples.commit(scene, 1, samples.outputs(scene, 1))

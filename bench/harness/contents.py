@@ -24,7 +24,7 @@ from photonfarm.core.records import (
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
-from photonfarm.store import Figures, JobRows, SampleRow, SceneStore
+from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneStore
 from photonfarm.store.format.schema import RowKind
 
 FIGURES = Figures(core_s=0.0, wall_s=0.0, redrawn=0, worker="bench", versions={})

@@ -13,7 +13,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.guiding import grid, learning
 from photonfarm.renderer.bdpt.guiding.learning import DEFAULT_SHARE, LightGuide, estimate_gains
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
-from photonfarm.renderer.bdpt.lights.emission import INFINITE, Lights, read_lights, sample_emission
+from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights, sample_emission
 from tests.stability.scenes import hard_scenes
 from tests.stability.weights.weight_check import ball_light, bulb_room, random_usefulness
 
@@ -69,13 +69,6 @@ def test_starts_fall_into_cells_as_the_guide_says(layout: Layout) -> None:
     assert np.abs(count - paths * probability).max() < 2.1
 
 
-def test_a_neutral_guide_has_the_density_of_no_guide() -> None:
-    scene = loaded(hard_scenes.many_lights)
-    plain = read_lights(scene)
-    start = started(plain.guide_with(StartGuide.neutral(Layout.of(plain.count)), scene), 256)
-    np.testing.assert_allclose(np.array(start.factor), np.array(plain.emission_factor(start.emitter)), rtol=1e-5)
-
-
 @pytest.mark.parametrize("towards", [(1, 2, 3), grid._AXIS, (0, 0, 1)], ids=str)
 def test_a_light_in_any_direction_has_a_frame(towards: tuple[float, float, float]) -> None:
     """The frame once had no directions for (1, 2, 3), so that all light paths of such a sun were lost."""
@@ -90,17 +83,6 @@ def test_a_light_in_any_direction_has_a_frame(towards: tuple[float, float, float
     lengths = [float(np.linalg.norm(np.array(v))) for v in (frame.s, frame.t)]
     np.testing.assert_allclose(lengths, 1, rtol=1e-4)
     assert np.isfinite(np.array(start.ray.o)).all()
-
-
-def test_a_dead_light_starts_no_guided_path() -> None:
-    description = hard_scenes.many_lights(16)
-    description["ball_light"]["emitter"] = hard_scenes.shining(0.0)
-    scene = mi.load_dict(description, optimize=False)
-    plain = read_lights(scene)
-    start = started(plain.guide_with(at_random(Layout.of(plain.count)), scene), 4096)
-    dead = next(shape.emitter() for shape in scene.shapes() if shape.id() == "ball_light")
-    assert not np.array(start.valid & (start.emitter == mi.EmitterPtr(dead))).any()
-    assert INFINITE in plain.kinds
 
 
 # ------------------------------------------------ Images ------------------------------------------------
@@ -138,16 +120,6 @@ def test_equal_seeds_give_equal_images_and_guides() -> None:
         assert not np.array_equal(np.array(a), np.array(other))
 
 
-def test_a_guide_that_is_given_serves_all_images_alike() -> None:
-    scene, sensor = (found := loaded(hard_scenes.cornell)), found.sensors()[0]
-    plugin = mi.load_dict({**BDPT, "guided_light": True, "record": True})
-    guide = plugin.learn_guide(scene, sensor, 3)
-    together = np.array(plugin.render_seeds(scene, sensor, [5, 6], 4, guide))
-    for image, seed in zip(together, (5, 6), strict=True):
-        alone = np.array(plugin.render(scene, sensor, seed=seed, spp=4, guide=guide))[..., :3]
-        np.testing.assert_array_equal(alone, image)
-
-
 def test_a_guide_of_other_lights_is_refused() -> None:
     scene = loaded(hard_scenes.cornell)
     guide = LightGuide(StartGuide.neutral(Layout.of(3)), None)
@@ -179,24 +151,6 @@ def test_light_paths_start_as_without_a_guide_where_connections_make_the_error()
     splats, edges = starts * [1, 4, 9, 0], starts * [1, 4, 2, 8]
     found = estimate_gains(layout, splats, 1e4 * splats.sum(), starts, edges, np.ones(1))
     np.testing.assert_allclose(found, 1, atol=1e-3)
-
-
-def test_cells_without_light_paths_have_the_gain_of_their_surroundings() -> None:
-    layout = Layout(1, 4, 1)
-    starts = np.full(16, 1e6)
-    sums = np.repeat([1.0, 4.0, 4.0, 4.0], 4) * starts
-    starts[1] = sums[1] = 0
-    found = estimate_gains(layout, sums, 0.0, starts, starts, np.ones(1))
-    assert found[1] == pytest.approx(found[0], rel=0.01)
-    assert found[4] > 1.5 * found[0]
-
-
-def test_nothing_seen_teaches_nothing() -> None:
-    layout = Layout.of(2)
-    nothing = np.zeros(layout.cells)
-    np.testing.assert_array_equal(
-        estimate_gains(layout, nothing, 0.0, nothing, nothing, np.full(2, 0.5)), np.ones(layout.cells)
-    )
 
 
 @pytest.mark.parametrize(("lights", "cells"), [(1, 1 << 14), (9, 9 << 10), (100, 100 << 6), (1 << 15, 1 << 15)])

@@ -30,18 +30,6 @@ def test_the_public_face_is_pinned() -> None:
     assert bdpt.__all__ == ["BidirectionalPathTracer", "TracedPhotons", "trace_photons"]
 
 
-def test_it_loads_from_xml() -> None:
-    scene = mi.load_string(
-        '<scene version="3.0.0"><integrator type="bdpt"><integer name="connections" value="2"/>'
-        '<float name="light_ratio" value="0.5"/></integrator><sensor type="perspective"><film type="hdrfilm">'
-        '<integer name="width" value="4"/><integer name="height" value="4"/><rfilter type="box"/></film></sensor>'
-        '<emitter type="constant"/></scene>'
-    )
-    assert scene.integrator().connections == 2
-    assert scene.integrator().light_ratio == 0.5
-    np.testing.assert_allclose(np.array(mi.render(scene, spp=2)), 1, rtol=1e-5)
-
-
 # ------------------------------------------------ Edits in place ------------------------------------------------
 
 
@@ -109,14 +97,6 @@ def test_dead_lights_are_never_chosen(renders: Any, assert_equal_means: Any) -> 
     integrator = {"type": "bdpt", "max_depth": 5}
     reference = renders(mi.load_dict(without, optimize=False), integrator, 64, range(100, 108))
     assert_equal_means(renders(scene, integrator, 64, range(8)), reference)
-
-
-def test_a_scene_with_no_light_left_is_black() -> None:
-    scene = load("cove")
-    parameters = mi.traverse(scene)
-    parameters["light.emitter.radiance.value"] = mi.Color3f(0)
-    parameters.update()
-    assert not image(scene).any()
 
 
 # ------------------------------------------------ Refusals ------------------------------------------------
@@ -268,10 +248,3 @@ def test_what_cannot_be_recorded_is_rendered_all_the_same() -> None:
     scene, plugins = mi.load_dict(described, optimize=False), pair()
     for seed in range(3):
         assert_recorded_alike(scene, scene, plugins, seed, 2)
-
-
-def test_the_integrator_says_all_its_settings() -> None:
-    settings = {"max_depth": 7, "rr_depth": 3, "connections": 2, "light_ratio": 0.5, "light_samples": 4}
-    said = str(mi.load_dict({"type": "bdpt", **settings, "guided_light": True}))
-    for name, value in {**settings, "guided_light": True}.items():
-        assert f"{name}={value}" in said

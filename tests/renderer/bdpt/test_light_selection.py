@@ -125,29 +125,7 @@ def _pooled(counts: Any, expected: Any) -> tuple[Any, Any]:
     return pooled[0][kept], pooled[1][kept] * pooled[0][kept].sum() / pooled[1][kept].sum()
 
 
-def test_extreme_numbers_choose_lights_that_shine() -> None:
-    scene = load(HARD_SCENES["hundred_lights"](8))
-    lights = read_lights(scene)
-    assert lights.selection is not None
-    n = 1000
-    places = mi.Point3f(mi.TensorXf(np.random.default_rng(0).uniform(-3, 3, (3, n)).astype(np.float32)))
-    for u in (0.0, 1 - 2.0**-24):
-        chosen, probability = lights.selection.choose(places, dr.full(mi.Float, u, n))
-        assert (np.array(probability) > 0).all()
-        assert not np.isin(np.array(chosen), [k for k, e in enumerate(scene.emitters()) if _is_dark(e)]).any()
-
-
 # ------------------------------------------------ What they follow ------------------------------------------------
-
-
-def test_equal_lights_are_chosen_by_their_distance() -> None:
-    scene = two_lights(1.0, 1.0)
-    lights, first = read_lights(scene), number_of(scene, "first")
-    assert lights.selection is not None
-    emitter = mi.EmitterPtr(scene.emitters()[first])
-    near, far = (np.array(lights.selection.probability(mi.Point3f(x, 0, 1.6), emitter))[0] for x in (-0.8, 0.8))
-    assert near > 0.8
-    assert far < 0.2
 
 
 def test_a_light_of_a_thousand_times_the_power_is_preferred_accordingly() -> None:

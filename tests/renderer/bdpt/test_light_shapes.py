@@ -49,13 +49,6 @@ def test_light_leaves_a_turned_sphere_on_the_side_that_is_seen_to_shine(scale: A
     np.testing.assert_allclose(np.array(dr.dot(start.sample.n, found.n)), 1, atol=1e-4)
 
 
-@pytest.mark.parametrize("guided", [False, True])
-def test_a_turned_sphere_lights_as_much_by_light_paths(guided: bool, renders: Any, assert_equal_means: Any) -> None:
-    scene = mi.load_dict({**hard_scenes.lit_room(16), "light": turned_ball(0.2, 0.2, 0.2)}, optimize=False)
-    images = renders(scene, {**BDPT, "guided_light": guided, "record": True}, 128, range(8))
-    assert_equal_means(images, renders(scene, {"type": "path", "max_depth": 4}, 512, range(100, 108)))
-
-
 # ------------------------------------------------ Cylinders ------------------------------------------------
 
 
@@ -97,21 +90,6 @@ def sheet(file: Path, texture_scale: float) -> dict[str, Any]:
 def test_texels_that_repeat_do_not_say_where_a_point_lies(texture_scale: float, found: bool, tmp_path: Path) -> None:
     mesh = mi.load_dict(sheet(tmp_path / "sheet.ply", texture_scale))
     assert bool(is_unfolded(mesh)[0]) is found
-
-
-@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_two_sides_of_a_thin_panel_share_their_texels(order: tuple[int, int]) -> None:
-    """Mitsuba samples one side alone, however close the other is."""
-    corners = np.array([(-0.3, -0.3), (-0.3, 0.3), (0.3, 0.3), (0.3, -0.3)])
-    below, above = (np.column_stack([corners, np.full(4, z)]) for z in (1.5, 1.504))
-    sides = [[0, 1, 2, 0, 2, 3], [4, 6, 5, 4, 7, 6]]
-    mesh = mi.Mesh("panel", 8, 4, has_vertex_texcoords=True)
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = np.vstack([below, above]).ravel().tolist()
-    parameters["faces"] = sides[order[0]] + sides[order[1]]
-    parameters["vertex_texcoords"] = [0, 0, 0, 1, 1, 1, 1, 0] * 2
-    parameters.update()
-    assert not bool(is_unfolded(mesh)[0])
 
 
 def test_faces_that_share_their_texels_are_lights_for_hits_alone(renders: Any, assert_equal_means: Any) -> None:

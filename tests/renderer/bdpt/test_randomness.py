@@ -56,18 +56,6 @@ def test_a_thousand_sequences_are_nets() -> None:
     assert all(is_net(each, 4) for each in xy)
 
 
-def test_single_numbers_are_stratified() -> None:
-    rng = randomness.sampler(randomness.stream(randomness.image_keys([5]), randomness.LIGHT), dr.arange(mi.UInt32, 256))
-    for _ in range(4):
-        assert len(np.unique((np.array(rng.next_1d()) * 256).astype(int))) == 256
-
-
-def test_numbers_are_in_the_half_open_unit_interval() -> None:
-    values = points(11, 1 << 16, pairs=4)
-    assert values.min() >= 0
-    assert values.max() < 1
-
-
 # ------------------------------------------------ Uniform ------------------------------------------------
 
 READS = ("next_2d", "next_1d", "next_independent")
@@ -166,22 +154,6 @@ def test_lanes_along_the_curve_are_stratified_for_any_number(n: int) -> None:
     assert (np.abs(piece - (np.arange(n) + 0.5)) <= 0.5 + n * 2.0**-30).all()
 
 
-@pytest.mark.parametrize("n", [3, 100, 1000])
-def test_points_along_the_curve_are_uniform(n: int) -> None:
-    xy = on_curve(n, repeats=max(1, 20000 // n)).reshape(-1, 2)
-    counts = np.histogram2d(xy[:, 0], xy[:, 1], bins=8, range=[[0, 1], [0, 1]])[0]
-    # Stratified points are more even than independent ones, so chi² is too small rather than too large
-    assert stats.chi2.sf(((counts - len(xy) / 64) ** 2 / (len(xy) / 64)).sum(), 63) > SIGNIFICANCE
-    for values in xy.T:
-        assert stats.kstest(values, "uniform").pvalue > SIGNIFICANCE
-
-
-def test_neighbours_along_the_curve_are_neighbours_in_space() -> None:
-    (xy,) = on_curve(4096)
-    steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
-    assert np.median(steps) < 2 / 64
-
-
 # ------------------------------------------------ Shifts ------------------------------------------------
 
 
@@ -189,13 +161,6 @@ def launch(light_paths: int, images: int = 1, first_sample: int = 0) -> Launch:
     return Launch(
         images=images, first_image=0, samples=4, first_sample=first_sample, light_paths=light_paths, first_light_path=0
     )
-
-
-def test_shifts_are_uniform_below_the_number_of_light_paths() -> None:
-    values = np.array(randomness.shifts(range(100), launch(10, images=100), 2))
-    assert values.shape == (100 * randomness.SHIFTS * 2,)
-    assert values.max() < 10
-    assert stats.chisquare(np.bincount(values, minlength=10)).pvalue > SIGNIFICANCE
 
 
 def test_shifts_belong_to_a_seed_and_to_a_part_of_its_samples() -> None:

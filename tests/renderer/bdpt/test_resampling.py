@@ -51,12 +51,6 @@ def test_a_sum_over_slots_has_the_expectation_of_the_sum_over_paths() -> None:
     assert np.std(sums) > 0
 
 
-def test_equal_weights_change_nothing() -> None:
-    slots, factor = drawn(np.full((2, 100), 0.7, np.float32), np.array([0.2, 0.9]))
-    np.testing.assert_array_equal(slots.ravel(), np.arange(200))
-    np.testing.assert_allclose(factor, 0.7, rtol=1e-6)
-
-
 def test_where_no_path_has_a_weight_slots_have_the_first_path_of_their_image() -> None:
     weight = weights(3)
     weight[1] = 0
@@ -65,15 +59,6 @@ def test_where_no_path_has_a_weight_slots_have_the_first_path_of_their_image() -
     assert (slots[1] == PATHS).all()
     assert (factor[1] == 0).all()
     assert not (slots[2] == 2 * PATHS + 5).any()
-
-
-def test_images_of_a_launch_are_drawn_as_alone() -> None:
-    weight, offset = weights(4), np.array([0.1, 0.5, 0.7])
-    slots, factor = drawn(weight, offset)
-    for k in range(IMAGES):
-        alone = drawn(weight[k : k + 1], offset[k : k + 1])
-        np.testing.assert_array_equal(slots[k] - k * PATHS, alone[0][0])
-        np.testing.assert_array_equal(factor[k], alone[1][0])
 
 
 def test_the_number_of_threads_changes_no_bit() -> None:

@@ -56,20 +56,6 @@ def test_no_cell_is_less_useful_than_the_least() -> None:
     np.testing.assert_array_equal(found[-CELLS // 4 :], LEAST)
 
 
-def test_cells_that_were_not_met_are_as_useful_as_those_around_them() -> None:
-    shape = (SIDE, SIDE, SIDE, NORMALS)
-    connections, sums = np.full(shape, 1e4), np.full(shape, 1e4)
-    sums[: SIDE // 2] *= 9
-    connections[1, 1, 1], sums[1, 1, 1] = 0, 0
-    found = estimate_usefulness(sums.ravel(), connections.ravel()).reshape(shape)
-    np.testing.assert_allclose(found[1, 1, 1], found[0, 0, 0], rtol=0.02)
-
-
-def test_where_connections_add_nothing_all_are_alike() -> None:
-    np.testing.assert_array_equal(estimate_usefulness(np.zeros(CELLS), np.ones(CELLS)), np.ones(CELLS))
-    np.testing.assert_array_equal(estimate_usefulness(np.zeros(CELLS), np.zeros(CELLS)), np.ones(CELLS))
-
-
 @pytest.mark.parametrize("wrong", [np.full(CELLS, np.nan), np.zeros(CELLS), np.ones(2)], ids=["nan", "zero", "short"])
 def test_a_table_that_would_lose_light_is_refused(wrong: Any) -> None:
     with pytest.raises(ValueError, match=r"table of usefulness .* above 0"):

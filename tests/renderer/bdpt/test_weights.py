@@ -109,12 +109,6 @@ def test_weights_are_the_balance_heuristic_of_the_densities(k: int, n: float, n_
         assert path.weight(s) == pytest.approx(densities[s] / sum(densities), rel=1e-5)
 
 
-@pytest.mark.parametrize("k", [2, 3, 6])
-def test_weights_of_one_path_sum_to_one(k: int) -> None:
-    path = RandomPath(k, 0.5, 0.7, seed=99)
-    assert sum(path.weight(s) for s in range(k + 1)) == pytest.approx(1, rel=1e-5)
-
-
 def test_a_sensor_that_cannot_be_hit_leaves_out_light_tracing() -> None:
     assert weights.eye_start(mi.Float(1.0), mi.Float(0.0))[0] == 0
 

@@ -155,16 +155,6 @@ def test_under_an_even_sky_a_floor_reflects_its_albedo_and_points_receive_pi() -
     assert point_light(scene, *points, KEY, GuideSpec()).mean() == pytest.approx(2 * np.pi, rel=0.03)
 
 
-def test_without_light_samples_or_lamps_nothing_arrives() -> None:
-    dark = known(floor_and_lamp(), ABOVE, light_samples=0)
-    assert not dark.direct.any()
-    assert not dark.gloss.any()
-    assert dark.mean_depth.any()
-    assert not known(scene_of(floor=square((0, 0, 0), UP, 3, bsdf=diffuse())), ABOVE).direct.any()
-    only_emission = known(floor_and_lamp(), ABOVE, transport={"max_depth": 1})
-    assert not only_emission.direct.any()
-
-
 MATERIALS: dict[str, Shape] = {
     "diffuse": diffuse(),
     "roughplastic": {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": rgb(GREY)},

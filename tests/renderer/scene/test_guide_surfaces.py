@@ -145,20 +145,6 @@ def test_roughness_and_gloss_of_a_pixel_are_means_over_what_it_shows() -> None:
 # ---------------------------------------------------------------------------------------------------- shape, and beyond
 
 
-def test_mean_depth_and_normal_are_the_centres_on_a_plane_and_the_normal_is_turned_to_the_eye() -> None:
-    scene = scene_of(wall=square((0, 0, 0), (0, 0, 1), 4, bsdf={"type": "twosided", "bsdf": diffuse()}))
-    for z in (3, -3):
-        view = View(np.array([0.3, 0.2, z], np.float32), np.array([0.3, 0.2, 0], np.float32))
-        found, buffers = known(scene, view), view_buffers(scene, view, spec())
-        np.testing.assert_allclose(found.mean_depth, buffers.depth, rtol=1e-5)
-        np.testing.assert_allclose(found.mean_normal, np.sign(z) * buffers.normal, atol=1e-6)
-    slanted = View(np.array([2, 1.5, 2], np.float32), np.zeros(3, np.float32))
-    found, buffers = known(scene, slanted), view_buffers(scene, slanted, spec())
-    whole = buffers.depth > 0
-    inner = np.pad(whole, 1)[:-2, 1:-1] & np.pad(whole, 1)[2:, 1:-1] & whole
-    np.testing.assert_allclose(found.mean_depth[inner], buffers.depth[inner], rtol=5e-3)
-
-
 def test_beyond_a_mirror_lies_the_wall_that_it_shows() -> None:
     """Along the path from (0, 0, 3) by z = 0 to z = 6: 9 over the cosine; half of the wall is grey, half black."""
     turned = mi.ScalarTransform4f().rotate([0, 0, 1], 20).scale(5)

@@ -82,19 +82,6 @@ def test_recorded_buffers_and_photons_are_those_that_python_traces_anew(room: Lo
         assert photons.power.sum() > 0
 
 
-def test_the_rest_state_comes_back_bit_by_bit(room: LoadedScene, somewhere: View) -> None:
-    room.apply(rest(room.spec))
-    state, image, buffers = mesh_state(room), room.render_half(somewhere, 9), room.buffers(somewhere)
-    for i in range(4):
-        room.apply(sample_modification(room.spec, 1, i))
-    assert mesh_state(room) != state
-    room.apply(rest(room.spec))
-    assert mesh_state(room) == state
-    np.testing.assert_array_equal(room.render_half(somewhere, 9), image)
-    np.testing.assert_array_equal(room.buffers(somewhere).depth, buffers.depth)
-    np.testing.assert_array_equal(room.buffers(somewhere).albedo, buffers.albedo)
-
-
 def test_after_many_edits_a_scene_gives_the_bytes_of_a_fresh_load(room: LoadedScene, somewhere: View) -> None:
     target = sample_modification(room.spec, 4, 9)
     for i in range(6):
@@ -178,10 +165,3 @@ def test_embree_can_be_told_to_expect_changes_and_each_scene_is_told_by_itself()
     assert 0 != first != second != 0
     assert all(native.expect_changes(scene) for scene in scenes)
     assert pending[0]
-
-
-def test_a_ray_that_comes_from_no_known_function_of_embree_changes_nothing(
-    room: LoadedScene, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(native, "_entry_points", lambda _: {0xBAD})
-    assert not native.expect_changes(room.scene)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.surroundings import NONE, hollow_boxes, surroundings
+from photonfarm.renderer.scene.surroundings import NONE, surroundings
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec_loading import load_spec
 
@@ -76,12 +76,6 @@ def test_a_single_sheet_holds_no_point() -> None:
     found = surroundings(scene, near)
     assert found.open.all()
     np.testing.assert_allclose(found.clearance[:2], 0.001, rtol=0.1)
-
-
-def test_a_box_of_most_others_is_hollow() -> None:
-    boxes = np.array([[[0, 0, 0], [9, 9, 9]], [[1, 1, 1], [3, 3, 3]], [[2, 2, 2], [3, 3, 3]]], np.float32)
-    np.testing.assert_array_equal(hollow_boxes(boxes), [True, False, False])
-    assert hollow_boxes(boxes[2:]).all()
 
 
 def test_the_built_in_room_is_open_but_in_its_furniture() -> None:

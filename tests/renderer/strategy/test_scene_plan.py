@@ -58,17 +58,6 @@ def test_a_plan_for_training_says_so_and_what_its_figures_are() -> None:
     assert found.document()["for"] == "training"
 
 
-def test_no_measurement_for_one_purpose_is_taken_for_the_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    spec, images = spec_with(), measurement()
-    training = images.model_copy(update={"purpose": Purpose.TRAINING})
-    measuring.keep(spec, images)
-    assert measuring.find(spec, Purpose.TRAINING) is None
-    measuring.keep(spec, training)
-    assert measuring.find(spec, Purpose.TRAINING) == training
-    assert measuring.find(spec, Purpose.IMAGES) == images
-
-
 UNUSUAL = [
     (Candidate(0, 1.0, guided_light=True), "guided_light"),
     (Candidate(0, 1.0, light_samples=2), "light_samples"),
@@ -139,13 +128,6 @@ def test_settings_are_kept_unless_others_are_significantly_better(error: float, 
         assert "light ratio 1 without connections was measured 1." in text_of(found)
 
 
-def test_the_best_settings_are_kept_as_the_best() -> None:
-    spec = spec_with(connections=0, light_ratio=1.0)
-    assert lines(plan_of(spec, measurement(), cached=False))[1] == (
-        "for images: the spec's settings are the best of those measured longest: keep them"
-    )
-
-
 def test_settings_of_which_no_sample_fits_into_the_present_cost_are_not_taken() -> None:
     """One sample of (0, 0) takes 0.02 s, and of (0, 1) 0.04 s."""
     spec = spec_with(half_spp=1, connections=0, light_ratio=0.0)
@@ -161,11 +143,6 @@ def test_settings_of_which_no_sample_fits_into_the_present_cost_are_not_taken() 
 def test_a_measurement_holds_for_about_the_time_that_it_was_made_for(half_spp: int, known: bool) -> None:
     """It was made for 0.1 s: 9 samples of (1, 1) take 0.38 s."""
     assert knows(measurement(), spec_with(half_spp=half_spp)) == known
-
-
-def test_the_same_time_is_many_samples_of_cheap_settings() -> None:
-    assert knows(measurement(), spec_with(half_spp=39, connections=0, light_ratio=0.0))
-    assert not knows(measurement(), spec_with(half_spp=1, connections=0, light_ratio=0.0))
 
 
 def test_a_saving_is_a_ratio_of_times_to_equal_error() -> None:
@@ -191,13 +168,6 @@ def test_what_was_not_shown_is_not_claimed() -> None:
     text = text_of(plan_of(spec_with(connections=0, light_ratio=0.0), measurement(*rows), cached=False))
     for claim in ("is best:", "pays here", "reach the same error sooner"):
         assert claim not in text
-
-
-def test_a_plan_says_the_same_in_whatever_order_settings_were_measured() -> None:
-    found = measurement()
-    reversed_rows = measurement(*reversed(found.rows))
-    said = [lines(plan_of(spec_with(), each, cached=False)) for each in (found, reversed_rows)]
-    assert said[0] == said[1]
 
 
 def test_the_table_is_aligned_and_says_what_its_columns_are() -> None:

@@ -11,24 +11,14 @@ import numpy as np
 from photonfarm.core.errors import IncompleteError
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidates import Candidate, ImageCost, Render
-from photonfarm.renderer.strategy.pilot import LEAST_PAIRS, SCOUTS
 
 LEAST_TURNS, MOST_TURNS = 3, 60
 
 RANGE = 4
 """The larger over the smaller of the two numbers of samples that are timed."""
 
-LEAST_VIEWS = 3
-"""The views of a pilot at least."""
-
-TRACES = 5
-"""How often a candidate is traced again: for other numbers of samples."""
-
-MARGIN = 1.3
-"""What the time is multiplied by that more settings are expected to take: pilots took up to 1.2 times as long."""
-
-EDITS = 5
-"""How often a pilot brings the scene into each view's configuration, about."""
+COMPILING, REQUIRED = 0.35, 0.5
+"""The largest shares of the time for compiling settings, and for compiling those that are always compared."""
 
 
 @dataclass(slots=True)
@@ -56,40 +46,30 @@ class Budget:
         """How far it is used, in words."""
         return f"{self.spent_s:.0f} of {self.seconds:g} s of processor time"
 
-    def require(self, what: str, more_s: float) -> None:
-        """Raise IncompleteError unless `more_s` are left, needed for `what`."""
-        if more_s > self.left_s:
+    def require(self, what: str, share: float = 1.0) -> None:
+        """Raise IncompleteError if more than a share of the time is used, once `what` is done."""
+        if self.spent_s > share * self.seconds:
             raise IncompleteError(
-                f"{what} does not fit in --seconds {self.seconds:g}: {self.spent_s:.0f} s of processor time are used, "
-                f"and about {max(ceil(more_s), 1)} s more are needed; give it {10 * ceil((self.spent_s + more_s) / 10)}"
+                f"{what} does not fit in --seconds {self.seconds:g}: {self.spent_s:.0f} s of processor time are used; "
+                f"give it {10 * ceil(self.spent_s / share / 10)}"
             )
 
 
-def affordable(
-    render: Render, candidates: Iterable[Candidate], first: Set[Candidate], budget: Budget, edit_s: float, what: str
+def compile_within(
+    render: Render, candidates: Iterable[Candidate], required: Set[Candidate], budget: Budget, what: str
 ) -> list[Candidate]:
-    """The candidates that there is time to compare, compiled by rendering each; those in `first` are among them.
+    """The candidates that there is time to compare, compiled by rendering each; the `required` ones are among them.
 
-    `edit_s` is the time to bring the scene into another configuration. Raises IncompleteError if there is no time for
-    those in `first`; `what` is what does not fit then.
+    Raises IncompleteError if there is no time for these; `what` is what does not fit then.
     """
-    ordered = sorted(candidates, key=lambda candidate: candidate not in first)
-    compiling: list[float] = []
-    images: list[float] = []
-
-    def needed_s(count: int) -> float:
-        timed = (LEAST_TURNS + 1) * (1 + RANGE) * count
-        of_a_view = max(SCOUTS, count) + 2 * -(-LEAST_PAIRS // LEAST_VIEWS) * count
-        rendered_s = (timed + LEAST_VIEWS * of_a_view) * np.mean(images)
-        return float(rendered_s + TRACES * count * min(compiling) + EDITS * LEAST_VIEWS * edit_s)
-
-    for count, candidate in enumerate(ordered, 1):
-        if count > len(first) and MARGIN * needed_s(count) + min(compiling) > budget.left_s:
-            return ordered[: count - 1]
-        for seconds in (compiling, images):
-            seconds.append(_time_of(render, candidate, 1, budget.clock))
-        if count <= len(first):
-            budget.require(what, needed_s(len(first)) + (len(first) - count) * min(compiling))
+    ordered = sorted(candidates, key=lambda candidate: candidate not in required)
+    for count, candidate in enumerate(ordered):
+        if count == len(required):
+            budget.require(what, REQUIRED)
+        if count >= len(required) and budget.spent_s > COMPILING * budget.seconds:
+            return ordered[:count]
+        render(candidate, 0, 1)
+    budget.require(what, REQUIRED if len(ordered) == len(required) else 1.0)
     return ordered
 
 

@@ -23,7 +23,7 @@ from photonfarm.renderer.jobs.render import versions
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
-from photonfarm.renderer.strategy.budget import EDITS, LEAST_VIEWS, Budget, affordable, time_images
+from photonfarm.renderer.strategy.budget import Budget, compile_within, time_images
 from photonfarm.renderer.strategy.candidates import (
     DEFAULT,
     GRID,
@@ -50,7 +50,7 @@ FIRST_ROUND = 0.4
 TIMING = 0.2
 """The share of the given time that is spent on timing images."""
 
-MOST_VIEWS = 8
+LEAST_VIEWS, MOST_VIEWS = 3, 8
 
 LIT = 6
 """The number of configurations in which light paths are traced, to see which photons are worth storing."""
@@ -151,12 +151,10 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
     with WorkLog(log) as work_log:
         work_log.begin(f"loading {spec.name}", budget.words)
         scene = PilotScene(spec, beside)
-        budget.require(f"{spec.name}: loading it", 0.0)
+        budget.require(f"{spec.name}: loading it")
         work_log.begin(f"following the light of {spec.name}", budget.words)
         content, depth = SceneContent.of(scene.loaded.scene, AimedSensor(spec).sensor), spec.transport.max_depth
-        loaded_s = budget.spent_s
         reach = light_reach(scene.configurations(LIT), spec.view, SEED)
-        edit_s = (budget.spent_s - loaded_s) / LIT
         pointless = content.why_no_light_paths(depth, reach.hit)
 
         every = list(dict.fromkeys([*([PLAIN] if pointless else GRID), now]))
@@ -164,14 +162,14 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         _shrink_film(scene, budget.left_s / IMAGES)
         film, renders = scene.spec.film, scene.renders(MOST_VIEWS)
         what = f"{spec.name}: comparing settings"
-        candidates = affordable(renders[0], every, {PLAIN, now} & set(every), budget, edit_s, what)
+        candidates = compile_within(renders[0], every, {PLAIN, now}, budget, what)
         timed = time_images(renders[:LEAST_VIEWS], candidates, half_spp, TIMING * budget.left_s, scene.clock)
         shared_by = 2 if purpose is Purpose.TRAINING else 1  # the half-estimates of a launch share its fixed part
         scale = spec.film.width * spec.film.height / (film.width * film.height)
         costs = {c: ImageCost(cost.fixed_s / shared_by, scale * cost.sample_s) for c, cost in timed.items()}
         half_s = costs[now].time_s(half_spp)
 
-        left_s = max(budget.left_s - EDITS * LEAST_VIEWS * edit_s, 0.0)
+        left_s = max(budget.left_s, 0.0)
         image_s = FIRST_ROUND * left_s / (2 + max(1.0, SCOUTS / len(timed)))  # for one of each candidate in each view
         fixed_s, sample_s = sum(cost.fixed_s for cost in timed.values()), sum(cost.sample_s for cost in timed.values())
         spp = int(np.clip((image_s / LEAST_VIEWS - fixed_s) / sample_s, 1, half_spp))
@@ -187,7 +185,6 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
             seed=SEED,
             keep=[c for c in (DEFAULT, now) if c in candidates],
             weigh=purpose.weigh(spec.exposure),
-            clock=scene.clock,
         )
     fewer = f"settings compared: {len(candidates)} of {len(every)}, as --seconds {seconds:g} allows no more"
     return Measurement(

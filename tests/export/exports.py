@@ -10,7 +10,7 @@ import store_samples as samples
 from pyarrow import parquet
 
 from photonfarm.export.export import Result, export_scene
-from photonfarm.export.manifest import ExportRequest
+from photonfarm.export.folder import ExportRequest
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneStore, Store
 

@@ -20,7 +20,7 @@ KILLED = """
 import os, sys
 from pathlib import Path
 from photonfarm.export.export import export_scene
-from photonfarm.export.manifest import ExportRequest
+from photonfarm.export.folder import ExportRequest
 
 def progress(done, total, size):
     if done == 5:

@@ -10,7 +10,7 @@ import store_samples as samples
 
 from photonfarm.export.card import READING
 from photonfarm.export.export import export_scene
-from photonfarm.export.manifest import ExportRequest, FormatName
+from photonfarm.export.folder import ExportRequest, FormatName
 from photonfarm.plan.request import Request
 from photonfarm.store import Store
 

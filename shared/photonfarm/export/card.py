@@ -14,8 +14,7 @@ from photonfarm.core.errors import store_errors
 from photonfarm.core.files import write_whole
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.export.columns import Column, Contents
-from photonfarm.export.folder import DATA
-from photonfarm.export.manifest import FormatName, Manifest
+from photonfarm.export.folder import DATA, FormatName, Manifest
 from photonfarm.export.snapshot import Snapshot
 
 CARD = "README.md"
@@ -167,47 +166,18 @@ CROISSANT = "croissant.json"
 
 _TYPES = {"str": "sc:Text", "bool": "sc:Boolean", "int64": "sc:Integer"}
 
+_TERMS = ("column", "dataType", "extract", "field", "fileSet", "includes", "isArray", "arrayShape", "isLiveDataset")
 _CONTEXT: dict[str, Any] = {
     "@language": "en",
     "@vocab": "https://schema.org/",
-    "citeAs": "cr:citeAs",
-    "column": "cr:column",
-    "conformsTo": "dct:conformsTo",
-    "cr": "http://mlcommons.org/croissant/",
-    "data": {"@id": "cr:data", "@type": "@json"},
-    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
-    "dct": "http://purl.org/dc/terms/",
-    "extract": "cr:extract",
-    "field": "cr:field",
-    "fileObject": "cr:fileObject",
-    "fileProperty": "cr:fileProperty",
-    "fileSet": "cr:fileSet",
-    "format": "cr:format",
-    "includes": "cr:includes",
-    "isArray": "cr:isArray",
-    "arrayShape": "cr:arrayShape",
-    "isLiveDataset": "cr:isLiveDataset",
-    "jsonPath": "cr:jsonPath",
-    "key": "cr:key",
-    "md5": "cr:md5",
-    "parentField": "cr:parentField",
-    "path": "cr:path",
-    "recordSet": "cr:recordSet",
-    "references": "cr:references",
-    "regex": "cr:regex",
-    "repeated": "cr:repeated",
-    "replace": "cr:replace",
     "sc": "https://schema.org/",
-    "separator": "cr:separator",
-    "source": "cr:source",
-    "subField": "cr:subField",
-    "transform": "cr:transform",
-    "rai": "http://mlcommons.org/croissant/RAI/",
-    "equivalentProperty": "cr:equivalentProperty",
-    "samplingRate": "cr:samplingRate",
-    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "cr": "http://mlcommons.org/croissant/",
+    "dct": "http://purl.org/dc/terms/",
+    "conformsTo": "dct:conformsTo",
+    **{term: f"cr:{term}" for term in (*_TERMS, "key", "recordSet", "source")},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
 }
-"""The context that the specification of Croissant 1.1 prints."""
+"""Of the context that the specification of Croissant 1.1 prints, the terms that are used here."""
 
 
 def write_croissant(exported: Exported) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 from photonfarm.core.errors import SpecError
@@ -60,18 +60,14 @@ class Contents:
     @property
     def images(self) -> list[Column]:
         """What has a value for each pixel."""
-        size = self._size
-        return [column for column in self.columns if not column.fact and column.shape[:2] == size]
+        (half,) = (column for column in self.columns if column.name == HALVES[0])
+        return [column for column in self.columns if not column.fact and column.shape[:2] == half.shape[:2]]
 
     @property
     def others(self) -> list[Column]:
         """What is neither."""
-        size = self._size
-        return [column for column in self.columns if not column.fact and column.shape[:2] != size]
-
-    @property
-    def _size(self) -> tuple[int, ...]:
-        return next(column.shape[:2] for column in self.columns if column.name == HALVES[0])
+        images = self.images
+        return [column for column in self.columns if not column.fact and column not in images]
 
 
 def parse_buffers(text: str) -> tuple[str, ...]:
@@ -90,76 +86,49 @@ def parse_buffers(text: str) -> tuple[str, ...]:
 
 
 def list_columns(spec: SceneSpec, buffers: Sequence[str], *, visibility: bool) -> tuple[Column, ...]:
-    """The columns of a scene's samples: facts, the half-estimates, buffers, and visibility if it is asked for."""
-    size = (spec.film.height, spec.film.width)
-    unit, _ = _find_declaration("radiance")
-    halves = [Column(name, "float32", (*size, 3), unit, _describe_half(name)) for name in HALVES]
-    return (
-        *_list_facts(spec),
-        *halves,
-        *(_describe_stored(spec, name) for name in buffers),
-        *(_list_visibility(spec) if visibility else ()),
-    )
+    """The columns of a scene's samples: facts, the half-estimates, buffers, and visibility if it is asked for.
 
-
-def _describe_half(name: str) -> str:
-    other = HALVES[name == "A"]
-    return f"linear RGB, mean over the pixel, not clipped; a noisy estimate of the image, independent of {other}"
+    A buffer or guide has the type that the store has: its values are the stored ones.
+    """
+    size, arrays = (spec.film.height, spec.film.width), schema.output_arrays(spec)
+    declared = {each.name: each for each in declarations.OUTPUTS}
+    columns = _list_facts(spec)
+    for name, other in (HALVES, HALVES[::-1]):
+        meaning = f"linear RGB, mean over the pixel, not clipped; a noisy estimate of the image, independent of {other}"
+        columns.append(Column(name, "float32", (*size, 3), declared["radiance"].unit, meaning))
+    for name in buffers:
+        array, about = arrays[name], declared[name]
+        columns.append(Column(name, array.dtype.name, array.shape, about.unit, about.convention))
+    for name, seen in (("point_seen", "point of the cloud"), ("photon_seen", "photon of the configuration")):
+        if visibility and (length := schema.bit_counts(spec)[name]):
+            columns.append(Column(name, "bool", (length,), "1", f"whether the view sees each {seen}"))
+    return tuple(columns)
 
 
 def _list_facts(spec: SceneSpec) -> list[Column]:
     groups = len(spec.groups)
-    moved = Column(
-        "modification",
-        "float32",
-        (groups, 4),
-        "scene units; the last: 1",
-        "of each movable group, in the "
-        "order of the spec: translation from rest along x, y, z, then 1: present or 0: removed",
+    moved = (
+        "of each movable group, in the order of the spec: translation from rest along x, y, z, then 1: present or 0: "
+        "removed"
     )
-    facts = [
-        Column("row", "int64", (), "1", "the sample's row in the store"),
-        Column("key", "str", (), "", "the sample's content key, hexadecimal"),
-        Column("split", "str", (), "", "train, or held-out: of a configuration to be kept from training"),
-        Column("pass", "int64", (), "1", "number of the noisy pass of this view, from 0"),
-        Column("configuration_key", "str", (), "", "content key of the configuration: equal for all its views"),
-        Column("view_key", "str", (), "", "content key of configuration and view: equal for all its passes"),
-        *([moved] if groups else []),
-        Column("origin", "float32", (3,), "scene units", "where the camera stands, world coordinates"),
-        Column("target", "float32", (3,), "scene units", "the point that it looks at, world coordinates"),
-        Column(
-            "camera_to_world",
-            "float64",
-            (4, 4),
-            "scene units",
-            "columns: the camera's right, up and backward, and where it stands (the convention of NeRF and OpenGL)",
-        ),
-        Column("seed_A", "int64", (), "1", "seed of A; a render that was not finite was drawn again with another"),
-        Column("seed_B", "int64", (), "1", "seed of B, likewise"),
-        Column("job", "int64", (), "1", "the render job that it came from"),
-        Column("core_s", "float64", (), "s", "processor time of that job, over its samples"),
+    camera = "columns: the camera's right, up and backward, and where it stands (the convention of NeRF and OpenGL)"
+    facts: list[tuple[str, str, tuple[int, ...], str, str]] = [
+        ("row", "int64", (), "1", "the sample's row in the store"),
+        ("key", "str", (), "", "the sample's content key, hexadecimal"),
+        ("split", "str", (), "", "train, or held-out: of a configuration to be kept from training"),
+        ("pass", "int64", (), "1", "number of the noisy pass of this view, from 0"),
+        ("configuration_key", "str", (), "", "content key of the configuration: equal for all its views"),
+        ("view_key", "str", (), "", "content key of configuration and view: equal for all its passes"),
+        *([("modification", "float32", (groups, 4), "scene units; the last: 1", moved)] if groups else []),
+        ("origin", "float32", (3,), "scene units", "where the camera stands, world coordinates"),
+        ("target", "float32", (3,), "scene units", "the point that it looks at, world coordinates"),
+        ("camera_to_world", "float64", (4, 4), "scene units", camera),
+        ("seed_A", "int64", (), "1", "seed of A; a render that was not finite was drawn again with another"),
+        ("seed_B", "int64", (), "1", "seed of B, likewise"),
+        ("job", "int64", (), "1", "the render job that it came from"),
+        ("core_s", "float64", (), "s", "processor time of that job, over its samples"),
     ]
-    return [replace(each, fact=True) for each in facts]
-
-
-def _describe_stored(spec: SceneSpec, name: str) -> Column:
-    """A buffer or guide in the type that the store has: its values are the stored ones."""
-    array = schema.output_arrays(spec)[name]
-    return Column(name, array.dtype.name, array.shape, *_find_declaration(name))
-
-
-def _list_visibility(spec: SceneSpec) -> list[Column]:
-    columns = []
-    for name, count in schema.bit_counts(spec).items():
-        what = "point of the cloud" if name == "point_seen" else "photon of the configuration"
-        columns.append(Column(name, "bool", (count,), "1", f"whether the view sees each {what}"))
-    return [column for column in columns if column.shape[0]]
-
-
-def _find_declaration(name: str) -> tuple[str, str]:
-    """Unit and convention of an array, as the store's format declares them."""
-    (declaration,) = (each for each in declarations.OUTPUTS if each.name == name)
-    return declaration.unit, declaration.convention
+    return [Column(*each, fact=True) for each in facts]
 
 
 _RANGE = re.compile(r"(\d{1,18})(?:-(\d{1,18}))?")

@@ -12,15 +12,22 @@ import numpy as np
 
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.waiting import tell_waiting
-from photonfarm.export import card, folder, manifest
+from photonfarm.export import card, folder
 from photonfarm.export.card import Exported
-from photonfarm.export.columns import GUIDES, Column, Contents, format_ranges, list_columns, parse_buffers, parse_ranges
-from photonfarm.export.folder import Files, Planned
+from photonfarm.export.columns import (
+    GUIDES,
+    Column,
+    Contents,
+    format_ranges,
+    list_columns,
+    parse_buffers,
+    parse_ranges,
+    parse_rows,
+)
+from photonfarm.export.folder import ExportRequest, ExportSettings, Files, Manifest, Part, SceneName
 from photonfarm.export.formats import Format, load_format
-from photonfarm.export.manifest import ExportRequest, ExportSettings, Manifest, SceneName
 from photonfarm.export.snapshot import Snapshot, Values, describe_constants
-from photonfarm.scene.spec import SceneSpec
-from photonfarm.store import SceneStore, Store
+from photonfarm.store import Store
 from photonfarm.store.format.declarations import VERSION
 from photonfarm.store.read.find import scene_or_spec
 
@@ -60,48 +67,34 @@ def export_scene(
     form = load_format(request.to)
     opened = Store(store)
     stored = scene_or_spec(opened, scene)
-    buffers = parse_buffers(request.buffers)
-    folder.check_extras(stored.spec, request.extras)
-    contents = _plan_contents(form, stored.spec, buffers, request)
-    settings = _choose_settings(buffers, contents, request)
-    name = SceneName(id=stored.scene_id, name=stored.spec.name)
+    spec, buffers, per_file = stored.spec, parse_buffers(request.buffers), request.samples_per_file
+    if "photons" in request.extras and not spec.photons.paths:
+        raise SpecError(f"--with: 'photons' is not there: scene {spec.name} has photons.paths = 0")
+    if form.ONE_PER_FILE and per_file not in (None, 1):
+        raise SpecError(f"--samples-per-file {per_file}: --to {request.to} has one sample per file")
+    single = form.ONE_PER_FILE or (form.ONE_PER_FILE is None and per_file in (None, 1))
+    columns = list_columns(spec, buffers, visibility="visibility" in request.extras)
+    contents = Contents(columns, describe_constants(spec), single)
+    settings = ExportSettings(
+        to=request.to,
+        buffers=buffers,
+        extras=tuple(sorted(request.extras)),
+        samples_per_file=1 if single else per_file or max(1, FILE_BYTES // _count_bytes(columns)),
+        hold_out=request.hold_out,
+    )
+    name = SceneName(id=stored.scene_id, name=spec.name)
     wanted = Manifest(scene=name, store=opened.store_id, settings=settings, constants=contents.about)
     with folder.lock_folder(out, wanted) as current:
-        job = _Export(form, out, contents, current, log, on_progress)
-        return job.run(_take_snapshot(store, stored, settings, log), request)
-
-
-def _plan_contents(form: type[Format], spec: SceneSpec, buffers: Sequence[str], request: ExportRequest) -> Contents:
-    single = form.ONE_PER_FILE or (form.ONE_PER_FILE is None and request.samples_per_file in (None, 1))
-    if form.ONE_PER_FILE and request.samples_per_file not in (None, 1):
-        raise SpecError(f"--samples-per-file {request.samples_per_file}: --to {request.to} has one sample per file")
-    columns = list_columns(spec, buffers, visibility="visibility" in request.extras)
-    return Contents(columns, describe_constants(spec), single)
-
-
-def _choose_settings(buffers: tuple[str, ...], contents: Contents, request: ExportRequest) -> ExportSettings:
-    per_file = (
-        1 if contents.single else request.samples_per_file or max(1, FILE_BYTES // _count_bytes(contents.columns))
-    )
-    extras = tuple(sorted(request.extras))
-    return ExportSettings(
-        to=request.to, buffers=buffers, extras=extras, samples_per_file=per_file, hold_out=request.hold_out
-    )
+        guides = not set(GUIDES).isdisjoint(buffers)
+        with tell_waiting(log, f"looking for what is complete of scene {spec.name} ({stored.scene_id})"):
+            snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
+        log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete")
+        return _Export(form, out, contents, current, log, on_progress).run(snapshot, request)
 
 
 def _count_bytes(columns: Sequence[Column]) -> int:
     """The bytes of a sample's values, without text."""
     return sum(int(np.prod(each.shape)) * np.dtype(each.dtype).itemsize for each in columns if each.dtype != "str")
-
-
-def _take_snapshot(
-    store: str | Path, stored: SceneStore, settings: ExportSettings, log: Callable[[str], None]
-) -> Snapshot:
-    guides = not set(GUIDES).isdisjoint(settings.buffers)
-    with tell_waiting(log, f"looking for what is complete of scene {stored.spec.name} ({stored.scene_id})"):
-        snapshot = Snapshot(store, stored, guides=guides, hold_out=settings.hold_out)
-    log(f"{len(snapshot.rows)} of {snapshot.planned} planned samples are complete")
-    return snapshot
 
 
 class _Export:
@@ -119,8 +112,8 @@ class _Export:
         self._form, self._out, self._contents, self._manifest = form, out, contents, current
         self._log, self._on_progress = log, on_progress
         self._files = Files(out, form.SUFFIX, current.settings.samples_per_file, single=contents.single)
-        self._configurations = set(folder.list_configurations(out))
-        self._done = self._total = self._bytes = 0
+        self._configurations = {file.stem for file in (out / folder.FOLDER).glob("[!.]*.npz")}
+        self._done = self._total = 0
 
     def run(self, snapshot: Snapshot, request: ExportRequest) -> Result:
         """Write what is new, and then what describes the whole."""
@@ -128,26 +121,32 @@ class _Export:
         there, written = self._files.scan(self._manifest.parts)
         new = sorted(set(chosen) - set(there))
         splits = {split: [row for row in new if snapshot.split_of(row) == split] for split in ("train", "held-out")}
-        planned, parts = self._files.plan(splits, written)
+        planned = self._files.plan(splits, written)
         if there:
             self._log(f"{self._out} holds {len(there)} samples already; {len(new)} are new")
         self._total = len(new)
-        self._manifest = self._manifest.model_copy(update={"complete": False, "parts": tuple(parts)})
-        manifest.write(self._out, self._manifest)
+        parts = () if self._contents.single else (*written, *planned)
+        self._manifest = self._manifest.model_copy(update={"complete": False, "parts": parts})
+        folder.write_manifest(self._out, self._manifest)
         written_bytes = 0
         for part in planned:
-            self._form.write(part.file, self._samples(snapshot, part), self._contents)
-            written_bytes += part.file.stat().st_size
+            file = self._out / part.file
+            self._form.write(file, self._samples(snapshot, part), self._contents)
+            written_bytes += file.stat().st_size
         rows = [*there, *new]
         with tell_waiting(self._log, f"describing {len(rows)} samples"):
-            self._finish(snapshot, rows)
+            self._manifest = self._manifest.model_copy(update=self._description(snapshot, rows))
+            exported = Exported(self._out, snapshot, self._contents, self._manifest)
+            self._form.finish(exported)
+            card.write_card(exported)
+            folder.write_manifest(self._out, self._manifest)
         shared = len(self._configurations)
         return Result(str(self._out), snapshot.spec.scene_id, len(rows), len(new), len(planned), written_bytes, shared)
 
-    def _samples(self, snapshot: Snapshot, part: Planned) -> Iterator[Values]:
+    def _samples(self, snapshot: Snapshot, part: Part) -> Iterator[Values]:
         """The samples of a file; what belongs to their configurations is written before them."""
         extras = [each for each in self._manifest.settings.extras if each in folder.OF_CONFIGURATION]
-        for row in part.rows:
+        for row in parse_rows(part.rows):
             sample = snapshot.sample(row)
             values = snapshot.values(sample, self._contents.columns)
             key = values["configuration_key"]
@@ -156,16 +155,7 @@ class _Export:
                 self._configurations.add(key)
             yield values
             self._done += 1
-            self._bytes += _count_bytes(self._contents.columns)
-            self._on_progress(self._done, self._total, self._bytes)
-
-    def _finish(self, snapshot: Snapshot, rows: Collection[int]) -> None:
-        """Write what describes all files: the format's own, the card and, last, the manifest."""
-        self._manifest = self._manifest.model_copy(update=self._description(snapshot, rows))
-        exported = Exported(self._out, snapshot, self._contents, self._manifest)
-        self._form.finish(exported)
-        card.write_card(exported)
-        manifest.write(self._out, self._manifest)
+            self._on_progress(self._done, self._total, self._done * _count_bytes(self._contents.columns))
 
     def _description(self, snapshot: Snapshot, rows: Collection[int]) -> dict[str, Any]:
         """What the manifest says of a folder with these rows."""

@@ -25,8 +25,7 @@ from photonfarm.core.errors import StoreError, store_errors
 from photonfarm.core.files import whole_file, write_whole
 from photonfarm.export.card import Exported, write_croissant
 from photonfarm.export.columns import HALVES, Column, Contents, parse_rows
-from photonfarm.export.folder import SAMPLES
-from photonfarm.export.manifest import FormatName
+from photonfarm.export.folder import SAMPLES, FormatName
 from photonfarm.export.snapshot import Snapshot, Values, camera_to_world, select_facts
 
 if TYPE_CHECKING:

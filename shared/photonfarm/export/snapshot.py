@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
-from functools import cached_property
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.core.keys import seed_of, view_key
-from photonfarm.data import Sample, Scene
+from photonfarm.data import Sample
 from photonfarm.export.columns import HALVES, Column
+from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
-from photonfarm.store import SceneStore
+from photonfarm.store import SceneReader, SceneStore
 
 Split = Literal["train", "held-out"]
 
@@ -29,20 +28,16 @@ class Snapshot:
 
     def __init__(self, place: str | Path, stored: SceneStore, *, guides: bool, hold_out: float) -> None:
         """Look once; samples that are completed later are not in it. With `guides` samples come with their guides."""
-        self._stored = stored
-        self._scene = Scene(place, stored.scene_id, guides=guides)  # it is not refreshed
-        self.spec: SceneSpec = self._scene.spec
+        self._stored, self._guides = stored, guides
+        self._reader = SceneReader(place, stored.scene_id)
+        self.rows: list[int] = self._reader.refresh().tolist()  # of all complete samples, ascending
+        self.spec: SceneSpec = self._reader.spec
         self._plans = stored.plans()
-        self._place = {row: place for place, row in enumerate(self._scene.rows.tolist())}
-        self._held_out = set(self._scene.split("held-out", hold_out=hold_out).rows.tolist())
-        self._job: _Job | None = None
+        held_out = rows_held_out(self._reader, self.rows, hold_out)
+        self._held_out = {row for row, is_held_out in zip(self.rows, held_out, strict=True) if is_held_out}
+        self._figures: tuple[int, dict[str, Any]] = -1, {}  # of the last job, as rows come in order
         self.versions: list[dict[str, str]] = []
         """The versions of the packages that rendered what has been read so far, each set once."""
-
-    @property
-    def rows(self) -> Collection[int]:
-        """The rows of all complete samples, ascending."""
-        return self._place.keys()
 
     def split_of(self, row: int) -> Split:
         """Whether the sample in a row is to be trained on or held out."""
@@ -50,7 +45,7 @@ class Snapshot:
 
     def jobs_of(self, rows: Iterable[int]) -> list[int]:
         """The jobs of rows, each once."""
-        return sorted({row // self._shard_rows for row in rows})
+        return sorted({row // self._plans[0].shard_rows for row in rows})
 
     def plans(self) -> list[dict[str, Any]]:
         """The plans of the scene: number, first row, samples and request of each."""
@@ -64,98 +59,55 @@ class Snapshot:
         """The number of samples in all plans."""
         return sum(plan.samples for plan in self._plans)
 
-    @property
-    def _shard_rows(self) -> int:
-        return self._plans[0].shard_rows
-
     # ----------------------------------------------------------------------------------------------------- of a sample
 
     def sample(self, row: int) -> Sample:
         """The sample in a row; raises CorruptError if stored bytes are not what was committed."""
-        sample: Sample = self._scene[self._place[row]]
-        return sample
+        return self._reader.read(row, guides=self._guides)
+
+    def inputs(self, row: int) -> tuple[Modification, View]:
+        """The configuration and the view of a row."""
+        return self._reader.inputs(row)[:2]
 
     def values(self, sample: Sample, columns: Sequence[Column]) -> Values:
         """The values of a sample, each in its column's type."""
-        values = self._facts(sample.row) | dict(zip(HALVES, sample.radiance, strict=True))
-        return {column.name: _take_value(sample, column, values) for column in columns}
-
-    def inputs(self, row: int) -> tuple[Modification, View]:
-        """The configuration and the view of a row, complete or not."""
-        return self._of_job(row // self._shard_rows).inputs(row)
-
-    def _facts(self, row: int) -> Values:
-        """What the sample in a row is: all its columns but images and visibility."""
-        job = self._of_job(row // self._shard_rows)
-        modification, view = job.inputs(row)
-        sample = job.samples[row]
-        key = modification.key(self.spec.radiance_id)
+        values = self._facts(sample) | dict(zip(HALVES, sample.radiance, strict=True)) | sample.images
+        values |= {"point_seen": sample.visibility.points, "photon_seen": sample.visibility.photons}
         return {
-            "row": row,
+            each.name: np.ascontiguousarray(values[each.name], each.dtype) if each.shape else values[each.name]
+            for each in columns
+        }
+
+    def _facts(self, sample: Sample) -> Values:
+        """What a sample is: all its columns but images and visibility."""
+        (job,) = self.jobs_of([sample.row])
+        seed_a, seed_b = sample.seeds
+        return {
+            "row": sample.row,
             "key": sample.key.hex(),
-            "split": self.split_of(row),
-            "pass": sample.pass_,
-            "configuration_key": key.hex(),
-            "view_key": view_key(key, view.vector).hex(),
-            "modification": modification.vector,
-            "origin": view.origin,
-            "target": view.target,
-            "camera_to_world": camera_to_world(view, self.spec),
-            "seed_A": seed_of(sample.key, "half A"),
-            "seed_B": seed_of(sample.key, "half B"),
-            "job": job.number,
+            "split": self.split_of(sample.row),
+            "pass": sample.pass_number,
+            "configuration_key": self._reader.modification_key(sample.row).hex(),
+            "view_key": self._reader.view_key(sample.row).hex(),
+            "modification": sample.modification.vector,
+            "origin": sample.view.origin,
+            "target": sample.view.target,
+            "camera_to_world": camera_to_world(sample.view, self.spec),
+            "seed_A": seed_a,
+            "seed_B": seed_b,
+            "job": job,
             "core_s": self._core_s(job),
         }
 
-    def _of_job(self, number: int) -> _Job:
-        """A job; the last one is kept, as rows come in order."""
-        if self._job is None or self._job.number != number:
-            self._job = _Job(self._stored, number)
-        return self._job
-
-    def _core_s(self, job: _Job) -> float:
-        if job.versions not in self.versions:
-            self.versions.append(job.versions)
-        return job.core_s
-
-
-class _Job:
-    """A job: its inputs and, of a committed one, its cost per sample, and what rendered it."""
-
-    def __init__(self, stored: SceneStore, number: int) -> None:
-        self._stored, self.number = stored, number
-        self._rows = stored.job_rows(number)
-        self.samples = {sample.row: sample for sample in self._rows.samples}
-
-    def inputs(self, row: int) -> tuple[Modification, View]:
-        sample = self.samples[row]
-        return self._rows.modifications[sample.modification_row], self._rows.views[sample.view_row]
-
-    @cached_property
-    def _figures(self) -> dict[str, Any]:
-        figures: dict[str, Any] = self._stored.marker(self.number)["figures"]
-        return figures
-
-    @property
-    def core_s(self) -> float:
-        return float(self._figures["core_s"]) / len(self.samples)
-
-    @property
-    def versions(self) -> dict[str, str]:
-        return dict(self._figures["versions"])
-
-
-def _take_value(sample: Sample, column: Column, values: Values) -> Any:
-    """The value of a column, in its type."""
-    if column.name in values:
-        value = values[column.name]
-    elif column.name == "point_seen":
-        value = sample.point_cloud.seen
-    elif column.name == "photon_seen":
-        value = sample.seen_photons
-    else:
-        value = getattr(sample, column.name)
-    return np.ascontiguousarray(value, column.dtype) if column.shape else value
+    def _core_s(self, job: int) -> float:
+        """The cost of a sample of a job; the versions of what rendered it are kept."""
+        if self._figures[0] != job:
+            self._figures = job, self._stored.marker(job)["figures"]
+        figures = self._figures[1]
+        if figures["versions"] not in self.versions:
+            self.versions.append(figures["versions"])
+        (samples,) = (plan.samples_in(job) for plan in self._plans if job in plan.own_jobs)
+        return float(figures["core_s"]) / samples
 
 
 def camera_to_world(view: View, spec: SceneSpec) -> NDArray[np.float64]:

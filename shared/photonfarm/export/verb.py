@@ -94,7 +94,7 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
     Exit codes: 0 exported, 7 no sample is complete, 4 store or folder, 3 what the scene does not have, 130 Ctrl-C.
     """
     from photonfarm.export.export import export_scene
-    from photonfarm.export.manifest import ExportRequest
+    from photonfarm.export.folder import ExportRequest
 
     try:
         with show_progress() as (log, on_progress):

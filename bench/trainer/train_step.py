@@ -33,11 +33,11 @@ from photonfarm.store.read.batch import Batch
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES
-from photonfarm.trainer.networks.inputs import Inputs
+from photonfarm.trainer.networks.inputs import Inputs, SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.paper_networks import LightTransportPhotons
 from photonfarm.trainer.runs import run_folder
-from photonfarm.trainer.runs.devices import usable_device
+from photonfarm.trainer.runs.devices import Ranks, usable_device
 from photonfarm.trainer.runs.run_folder import METRICS
 from photonfarm.trainer.runs.settings import TrainSettings, make_preset
 from photonfarm.trainer.training.learner import Learner
@@ -129,7 +129,7 @@ def measure(where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer, 
     """One architecture on a complete store."""
     with Feed(SceneReader(*where), settings) as feed:
         rows = [row for row, _ in feed.arrivals()[0]]
-        learner = Learner(feed, settings)
+        learner = Learner(SceneFrame.of(feed.spec, *feed.base, settings.network), settings, Ranks())
         feed.ask(rows[: settings.batch])
         batch = feed.take()
         step, image = (timed(learner, batch, usable_device(settings.device), clock, gradients=g) for g in (True, False))

@@ -4,7 +4,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from photonfarm.trainer.data.feed import Feed, SampleSource
+from photonfarm.store import SceneReader
+from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predictors.evaluation import make_network_predictor, measure, read_batches
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report.trained_runs import Baselines
@@ -19,12 +20,12 @@ class Errors:
     configurations: int
 
 
-def held_out_errors(make: Callable[[], SampleSource], folder: Path) -> Errors:
+def held_out_errors(make: Callable[[], SceneReader], folder: Path) -> Errors:
     """The held-out errors of a run; `make` gives its source anew, as each is read once."""
     run = TrainedRun.load(folder)
     with Feed(make(), run.settings.model_copy(update={"device": "cpu"}), needs=run.needs) as feed:
         rows = [row for row, held in feed.arrivals()[0] if held][:MOST_HELD_OUT]
         baselines = Baselines.of(make(), run, rows)
-        network = run.network(feed.spec, (feed.geometry, feed.cloud))
+        network = run.network(feed.spec, feed.base)
         last = measure(make_network_predictor(network), read_batches(feed, rows, run.settings.batch)).error
     return Errors(baselines.untrained.error.mean, last.mean, baselines.mean_colour.error.mean, last.count)

@@ -15,6 +15,7 @@ from photonfarm.trainer import dry_run
 from photonfarm.trainer.dry_run import DryRun, MadeUpScene, NetworkPart, format_dry_run, rehearse, summarise
 from photonfarm.trainer.networks import ARCHITECTURES, predict_image
 from photonfarm.trainer.networks.network import Network
+from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings, make_settings
 from photonfarm.trainer.training.learner import Learner
 
@@ -29,6 +30,10 @@ def settings(**changes: object) -> TrainSettings:
     return make_settings("small", {"width": 4, "points": 256, "device": "cpu", **changes})
 
 
+def learner_of(scene: MadeUpScene, chosen: TrainSettings) -> Learner:
+    return Learner(scene.frame(chosen.network), chosen, Ranks())
+
+
 def found(size: int = 16, **changes: object) -> DryRun:
     return rehearse(spec_of(size), settings(**changes))
 
@@ -36,7 +41,7 @@ def found(size: int = 16, **changes: object) -> DryRun:
 @pytest.mark.parametrize("architecture", ARCHITECTURES)
 def test_every_network_takes_real_steps_on_made_up_samples(architecture: str) -> None:
     scene = MadeUpScene.of(spec_of(16))
-    learner = Learner(scene, settings(architecture=architecture))
+    learner = learner_of(scene, settings(architecture=architecture))
     before = [weight.clone() for weight in learner.network.parameters()]
     losses = [learner.step(number, scene.batch(2, settings(architecture=architecture).network)) for number in range(5)]
     assert all(math.isfinite(loss) for loss in losses)
@@ -46,7 +51,7 @@ def test_every_network_takes_real_steps_on_made_up_samples(architecture: str) ->
 
 def test_points_of_the_made_up_scene_are_seen_in_its_views() -> None:
     scene, chosen = MadeUpScene.of(spec_of(64)), settings(architecture="feature_projection")
-    network = Learner(scene, chosen).network
+    network = learner_of(scene, chosen).network
     (channels,) = network.further(scene.batch(3, chosen.network).inputs)
     covered = (channels.abs().sum(dim=-1) > 0).flatten(1).sum(dim=1)
     assert isinstance(network, Network)
@@ -70,7 +75,7 @@ def test_a_step_has_three_times_the_work_of_an_image() -> None:
 def test_memory_counts_what_backward_needs_and_not_what_has_the_shape_of_weights() -> None:
     """Of a U-Net of two levels' width 1 each convolution keeps its input once, and the weights are no activations."""
     scene, chosen = MadeUpScene.of(spec_of(16)), settings(architecture="cnn")
-    learner = Learner(scene, chosen)
+    learner = learner_of(scene, chosen)
     _, kept = dry_run.count_work(learner, scene.batch(1, chosen.network))
     inputs = []
     for layer in learner.network.modules():
@@ -114,7 +119,7 @@ def test_the_paper_takes_the_work_of_its_convolutions() -> None:
     """62.1 GMAC forward at 256² [method 2], three times that in a step: of 150 000 steps of 32 are 1.8 · 10¹⁸."""
     spec = load_spec("room").model_copy(update={"film": load_spec("room").film.model_copy(update={"width": 64})})
     scene, paper = MadeUpScene.of(spec), make_settings("paper", {"device": "cpu"})
-    flops, _ = dry_run.count_work(Learner(scene, paper), scene.batch(1, paper.network))
+    flops, _ = dry_run.count_work(learner_of(scene, paper), scene.batch(1, paper.network))
     assert 16 * flops == pytest.approx(3 * 2 * 62.1e9, rel=0.03)
 
 

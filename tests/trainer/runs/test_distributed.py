@@ -23,7 +23,7 @@ from photonfarm.core.errors import IncompleteError, PhotonfarmError, SpecError, 
 from photonfarm.plan.request import Request
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs import devices as processes
-from photonfarm.trainer.runs.devices import Ranks, join_ranks, lead
+from photonfarm.trainer.runs.devices import Ranks, join_ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import Learner
@@ -66,8 +66,8 @@ def together(make: Callable[[], Any], settings: TrainSettings, run: Path, **how:
         if group.rank:
             assist(lambda *_: make(), settings, run, group)
             return
-        with lead(group):
-            train(make(), settings, run, Hooks(group=group, **how))
+        with group.lead():
+            train(make(), settings, run, Hooks(ranks=group, **how))
 
     return in_both(target, settings.batch)
 
@@ -105,8 +105,8 @@ def test_each_process_reads_its_own_part_and_only_rank_0_what_is_held_out(make_s
         if group.rank:
             assist(lambda *_: source, tiny(batch=4), run, group)
         else:
-            with lead(group):
-                train(source, tiny(batch=4), run, Hooks(group=group))
+            with group.lead():
+                train(source, tiny(batch=4), run, Hooks(ranks=group))
         (tmp_path / f"{group.rank}.json").write_text(json.dumps(source.reads))
 
     assert in_both(target) == [0, 0]

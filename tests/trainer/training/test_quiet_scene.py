@@ -4,8 +4,6 @@ import contextlib
 import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -14,14 +12,16 @@ from typing import Any
 
 import pytest
 import torch
+from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.model.lease import hold_lease
 from photonfarm.store.model.withdrawal import forget
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.devices import join_ranks, lead
+from photonfarm.trainer.runs.devices import join_ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training import other_ranks
@@ -45,7 +45,7 @@ def committed(scene: SceneStore, commit, monkeypatch: pytest.MonkeyPatch) -> Sce
 
 @pytest.fixture
 def settings(tiny) -> TrainSettings:
-    return tiny(max_steps=60, hold_out=0.3, validate_every=20, checkpoint_every=1)
+    return tiny(max_steps=24, hold_out=0.3, validate_every=8, checkpoint_every=1)
 
 
 class Trainer:
@@ -63,14 +63,11 @@ class Trainer:
         os.environ.update({name: str(value) for name, value in told.items()})
         source = SceneReader(self._scene.storage.root, self._scene.scene_id)
         with join_ranks("cpu", self._settings.batch) as group, stop_on_signals() as stop:
-            how = {} if group is None else {"group": group}
-            hooks = Hooks(stop=stop, on_wait=self._note, on_draws=lambda *_: time.sleep(0.05), **how)
-            if group is None:
-                train(source, self._settings, self._run, hooks)
-            elif group.rank:
+            hooks = Hooks(stop=stop, on_wait=self._note, on_draws=lambda *_: time.sleep(0.05), ranks=group)
+            if group.rank:
                 assist(lambda *_: source, self._settings, self._run, group)
             else:
-                with lead(group):
+                with group.lead():
                     train(source, self._settings, self._run, hooks)
 
     def _note(self, sentence: str) -> None:
@@ -108,10 +105,8 @@ def repair(scene: SceneStore, job: int) -> str:
     """Damage a job, and have it repaired by the verb."""
     path = next((scene.folder / "plans/000000/radiance").glob(f"c.{job}.*"))
     path.write_bytes(path.read_bytes()[:-1])
-    code = "import sys; from photonfarm.cli.main import main; sys.argv[0] = 'photonfarm'; sys.exit(main())"
-    verb = [sys.executable, "-c", code, "store", "check", "--repair", "--store", str(scene.storage.root)]
-    ended = subprocess.run(verb, capture_output=True, text=True, timeout=100)
-    assert ended.returncode == IncompleteError.exit_code, ended.stderr
+    ended = CliRunner().invoke(umbrella, ["store", "check", "--repair", "--store", str(scene.storage.root)])
+    assert ended.exit_code == IncompleteError.exit_code, ended.output
     assert scene.missing_jobs() == [job]
     return ended.stderr
 
@@ -121,7 +116,7 @@ def test_training_waits_for_a_repair_and_for_what_it_set_aside_and_ends_in_the_s
 ) -> None:
     train(SceneReader(committed.storage.root, committed.scene_id), settings, tmp_path / "undisturbed")
     trainer = Trainer(committed, settings, run)
-    until(lambda: trainer.step > 2)
+    until(lambda: trainer.step > 1)
     assert f"waits for trainer of run {run}" in repair(committed, 0)
     assert trainer.said("store check --repair")
     until(lambda: trainer.said("training waits: 4 samples were set aside; workers render them again"))
@@ -139,7 +134,7 @@ def test_a_run_that_is_stopped_while_it_waits_goes_on_to_the_same_weights(
 ) -> None:
     train(SceneReader(committed.storage.root, committed.scene_id), settings, tmp_path / "undisturbed")
     trainer = Trainer(committed, settings, run)
-    until(lambda: trainer.step > 2)
+    until(lambda: trainer.step > 1)
     with hold_lease(committed.storage, committed.scene_id, "store join", lambda _: None):
         until(lambda: trainer.said("store join"))
         os.kill(trainer.processes[0].pid, signal.SIGTERM)
@@ -159,12 +154,12 @@ def test_two_processes_have_both_ended_their_reading_when_the_lease_begins(
 ) -> None:
     assert Trainer(committed, settings, tmp_path / "undisturbed", size=2).codes() == [0, 0]
     trainer = Trainer(committed, settings, run, size=2)
-    until(lambda: trainer.step > 2)
+    until(lambda: trainer.step > 1)
     with hold_lease(committed.storage, committed.scene_id, "store join", lambda _: None):
         stands = trainer.step
         (moved := committed.folder.with_name("elsewhere")).mkdir()
         committed.folder.rename(moved / "scene")  # whoever reads now fails
-        time.sleep(1)
+        time.sleep(0.5)
         assert trainer.step == stands
         (moved / "scene").rename(committed.folder)
     assert trainer.codes() == [0, 0]

@@ -22,7 +22,7 @@ from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, METRICS
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.validation import NEXT, UP_TO_WHITE, BestValidation, Validation, compare, validate
+from photonfarm.trainer.training.validation import NEXT, UP_TO_WHITE, Validation, compare, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
@@ -39,8 +39,8 @@ def validation(errors: dict[int, float], views: int = 1, step: int = 0) -> Valid
     return Validation(step, (*errors,), held_out)
 
 
-def best(errors: dict[int, float]) -> BestValidation:
-    return BestValidation(0, errors)
+def best(errors: dict[int, float]) -> dict[str, Any]:
+    return validation(errors).state()
 
 
 def spoilt(source: Any, reads: Callable[[int], bool]) -> Any:
@@ -128,7 +128,7 @@ def test_lamps_that_got_worse_are_not_held_against_a_run_whose_loss_cares_little
 
     for loss, worse in [("linear", True), ("relative", False), ("paired", False)]:
         was = at(batch, before, loss)
-        assert compare(at(batch, learned, loss), BestValidation(0, was.errors, was.judge)).is_worse is worse
+        assert compare(at(batch, learned, loss), was.state()).is_worse is worse
     assert at(batch, learned, "relative").held_out.shown == pytest.approx(0.0)
     assert at(batch, before, "relative").held_out.shown == pytest.approx(0.01 * 15 / 16)
 
@@ -140,7 +140,7 @@ def test_noise_does_not_make_a_dark_network_look_better_than_the_right_one() -> 
     right, dark = (np.full((1, 64, 64, 3), value, np.float32) for value in (0.3, 0.15))
     batch = batch_of(halves[:1], halves[1:])
     was = at(batch, dark, "relative")
-    found = compare(at(batch, right, "relative"), BestValidation(0, was.errors, was.judge))
+    found = compare(at(batch, right, "relative"), was.state())
     assert found.is_best
     assert found.best == pytest.approx(0.15**2, rel=0.2)
 
@@ -160,11 +160,9 @@ def at(batch: Any, predicted: Any, loss: str) -> Validation:
 
 
 def test_a_best_of_all_light_is_none_for_a_run_that_is_judged_by_light_up_to_white() -> None:
-    older = {"step": 4, "rows": torch.tensor([0]), "errors": torch.tensor([0.5], dtype=torch.float64)}
-    now = replace(validation({0: 50.0}), judge=UP_TO_WHITE)
-    for by_pixels in ({}, {"by_shown": True}):  # as older versions wrote it
-        assert compare(now, BestValidation.of({**older, **by_pixels})).is_best
-    assert compare(now, BestValidation.of(BestValidation(4, {0: 0.5}, judge=UP_TO_WHITE).state())).is_worse
+    now, before = replace(validation({0: 50.0}), judge=UP_TO_WHITE), validation({0: 0.5})
+    assert compare(now, before.state()).is_best
+    assert compare(now, replace(before, judge=UP_TO_WHITE).state()).is_worse
 
 
 # ----------------------------------------------------------------------------------------------------------------- runs

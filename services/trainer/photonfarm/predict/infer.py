@@ -84,7 +84,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
             raise _explain_missing(source, row)
         feed.ask([row])
         batch = feed.take()
-        predict = run.predictor(feed.spec, (feed.geometry, feed.cloud), device)
+        predict = run.predictor(feed.spec, feed.base, device)
     shown = {"prediction": (image := predict(batch)[0]), "target": batch.target[0].mean(dim=0).numpy()}
     files = tuple(out / f"{name}.png" for name in shown)
     _make_folder(out)

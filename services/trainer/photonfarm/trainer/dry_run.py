@@ -28,7 +28,7 @@ from photonfarm.scene.view import Camera, View
 from photonfarm.trainer.data.batch import TrainingBatch, allocate_memory, count_bytes
 from photonfarm.trainer.networks import build, find_kind
 from photonfarm.trainer.networks.inputs import SceneFrame
-from photonfarm.trainer.runs.devices import describe_device, usable_device
+from photonfarm.trainer.runs.devices import Ranks, describe_device, usable_device
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import Learner, name_compile_errors
 
@@ -58,6 +58,10 @@ class MadeUpScene:
         group, face = np.full(spec.points, STATIC, np.int16), np.zeros(spec.points, np.uint32)
         albedo, emission = (rng.random((spec.points, 3), np.float32) for _ in range(2))
         return cls(spec, geometry, BasePointCloud(position.astype(np.float32), normal, albedo, emission, group, face))
+
+    def frame(self, settings: NetworkSettings) -> SceneFrame:
+        """The constants that a network is made from."""
+        return SceneFrame.of(self.spec, self.geometry, self.cloud, settings)
 
     def batch(self, size: int, settings: NetworkSettings) -> TrainingBatch:
         """A batch with all that the network reads: numbers uniform in [0, 1), flags of which half are set.
@@ -128,7 +132,7 @@ def summarise(spec: SceneSpec, settings: NetworkSettings) -> list[NetworkPart]:
     matrix products; sums, such as the mean over the points in a pixel, are not counted. Descriptors belong to points.
     """
     scene = MadeUpScene.of(spec)
-    network = build(settings, SceneFrame.of(spec, scene.geometry, scene.cloud, settings), seed=0)
+    network = build(settings, scene.frame(settings), seed=0)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(scene.batch(1, settings).inputs)
     counts = {name: sum(ops.values()) / 2e9 for name, ops in counter.get_flop_counts().items()}
@@ -207,12 +211,13 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
     """
     torch.set_num_threads(settings.threads)
     scene, network, device = MadeUpScene.of(spec), settings.network, usable_device(settings.device)
-    learner = Learner(scene, settings.model_copy(update={"compile": "off"}))
+    frame = scene.frame(network)
+    learner = Learner(frame, settings.model_copy(update={"compile": "off"}), Ranks())
     one = scene.batch(1, network)
     flops, activations = count_work(learner, one)
     state = count_state_bytes(learner)
     if settings.compile != "off":
-        learner = Learner(scene, settings)
+        learner = Learner(frame, settings, Ranks())
     most = settings.batch if device.type == "cuda" else int(TIMED_BYTES / activations)
     with name_compile_errors(settings.compile):
         samples, step_s, peak_bytes = time_steps(learner, scene, settings, device, most)

@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from photonfarm.core.records import F32
     from photonfarm.scene.spec import SceneSpec
     from photonfarm.trainer.dry_run import DryRun
-    from photonfarm.trainer.runs.devices import TrainingGroup
+    from photonfarm.trainer.training.loop import Hooks
 
 T = TypeVar("T")
 
@@ -63,106 +64,93 @@ def run(
     signal stops it.
     """
     from photonfarm.store import SceneReader
-    from photonfarm.trainer.runs.devices import SINGLE_PROCESS, describe_device, join_ranks, lead
-    from photonfarm.trainer.training.loop import stop_on_signals
+    from photonfarm.trainer.runs.devices import describe_device, join_ranks
+    from photonfarm.trainer.training.loop import Hooks, stop_on_signals
     from photonfarm.trainer.training.other_ranks import assist
 
     settings = make_settings(preset_name, changes)
-    with join_ranks(settings.device, settings.batch) as ours, stop_on_signals() as stop:
-        group = ours or SINGLE_PROCESS
-        device = group.device(settings.device)
-        if ours is not None and ours.rank:
-            assist(lambda scene_id, exposure: SceneReader(store, scene_id, exposure=exposure), settings, folder, ours)
+    with join_ranks(settings.device, settings.batch) as ranks, stop_on_signals() as stop:
+        device = ranks.device(settings.device)
+        if ranks.rank:
+            assist(lambda scene_id, exposure: SceneReader(store, scene_id, exposure=exposure), settings, folder, ranks)
             return
-        with lead(group):
+        with ranks.lead():
             log(f"training on {describe_device(device, settings.network.precision)}")
             loaded = load_spec(spec) if spec else None
             scene_id = loaded.scene_id if loaded else scene_id
-            beside = scene_folder(spec, loaded) if spec and loaded else None
-            _lead(loaded, beside, scene_id, store, folder, settings, redis_url, stop, group, log, on_record)
+            begun_on, exposure = _read_beginning(folder)
+            if scene_id and begun_on and scene_id != begun_on:
+                raise SpecError(
+                    f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
+                )
+            with _give_sign_of_life(folder):
+                note_scene_folder(folder, scene_folder(spec, loaded) if spec and loaded else None)
+                hooks = Hooks(stop=stop, on_record=on_record, on_wait=log, ranks=ranks)
+                _train(loaded, store, scene_id or begun_on, exposure, folder, settings, redis_url, hooks)
         if until_complete and stop.is_set():
             raise IncompleteError(f"{folder}: a signal stopped it; the same command continues it")
 
 
-def _lead(
+def _train(
     spec: SceneSpec | None,
-    beside: Path | None,
-    scene_id: str | None,
     store: str | Path,
+    scene_id: str | None,
+    exposure: float | None,
     folder: Path,
     settings: TrainSettings,
     redis_url: str | None,
-    stop: Stop,
-    group: TrainingGroup,
-    log: Callable[[str], object],
-    on_record: Callable[[dict[str, Any]], object] | None,
+    hooks: Hooks,
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
     from photonfarm.store import SceneReader
     from photonfarm.trainer.runs.tensorboard import open_event_files
-    from photonfarm.trainer.training.loop import Hooks, train
+    from photonfarm.trainer.training.loop import train
 
-    begun_on, exposure = _read_beginning(folder)
-    if scene_id and begun_on and scene_id != begun_on:
-        raise SpecError(
-            f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
-        )
-    scene_id = scene_id or begun_on
-    with _give_sign_of_life(folder), open_event_files(folder) as board:
-        note_scene_folder(folder, beside)
-        began = time.monotonic()
-        if is_vacant(store):
-            log(f"waiting for a store and a scene in {store} (--store): `photonfarm submit` makes them")
-        scene_id = scene_id or _wait_for(lambda: _find_only_scene(store), stop, settings.max_seconds or math.inf)
-        if scene_id is None and not stop.is_set():
-            raise IncompleteError(
-                f"{store}: no scene to train on has come in {settings.max_seconds:g} s; nothing was trained"
-            )
-        if scene_id is None:
-            log(f"{store}: no scene to train on has come; nothing was trained")
-            return
-        source, waited = SceneReader(store, scene_id, exposure=exposure), time.monotonic() - began
-        if not is_vacant(store) and not source.ready():
-            log(f"waiting for scene {scene_id}, {_describe_lack(Store(store), scene_id, spec)}")
-        elif spec is not None and source.ready() and spec.exposure != source.spec.exposure:
-            of = "the run began with" if exposure else "the store has"
-            log(f"exposure is {source.spec.exposure:g}, which {of}, and not {spec.exposure:g} as the spec says")
-        progress, begun = RunProgress(settings.max_steps, settings.batch), False
+    began, log, on_record = time.monotonic(), hooks.on_wait, hooks.on_record
+    if is_vacant(store):
+        log(f"waiting for a store and a scene in {store} (--store): `photonfarm submit` makes them")
+    limit_s = settings.max_seconds or math.inf
+    scene_id = scene_id or _wait_for(lambda: _find_only_scene(store), hooks.stop, limit_s)
+    if scene_id is None and not hooks.stop.is_set():
+        raise IncompleteError(f"{store}: no scene to train on has come in {limit_s:g} s; nothing was trained")
+    if scene_id is None:
+        log(f"{store}: no scene to train on has come; nothing was trained")
+        return
+    source, waited = SceneReader(store, scene_id, exposure=exposure), time.monotonic() - began
+    if not is_vacant(store) and not source.ready():
+        log(f"waiting for scene {scene_id}, {_describe_lack(Store(store), scene_id, spec)}")
+    elif spec is not None and source.ready() and spec.exposure != source.spec.exposure:
+        of = "the run began with" if exposure else "the store has"
+        log(f"exposure is {source.spec.exposure:g}, which {of}, and not {spec.exposure:g} as the spec says")
+    progress = RunProgress(settings.max_steps, settings.batch)
+    with (
+        open_event_files(folder) as board,
+        _report_use(redis_url, store, scene_id, log) as report_draws,
+        follow_progress(progress, folder, log),
+    ):
 
-        def follow_draws(draws: int, samples: int) -> None:
-            nonlocal begun
-            if draws and not begun:
+        def note_record(record: dict[str, Any]) -> None:
+            for follow in (on_record, board and board.record):
+                if follow:
+                    follow(record)
+
+        def note_draws(draws: int, samples: int) -> None:
+            if draws and not progress.has_begun:
                 log(f"continues at step {draws // settings.batch} of run {folder}")
-            begun = True
             progress.note_draws(draws, samples)
-            on_draws(draws, samples)
+            report_draws(draws, samples)
 
         def show(step: int, rows: tuple[int, ...], targets: F32, predictions: F32) -> None:
             write_views(folder, source.spec.scene_id, step, rows, predictions)
             if board:
                 board.pictures(step, targets, predictions)
 
-        with _report_use(redis_url, store, scene_id, log) as on_draws, follow_progress(progress, folder, log):
-            followers = [follow for follow in (on_record, board and board.record) if follow]
-            outcome = train(
-                source,
-                settings,
-                folder,
-                Hooks(
-                    stop=stop,
-                    on_record=lambda record: [follow(record) for follow in followers],
-                    on_draws=follow_draws,
-                    on_phase=progress.phase,
-                    on_images=show,
-                    on_wait=log,
-                    waited=waited,
-                    group=group,
-                ),
-            )
+        hooks = replace(hooks, on_record=note_record, on_draws=note_draws, on_phase=progress.phase, on_images=show)
+        outcome = train(source, settings, folder, replace(hooks, waited=waited))
     log(f"ended at step {outcome.step}: {outcome.reason}")
     if outcome.reason == "seconds" and not source.ready():
         raise IncompleteError(
-            f"{store}: nothing of scene {scene_id} has been rendered in {settings.max_seconds:g} s; nothing was trained"
+            f"{store}: nothing of scene {scene_id} has been rendered in {limit_s:g} s; nothing was trained"
         )
 
 
@@ -304,42 +292,33 @@ def _report_use(
     Each sample counts once, and held-out ones as soon as they are visible. A missing Redis or store is ignored; if the
     Redis serves another store, that is logged once.
     """
-    reporter = _ConsumptionReporter(redis_url, store, scene_id, log)
-    try:
-        with repeat(REPORT_S, reporter.report):
-            yield reporter.take
-    finally:
-        reporter.report()
+    used: int | None = None  # a resumed run knows it only once it has begun
+    connection: Redis | None = None
+    refused = ""
 
+    def note(draws: int, samples: int) -> None:
+        nonlocal used
+        used = min(draws, samples)
 
-class _ConsumptionReporter:
-    """Reports a scene's used samples to Redis."""
-
-    def __init__(self, redis_url: str | None, store: str | Path, scene_id: str, log: Callable[[str], object]) -> None:
-        self._url, self._root, self._scene_id, self._log = redis_url, store, scene_id, log
-        self._store: Store | None = None  # opened with the first numbers: there may be no store before training begins
-        self._used: int | None = None  # a resumed run knows it only once it has begun
-        self._connection: Redis | None = None
-        self._refused = False
-
-    def take(self, draws: int, samples: int) -> None:
-        """Set the current numbers."""
-        self._used = min(draws, samples)
-
-    def report(self) -> None:
-        """Report the last numbers, if there are any and a Redis."""
-        if self._url is None or self._used is None:
+    def report() -> None:
+        nonlocal connection, refused
+        if redis_url is None or used is None:
             return
         from photonfarm import queue
 
         try:
-            self._connection = self._connection or queue.connect(self._url)
-            self._store = self._store or Store(self._root)
-            queue.check_served(self._connection, self._store)
-            queue.report_consumed(self._connection, self._scene_id, self._used)
+            connection = connection or queue.connect(redis_url)
+            queue.check_served(connection, Store(store))
+            queue.report_consumed(connection, scene_id, used)
         except queue.OtherStoreError as error:
-            if not self._refused:
-                self._log(f"used samples are not reported to workers: {error}")
-            self._refused = True
+            if not refused:
+                log(f"used samples are not reported to workers: {error}")
+            refused = str(error)
         except (QueueError, RedisError, StoreError):
             pass
+
+    try:
+        with repeat(REPORT_S, report):
+            yield note
+    finally:
+        report()

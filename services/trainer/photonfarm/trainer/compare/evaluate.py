@@ -231,7 +231,7 @@ class _Test:
     def load(self, predictor: TrainedRun | ReadyPredictor) -> tuple[DevicePredictor, Inputs]:
         """Load a predictor, and the inputs of the first sample, on which it is timed."""
         with self._feed(predictor, batch=1) as feed:
-            predict = predictor.predictor(feed.spec, (feed.geometry, feed.cloud), self.device)
+            predict = predictor.predictor(feed.spec, feed.base, self.device)
             for batch in read_batches(feed, self.samples.rows, 1):
                 return predict, predict.of_its_own(batch.inputs)
         raise IncompleteError(NONE_COMPLETE)

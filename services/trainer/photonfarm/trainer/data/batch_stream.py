@@ -5,11 +5,9 @@ Samples are drawn in rounds, which choose the least drawn ones more often.
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 from photonfarm.core.keys import Stream, make_key
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.runs.devices import SINGLE_PROCESS, TrainingGroup
+from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.settings import TrainSettings
 
 
@@ -98,94 +96,48 @@ class RoundSampler:
         self._shuffles += 1
 
 
-@dataclass(frozen=True, slots=True)
-class Growth:
-    """The rows that arrived, and when; together with the seed they determine the order of training.
+class BatchStream:
+    """Draws batches, and has them read, ahead of training.
 
-    A run's checkpoint has all of it, as `following.arrived` and `following.growth`. metrics.jsonl has a summary: each
-    of its records has the number of drawn and of arrived samples.
+    The rows that arrived, and when, determine the order of training together with the seed. A run's checkpoint has all
+    of it, as `following.arrived` and `following.growth`.
     """
 
-    rows: list[int] = field(default_factory=list)  # in order of arrival, training and held-out rows
-    log: list[tuple[int, int]] = field(default_factory=list)  # (batches drawn by then, rows that had arrived)
-    drawn: int = 0  # batches drawn when this was saved
-
-    @classmethod
-    def of(cls, state: dict[str, Any]) -> Self:
-        """The growth of a run, from the `following` of its checkpoint."""
-        log = [(drawn, arrived) for drawn, arrived in state["growth"].tolist()]
-        return cls(state["arrived"].tolist(), log, state["drawn"])
-
-    def visible(self, drawn: int) -> int | None:
-        """The number of rows that had arrived when batch `drawn` was drawn; None for a batch not drawn by then."""
-        if drawn >= self.drawn:
-            return None
-        place = bisect_right(self.log, drawn, key=lambda entry: entry[0])
-        return self.log[place - 1][1] if place else 0
-
-
-class BatchStream:
-    """Draws batches, and has them read, ahead of training. A `script` is the growth of an earlier run to repeat."""
-
-    def __init__(
-        self, feed: Feed, settings: TrainSettings, script: Growth | None = None, group: TrainingGroup = SINGLE_PROCESS
-    ) -> None:
-        """Draw batches for all processes of a group, and read this process's part of them."""
-        self._feed, self._settings, self._group = feed, settings, group
-        self._script = script or Growth()
+    def __init__(self, feed: Feed, settings: TrainSettings, ranks: Ranks) -> None:
+        """Draw batches for all ranks, and read this process's part of them."""
+        self._feed, self._settings, self._ranks = feed, settings, ranks
         self._sampler = RoundSampler(settings.seed, settings.catch_up)
-        self._waiting: dict[int, bool] = {}  # arrived, not yet visible: row → held out
         self._known: set[int] = set()
         self._asked: deque[tuple[int, ...]] = deque()  # drawn, not yet trained on
         self._restored: list[tuple[int, ...]] = []  # the same of an earlier session, not requested in this one yet
-        self._complete = False
-        self.growth = Growth()
+        self.complete = False  # everything planned has arrived
+        self.arrived: list[int] = []  # rows, in order of arrival
+        self.growth: list[tuple[int, int]] = []  # (batches drawn by then, rows that had arrived)
         self.held_out: list[int] = []
         self.drawn = 0  # batches
 
     @property
     def training_rows(self) -> list[int]:
-        """The visible rows that are not held out, in order of arrival."""
+        """The rows that have arrived and are not held out, in order of arrival."""
         return self._sampler.rows
 
-    @property
-    def complete(self) -> bool:
-        """Whether everything planned has arrived and is visible."""
-        return self._complete
-
     def look(self) -> None:
-        """Make arrived rows visible; with a script, only the rows that it lists up to this batch."""
-        rows, complete = self._feed.arrivals()
-        self._waiting.update((row, held) for row, held in rows if row not in self._known)
-        scripted = self._script.visible(self.drawn)
-        if scripted is None:
-            self._show(list(self._waiting))
-        else:
-            due = self._script.rows[len(self.growth.rows) : scripted]
-            self._show(due if all(row in self._waiting for row in due) else [])
-        self._complete = complete and not self._waiting
-
-    def _show(self, rows: list[int]) -> None:
-        if not rows:
-            return
-        held = {row: self._waiting.pop(row) for row in rows}
-        self._known.update(rows)
-        self.growth.rows.extend(rows)
-        self.growth.log.append((self.drawn, len(self.growth.rows)))
-        self.held_out.extend(row for row in rows if held[row])
-        self._sampler.add([row for row in rows if not held[row]])
+        """Take in the rows that have arrived."""
+        arrived, self.complete = self._feed.arrivals()
+        if new := {row: is_held_out for row, is_held_out in arrived if row not in self._known}:
+            self._known.update(new)
+            self.arrived.extend(new)
+            self.growth.append((self.drawn, len(self.arrived)))
+            self.held_out.extend(row for row, is_held_out in new.items() if is_held_out)
+            self._sampler.add(row for row, is_held_out in new.items() if not is_held_out)
 
     def may_draw(self) -> bool:
         """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and `minimum_samples` have arrived.
 
-        Neither limit applies once everything planned has arrived. With a script, a batch is drawn when exactly the
-        scripted rows are visible.
+        Neither limit applies once everything planned has arrived.
         """
-        scripted = self._script.visible(self.drawn)
-        if scripted is not None:
-            return scripted == len(self.growth.rows)
         arrived, s = len(self.training_rows), self._settings
-        if self._complete:
+        if self.complete:
             return arrived > 0
         draws = (self.drawn + 1) * s.batch
         return arrived >= s.minimum_samples and draws <= s.replay_ratio * arrived + s.replay_buffer
@@ -204,13 +156,13 @@ class BatchStream:
 
     def _ask(self, rows: tuple[int, ...]) -> None:
         self._asked.append(rows)
-        self._group.send("rows", rows)
-        self._feed.ask(self._group.part(rows))
+        self._ranks.send("rows", rows)
+        self._feed.ask(self._ranks.part(rows))
 
     def take(self) -> TrainingBatch:
         """The next drawn batch, of which this process has read its part."""
         batch = self._feed.take()
-        self._group.send("take")  # only now, so that other ranks do not wait for a rank whose reading failed
+        self._ranks.send("take")  # only now, so that other ranks do not wait for a rank whose reading failed
         self._asked.popleft()
         return batch
 
@@ -222,7 +174,7 @@ class BatchStream:
     def ask_again(self) -> None:
         """Request the dropped batches again."""
         for rows in self._asked:
-            self._feed.ask(self._group.part(rows))
+            self._feed.ask(self._ranks.part(rows))
 
     def state(self) -> dict[str, Any]:
         """The state from which the same batches follow; int64 tensors for values of each row."""
@@ -230,8 +182,8 @@ class BatchStream:
             "sampler": self._sampler.state(),
             "asked": [list(rows) for rows in (*self._restored, *self._asked)],
             "drawn": self.drawn,
-            "arrived": torch.tensor(self.growth.rows, dtype=torch.int64),
-            "growth": torch.tensor(self.growth.log, dtype=torch.int64).reshape(-1, 2),
+            "arrived": torch.tensor(self.arrived, dtype=torch.int64),
+            "growth": torch.tensor(self.growth, dtype=torch.int64).reshape(-1, 2),
             "held_out": torch.tensor(self.held_out, dtype=torch.int64),
         }
 
@@ -239,7 +191,8 @@ class BatchStream:
         """Continue from what `state` returned."""
         self._sampler.restore(state["sampler"])
         self.drawn = state["drawn"]
-        self.growth = Growth.of(state)
+        self.arrived = state["arrived"].tolist()
+        self.growth = [(drawn, arrived) for drawn, arrived in state["growth"].tolist()]
         self.held_out = state["held_out"].tolist()
-        self._known = set(self.growth.rows)
+        self._known = set(self.arrived)
         self._restored = [tuple(rows) for rows in state["asked"]]

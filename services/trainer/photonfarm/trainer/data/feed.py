@@ -6,20 +6,19 @@ import queue
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from photonfarm.core.keys import Key
-from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.core.waiting import pause_after_look
-from photonfarm.data.torch_dataset import Samples, SceneDataset
-from photonfarm.plan.hold_out import Keyed, are_held_out, enough, units_of
+from photonfarm.data.torch_dataset import SceneDataset
+from photonfarm.plan.hold_out import are_held_out, enough, units_of
+from photonfarm.store import SceneReader
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, allocate_memory, choose_kept_pixels
 from photonfarm.trainer.networks import find_kind
 from photonfarm.trainer.networks.inputs import Needs
@@ -35,39 +34,6 @@ Request = tuple[int, ...] | Callable[[], object] | None
 """The rows of a batch; what is to be done between two batches; or the end."""
 
 
-class SampleSource(Samples, Keyed[Sequence[int]], Protocol):
-    """The samples of one scene: a `SceneReader`, or anything that behaves like it. One thread at a time reads."""
-
-    def base(self) -> tuple[Geometry, BasePointCloud]:
-        """The geometry and the base cloud."""
-
-    def ready(self) -> bool:
-        """Whether spec and base are there; they come with the scene's first job."""
-
-    def refresh(self) -> NDArray[np.int64]:
-        """Look for new samples; returns the rows that became complete since the last call."""
-
-    def doubt(self) -> None:
-        """Look anew at all of them the next time: some may no longer be complete."""
-
-    def sample_keys(self, rows: Sequence[int]) -> list[Key]:
-        """The content keys of samples."""
-
-    def lease(self) -> str | None:
-        """Who has the scene for itself now, in words; None if nobody has."""
-
-    def at_work(self, what: str) -> AbstractContextManager[None]:
-        """Announce that this process is at work in the scene; raises LeasedError if another has it for itself."""
-
-    @property
-    def planned(self) -> int:
-        """The number of samples in all plans so far, complete or not."""
-
-    @property
-    def plan_requests(self) -> list[dict[str, Any]]:
-        """The requests of all plans so far, in order, as JSON documents: all rows follow from them."""
-
-
 class Feed:
     """Batches in the order of their requests, and rows as they arrive; a context manager.
 
@@ -78,7 +44,7 @@ class Feed:
 
     def __init__(
         self,
-        source: SampleSource,
+        source: SceneReader,
         settings: TrainSettings,
         clock: Callable[[], float] = time.monotonic,
         needs: Needs | None = None,
@@ -88,13 +54,10 @@ class Feed:
 
         With `resident`, samples are kept there, and batches are on its device.
         """
-        self.geometry: Geometry
-        self.cloud: BasePointCloud
         self._source, self._settings, self._clock = source, settings, clock
         self._needs = needs or find_kind(settings.network.architecture).needs
         self._resident = resident if resident is not None and resident.keeps_any else None
-        self.geometry, self.cloud = source.base()
-        self.spec = source.spec
+        self.spec, self.base = source.spec, source.base()
         points = settings.network.points
         self._dataset = SceneDataset(source, self._needs.fields, exposure=self.spec.exposure, points=points)
         self._lock = threading.Lock()
@@ -264,7 +227,7 @@ class Feed:
 
 
 def read_batch(
-    source: SampleSource,
+    source: SceneReader,
     dataset: SceneDataset,
     rows: Sequence[int],
     kept: int | None = None,

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core.errors import IncompleteError
-from photonfarm.trainer.data.feed import Feed, SampleSource
+from photonfarm.store import SceneReader
+from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predictors.evaluation import (
     HeldOutErrors,
     average_colours,
@@ -92,7 +93,7 @@ class RunStory:
         """Its part of report.json."""
         state, settings = self.state, self.run.settings
         draws = state["step"] * settings.batch
-        shares = share_waits(state["seconds"])
+        shares = share_waits(state["seconds"], {})
         return {
             "name": self.name,
             "folder": str(self.run.folder),
@@ -133,7 +134,7 @@ class Baselines:
     untrained: HeldOutErrors  # the first run's network before its first step
 
     @classmethod
-    def of(cls, source: SampleSource, run: TrainedRun, rows: Sequence[int]) -> Baselines:
+    def of(cls, source: SceneReader, run: TrainedRun, rows: Sequence[int]) -> Baselines:
         """Measure them on some held-out samples of a run; raises IncompleteError without samples for the colour."""
         settings = run.settings.model_copy(update={"device": "cpu"})
         with Feed(source, settings, needs=run.needs) as feed:
@@ -143,7 +144,7 @@ class Baselines:
                 raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
             some = training[:: -(-len(training) // MOST_TRAINING)]
             colour, shown_colour = average_colours(read_batches(feed, some, settings.batch))
-            network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, (feed.geometry, feed.cloud))
+            network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, feed.base)
             return cls(
                 measure(make_constant_predictor(colour), read_batches(feed, rows, settings.batch)),
                 measure(make_constant_predictor(shown_colour), read_batches(feed, rows, settings.batch)),

@@ -15,7 +15,7 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from datetime import timedelta
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor, distributed, nn
@@ -75,91 +75,52 @@ Reading a part of a batch may take minutes if the store is in a bucket; a rank t
 """
 
 
-class TrainingGroup(Protocol):
-    """The group of processes that share each batch, as one of them uses it."""
-
-    within_step: bool  # the others wait for this one's gradient, and take no command before they have it
-
-    def device(self, name: str) -> torch.device:
-        """The device of this process, given the `name` in the settings."""
-
-    def part(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """The rows of a batch that this process reads."""
-
-    def send(self, command: str, value: Any = None) -> None:
-        """Send the other ranks a command; for rank 0."""
-
-    def meet(self) -> None:
-        """Wait until all processes call this."""
-
-    def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
-        """The loss over the joint batch, whose gradient the weights get; `count` of its samples are of this process."""
-
-
-class SingleProcess:
-    """A process that trains by itself."""
-
-    within_step = False
-
-    def device(self, name: str) -> torch.device:
-        """The device named `name`."""
-        return usable_device(name)
-
-    def part(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """All rows: this process reads the whole batch."""
-        return tuple(rows)
-
-    def send(self, command: str, value: Any = None) -> None:
-        """Do nothing, as there are no other ranks."""
-
-    def meet(self) -> None:
-        """Do nothing, as there are no other ranks."""
-
-    def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:  # noqa: ARG002
-        """The loss as a number; the weights have its gradient already."""
-        return loss.item()
-
-
-SINGLE_PROCESS = SingleProcess()
-
-
 class Ranks:
-    """One of the processes of torch's default group. Raises IncompleteError if another one has ended or hangs."""
+    """The processes that share each batch, as one of them uses them, or one that trains alone.
 
-    def __init__(self, commands: distributed.ProcessGroup) -> None:
-        """Take `commands`, a group of the same processes by which rank 0 sends commands."""
-        self.rank, self.size = distributed.get_rank(), distributed.get_world_size()
+    Raises IncompleteError if another one has ended or hangs.
+    """
+
+    def __init__(self, commands: distributed.ProcessGroup | None = None) -> None:
+        """Take `commands`, a group of the processes of torch's default group, by which rank 0 sends commands."""
+        self.rank, self.size = (distributed.get_rank(), distributed.get_world_size()) if commands else (0, 1)
         self._commands = commands
-        self.within_step = False
+        self.within_step = False  # the others wait for this one's gradient, and take no command before they have it
 
     def device(self, name: str) -> torch.device:
-        """The device of this process; for "cuda" the card with the process's local rank."""
-        return usable_device(_choose_own_device(name))
+        """The device of this process, given the `name` in the settings; "cuda" is the card with its local rank."""
+        return usable_device(name if self.size == 1 else _choose_own_device(name))
 
     def part(self, rows: Sequence[int]) -> tuple[int, ...]:
-        """Every `size`-th row, beginning with this rank's."""
+        """The rows of a batch that this process reads: every `size`-th one, beginning with this rank's."""
         return tuple(rows[self.rank :: self.size])
 
     def send(self, command: str, value: Any = None) -> None:
         """Send the other ranks a command; for rank 0."""
-        with self._others_there():
-            distributed.broadcast_object_list([command, value], src=0, group=self._commands)
-        self.within_step = command == "take"
+        self._broadcast([command, value])
+        self.within_step = command == "take" and self.size > 1
 
     def receive(self) -> tuple[str, Any]:
         """Receive the next command of rank 0; for the others."""
-        received: list[Any] = [None, None]
-        with self._others_there():
-            distributed.broadcast_object_list(received, src=0, group=self._commands)
-        return received[0], received[1]
+        command, value = self._broadcast([None, None])
+        return command, value
+
+    def _broadcast(self, objects: list[Any]) -> list[Any]:
+        if self._commands:
+            with self._others_there():
+                distributed.broadcast_object_list(objects, src=0, group=self._commands)
+        return objects
 
     def meet(self) -> None:
         """Wait until all processes call this."""
-        with self._others_there():
-            distributed.all_reduce(torch.zeros(()))
+        if self.size > 1:
+            with self._others_there():
+                distributed.all_reduce(torch.zeros(()))
 
     def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
-        """The mean of losses and gradients, weighted by the number of samples of each process."""
+        """The loss over the joint batch, whose gradient the weights get; `count` of its samples are of this process."""
+        if self.size == 1:
+            return loss.item()
         gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in weights]
         sums = torch.cat([*(g.flatten() for g in gradients), loss.detach().reshape(1)]) * count
         sums = torch.cat([sums, sums.new_tensor([count])])
@@ -170,6 +131,19 @@ class Ranks:
         for weight, mean in zip(weights, means, strict=True):
             weight.grad = mean.view_as(weight)
         return mean_loss.item()
+
+    @contextmanager
+    def lead(self) -> Iterator[None]:
+        """Run rank 0's training in the block, and then send the other ranks the command to end.
+
+        Within a step they take no command; they notice then that rank 0 is gone.
+        """
+        try:
+            yield
+        finally:
+            if not self.within_step:
+                with suppress(IncompleteError):  # they have ended already
+                    self.send("end")
 
     @contextmanager
     def _others_there(self) -> Iterator[None]:
@@ -186,28 +160,14 @@ def count_processes() -> int:
 
 
 @contextmanager
-def lead(group: TrainingGroup) -> Iterator[None]:
-    """Run rank 0's training in the block, and then send the other ranks the command to end.
-
-    Within a step they take no command; they notice then that rank 0 is gone.
-    """
-    try:
-        yield
-    finally:
-        if not group.within_step:
-            with suppress(IncompleteError):  # they have ended already
-                group.send("end")
-
-
-@contextmanager
-def join_ranks(device: str, batch: int) -> Iterator[Ranks | None]:
-    """Join the processes that torchrun has started; yields None if this is the only one.
+def join_ranks(device: str, batch: int) -> Iterator[Ranks]:
+    """Join the processes that torchrun has started, if it has.
 
     Raises SpecError for a batch of fewer samples than there are processes.
     """
     size = count_processes()
     if size < 2:
-        yield None
+        yield Ranks()
         return
     if batch < size:
         raise SpecError(

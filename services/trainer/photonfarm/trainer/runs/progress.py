@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, get_args
 
 from photonfarm.core.files import write_whole
 from photonfarm.core.processes import repeat
@@ -25,26 +25,17 @@ In this order: building the network and the feed; steps; validations; waiting fo
 samples to be read; writing checkpoints; and the rest, such as writing the log and drawing.
 """
 
-KINDS: tuple[TimeKind, ...] = ("start", "train", "validate", "wait_data", "wait_read", "save", "other")
-
-Bottleneck = Literal["rendering", "reading", "training"]
-
-NONE: Mapping[str, float] = {}
+KINDS: tuple[TimeKind, ...] = get_args(TimeKind)
 
 
 class Stopwatch:
     """Counts the seconds of a run by kind. At any moment exactly one kind is counted, so their sum is the wall time."""
 
     def __init__(
-        self,
-        clock: Callable[[], float],
-        kind: TimeKind,
-        ahead: float = 0.0,
-        on_turn: Callable[[TimeKind], object] | None = None,
+        self, clock: Callable[[], float], kind: TimeKind, ahead: float, on_turn: Callable[[TimeKind], object] | None
     ) -> None:
         """Begin to count `kind`, which has `ahead` seconds already; `on_turn` is told each kind that begins."""
-        self._on_turn = on_turn
-        self._clock, self._kind, self._since = clock, kind, clock() - ahead
+        self._clock, self._kind, self._since, self._on_turn = clock, kind, clock() - ahead, on_turn
         self._spent: dict[str, float] = dict.fromkeys(KINDS, 0.0)
 
     @property
@@ -52,11 +43,6 @@ class Stopwatch:
         """The seconds so far, by kind."""
         self.turn(self._kind)
         return dict(self._spent)
-
-    @property
-    def total(self) -> float:
-        """The sum of all kinds."""
-        return sum(self.seconds.values())
 
     def add(self, seconds: Mapping[str, float]) -> None:
         """Add the seconds of an earlier session of the run."""
@@ -82,16 +68,16 @@ class Stopwatch:
             self.turn(before)
 
 
-def share_waits(seconds: Mapping[str, float], before: Mapping[str, float] = NONE) -> dict[str, float]:
+def share_waits(seconds: Mapping[str, float], before: Mapping[str, float]) -> dict[str, float]:
     """The shares of the time since `before` in which training waited for samples to be rendered, and to be read."""
     spent = {name: value - before.get(name, 0.0) for name, value in seconds.items()}
     total = max(sum(spent.values()), 1e-9)
     return {"samples": round(spent["wait_data"] / total, 4), "reading": round(spent["wait_read"] / total, 4)}
 
 
-def find_bottleneck(shares: Mapping[str, float]) -> Bottleneck:
+def find_bottleneck(shares: Mapping[str, float]) -> str:
     """The part that takes most of the time, by `share_waits`; the rest of the time counts as training."""
-    spent: dict[Bottleneck, float] = {"rendering": shares["samples"], "reading": shares["reading"]}
+    spent = {"rendering": shares["samples"], "reading": shares["reading"]}
     spent["training"] = 1 - sum(spent.values())
     return max(spent, key=lambda name: spent[name])
 
@@ -130,7 +116,7 @@ WORDS: dict[TimeKind, str] = {
 
 
 class RunProgress:
-    """Follows a session of training; `phase` and `drawn` are its hooks."""
+    """Follows a session of training; `phase` and `note_draws` are its hooks."""
 
     def __init__(self, steps: int, batch: int, *, clock: Callable[[], float] = time.monotonic) -> None:
         """Take the last step, and the samples of each step."""
@@ -138,6 +124,7 @@ class RunProgress:
         self._step = self._samples = 0
         self._phase: tuple[TimeKind, float] = ("wait_data", clock())
         self._history: deque[tuple[float, int]] = deque(maxlen=WINDOW)
+        self.has_begun = False  # draws have been noted
 
     def phase(self, kind: TimeKind) -> None:
         """Note what the time is spent on from now on."""
@@ -146,21 +133,20 @@ class RunProgress:
 
     def note_draws(self, draws: int, samples: int) -> None:
         """Note the samples drawn so far, and those that have arrived."""
-        self._step, self._samples = draws // self._batch, samples
+        self._step, self._samples, self.has_begun = draws // self._batch, samples, True
 
-    def look(self) -> dict[str, object]:
+    def look(self) -> dict[str, Any]:
         """The present state, as the file holds it."""
         now, (kind, since) = self._clock(), self._phase
         self._history.append((now, self._step))
         (began, first), left = self._history[0], None
         if self._step > first:
             left = max(self._steps - self._step, 0) * (now - began) / (self._step - first)
-        phase = WORDS[kind] if now - since >= SHORT_S or not self._step else TRAINS
         return {
             "step": self._step,
             "steps": self._steps,
             "samples": self._samples,
-            "phase": phase,
+            "phase": WORDS[kind] if now - since >= SHORT_S or not self._step else TRAINS,
             "phase_s": round(now - since, 1),
             "left_s": left,
             "at_s": time.time(),
@@ -169,21 +155,19 @@ class RunProgress:
     def line(self) -> str:
         """The present state in words."""
         state = self.look()
-        left = f", {format_span(state['left_s'])} left" if isinstance(state["left_s"], float) else ""
+        left = "" if state["left_s"] is None else f", {format_span(state['left_s'])} left"
         since = f" for {state['phase_s']:.0f} s" if state["phase"] != TRAINS else ""
-        return f"{self._steps_done}: {state['phase']}{since}, {self._samples} samples have arrived{left}"
+        step = count_steps(self._step, self._steps)
+        return f"step {step}: {state['phase']}{since}, {self._samples} samples have arrived{left}"
 
     def last_line(self) -> str:
         """The state at the end of the session, in words; "" if nothing has arrived."""
-        return f"{self._steps_done}, {self._samples} samples have arrived" if self._samples else ""
-
-    @property
-    def _steps_done(self) -> str:
-        return f"step {count_steps(self._step, self._steps)}"
+        step = count_steps(self._step, self._steps)
+        return f"step {step}, {self._samples} samples have arrived" if self._samples else ""
 
 
 @contextmanager
-def follow_progress(progress: RunProgress, run: Path, say: Callable[[str], object] | None) -> Iterator[None]:
+def follow_progress(progress: RunProgress, run: Path, say: Callable[[str], object]) -> Iterator[None]:
     """Keep the file up to date until the block ends; say a line every five seconds, and a last one."""
     said = time.monotonic()
 
@@ -191,14 +175,14 @@ def follow_progress(progress: RunProgress, run: Path, say: Callable[[str], objec
         nonlocal said
         with suppress(OSError):
             write_whole(run / PROGRESS, json.dumps(progress.look()))
-        if say is not None and time.monotonic() - said >= LINE_S - FILE_S / 2:
+        if time.monotonic() - said >= LINE_S - FILE_S / 2:
             said = time.monotonic()
             say(progress.line())
 
     try:
         with repeat(FILE_S, follow):
             yield
-        if say is not None and (last := progress.last_line()):
+        if last := progress.last_line():
             say(last)
     finally:
         with suppress(OSError):

@@ -10,19 +10,17 @@ import copy
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import nn
 
 from photonfarm.core.errors import IncompleteError, SpecError
-from photonfarm.core.records import BasePointCloud, Geometry
-from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import build, predict_image
 from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs.devices import SINGLE_PROCESS, TrainingGroup
+from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.settings import Compilation, TrainSettings
 from photonfarm.trainer.training.losses import find_loss
 
@@ -47,22 +45,16 @@ def compute_rate(step: int, settings: TrainSettings) -> float:
     """The learning rate of a step, by the schedule of the settings.
 
     "epochs": learning_rate × decay^epoch, where an epoch is a number of samples drawn [supplement 3.1]. "cosine" is
-    ours.
+    ours: linearly up over the `warm_up` (Goyal et al., Accurate, Large Minibatch SGD, 2017, 2.2), then by
+    (1 + cos πx) / 2 down to 0 at `max_steps` (Loshchilov and Hutter, SGDR, 2017, 5, without restarts).
     """
-    if settings.schedule == "cosine":
-        return settings.learning_rate * _anneal(step, settings.max_steps, int(settings.warm_up * settings.max_steps))
-    return settings.learning_rate * settings.decay ** (step * settings.batch // settings.epoch_samples)
-
-
-def _anneal(step: int, steps: int, rising: int) -> float:
-    """The share of the rate: linearly up to 1 over `rising` steps, then (1 + cos πx) / 2 down to 0 at `steps`.
-
-    The first part is of Goyal et al., Accurate, Large Minibatch SGD, 2017 (2.2); the second of Loshchilov and Hutter,
-    SGDR, 2017 (5), without restarts.
-    """
+    if settings.schedule == "epochs":
+        return settings.learning_rate * settings.decay ** (step * settings.batch // settings.epoch_samples)
+    rising = int(settings.warm_up * settings.max_steps)
     if step < rising:
-        return (step + 1) / rising
-    return (1 + math.cos(math.pi * min((step - rising) / (steps - rising), 1.0))) / 2
+        return settings.learning_rate * ((step + 1) / rising)
+    fallen = min((step - rising) / (settings.max_steps - rising), 1.0)
+    return settings.learning_rate * ((1 + math.cos(math.pi * fallen)) / 2)
 
 
 class WeightAverage:
@@ -99,10 +91,6 @@ class WeightAverage:
         self._steps = state["steps"]
 
 
-MODES = {"on": "default", "graphs": "reduce-overhead"}
-"""torch's name of each way to compile; the second records CUDA graphs."""
-
-
 def compile_network(network: nn.Module, how: Compilation, device: torch.device) -> None:
     """Have torch compile a network's U-Net when it is first used; all of a network that is no `Network`.
 
@@ -114,7 +102,8 @@ def compile_network(network: nn.Module, how: Compilation, device: torch.device) 
         return
     if how == "graphs" and device.type != "cuda":
         raise SpecError(f"compile = 'graphs': CUDA graphs need a CUDA device, and this run is on {device}; give on")
-    (network.image_synthesis if isinstance(network, Network) else network).compile(mode=MODES[how], dynamic=False)
+    mode = "reduce-overhead" if how == "graphs" else "default"
+    (network.image_synthesis if isinstance(network, Network) else network).compile(mode=mode, dynamic=False)
 
 
 @contextmanager
@@ -123,20 +112,17 @@ def name_compile_errors(how: Compilation) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        if how == "off" or not isinstance(error, _list_compiler_errors()):
+        if how == "off":
+            raise
+        from torch._dynamo.exc import TorchDynamoException  # which is slow to load
+
+        if not isinstance(error, TorchDynamoException):
             raise
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise SpecError(
             f"compile = {how!r}: torch cannot compile the network on this machine: {reason}. It needs a C++ compiler, "
             "and on CUDA Triton; install these, or train with compile = off"
         ) from error
-
-
-def _list_compiler_errors() -> tuple[type[Exception], ...]:
-    """The errors of torch's compiler, which is imported here only where it has been used."""
-    from torch._dynamo.exc import TorchDynamoException
-
-    return (TorchDynamoException,)
 
 
 class DivergedError(IncompleteError):
@@ -154,30 +140,13 @@ class DivergedError(IncompleteError):
         )
 
 
-class KnownScene(Protocol):
-    """What of a scene is known before any sample; a `Feed` knows it."""
-
-    @property
-    def spec(self) -> SceneSpec:
-        """The scene's spec."""
-
-    @property
-    def geometry(self) -> Geometry:
-        """Its triangles."""
-
-    @property
-    def cloud(self) -> BasePointCloud:
-        """Its base cloud."""
-
-
 class Learner:
     """The network of a scene, equal in all processes of a group, before and after each step."""
 
-    def __init__(self, scene: KnownScene, settings: TrainSettings, group: TrainingGroup = SINGLE_PROCESS) -> None:
+    def __init__(self, frame: SceneFrame, settings: TrainSettings, ranks: Ranks) -> None:
         """Make the untrained network of a scene, on the device of this process."""
-        frame = SceneFrame.of(scene.spec, scene.geometry, scene.cloud, settings.network)
-        self._settings, self._group = settings, group
-        self._device = group.device(settings.device)
+        self._settings, self._ranks = settings, ranks
+        self._device = ranks.device(settings.device)
         self.network = build(settings.network, frame, settings.seed).to(self._device)
         self._loss, self.verdict = find_loss(settings.loss)  # the loss, and the result of the test of its unbiasedness
         self.optimiser = build_optimiser(self.network.parameters(), settings)
@@ -199,13 +168,13 @@ class Learner:
 
         The loss is the same in all processes. If it is not finite, nothing has changed.
         """
-        for group in self.optimiser.param_groups:
-            group["lr"] = self.rate(number)
+        for options in self.optimiser.param_groups:
+            options["lr"] = self.rate(number)
         self.optimiser.zero_grad()
         batch = batch.to(self._device).for_training()
         loss = self._loss(predict_image(self.network, batch.inputs), batch.target)
         torch.autograd.backward(loss)
-        value = self._group.average(list(self.network.parameters()), loss, len(batch.rows))
+        value = self._ranks.average(list(self.network.parameters()), loss, len(batch.rows))
         if math.isfinite(value):
             self.optimiser.step()
             if self.average is not None:

@@ -18,12 +18,14 @@ from photonfarm.core.errors import SpecError, store_errors
 from photonfarm.core.models import Changes
 from photonfarm.core.processes import Stop
 from photonfarm.core.statistics import group_means
+from photonfarm.store import SceneReader
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch
-from photonfarm.trainer.data.batch_stream import BatchStream, Growth
-from photonfarm.trainer.data.feed import Feed, SampleSource
+from photonfarm.trainer.data.batch_stream import BatchStream
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.predictors.evaluation import make_network_predictor, read_batches
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.devices import SINGLE_PROCESS, TrainingGroup, usable_device
+from photonfarm.trainer.runs.devices import Ranks, usable_device
 from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used, share_waits
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, lock_run
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -31,7 +33,6 @@ from photonfarm.trainer.runs.user_code import name_in_errors
 from photonfarm.trainer.training.learner import DivergedError, Learner, name_compile_errors
 from photonfarm.trainer.training.other_ranks import Presence
 from photonfarm.trainer.training.validation import (
-    BestValidation,
     Comparison,
     GoodState,
     Show,
@@ -80,13 +81,12 @@ class Hooks:
     on_phase: Callable[[TimeKind], object] | None = None  # what the time is spent on from now on
     on_images: Show | None = None  # at each validation, with the first held-out samples
     on_wait: Callable[[str], object] = lambda _: None  # gets a sentence on what others do in the store
-    script: Growth | None = None  # the growth of an earlier run, to be repeated to the bit on a CPU
-    group: TrainingGroup = SINGLE_PROCESS  # the processes that share each batch; this one is rank 0
+    ranks: Ranks = field(default_factory=Ranks)  # the processes that share each batch; this one is rank 0
     waited: float = 0.0  # seconds that have passed already
     clock: Callable[[], float] = time.monotonic
 
 
-def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks | None = None) -> TrainingOutcome:
+def train(source: SceneReader, settings: TrainSettings, run: Path, hooks: Hooks | None = None) -> TrainingOutcome:
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene, and at any time for whoever takes the scene's lease. Ends at `max_steps`, at
@@ -103,7 +103,7 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
     watch = Stopwatch(hooks.clock, "wait_data", hooks.waited, hooks.on_phase)
 
     def is_over() -> bool:
-        return watch.total >= (settings.max_seconds or math.inf)
+        return sum(watch.seconds.values()) >= (settings.max_seconds or math.inf)
 
     with lock_run(run), Presence(source, f"trainer of run {run}", hooks.on_wait) as presence:
         while not source.ready() and not is_over() and not hooks.stop.wait(settings.poll_seconds):
@@ -112,7 +112,7 @@ def train(source: SampleSource, settings: TrainSettings, run: Path, hooks: Hooks
             return TrainingOutcome(0, "stopped" if hooks.stop.is_set() else "seconds", None)
         watch.turn("start")
         own = {"architecture": settings.network.architecture, "loss": settings.loss}
-        resident = ResidentSamples(hooks.group.device(settings.device), settings.resident_gb)
+        resident = ResidentSamples(hooks.ranks.device(settings.device), settings.resident_gb)
         fed = Feed(source, settings, hooks.clock, resident=resident)
         with fed as feed, name_in_errors(**own), name_compile_errors(settings.compile):
             return Session(feed, settings, run, watch, hooks, presence).run()
@@ -128,10 +128,11 @@ class Session:
         self._feed, self._settings, self._run, self._watch, self._hooks = feed, settings, run, watch, hooks
         self._stop = hooks.stop
         self._log = MetricsLog(run / METRICS, hooks.on_record)
-        self._learner = Learner(feed, settings, hooks.group)
+        frame = SceneFrame.of(feed.spec, *feed.base, settings.network)
+        self._learner = Learner(frame, settings, hooks.ranks)
         self._good = GoodState(self._learner)
-        self._best: BestValidation | None = None
-        self._stream = BatchStream(feed, settings, hooks.script, hooks.group)
+        self._best: dict[str, Any] | None = None  # the state of the run's best validation
+        self._stream = BatchStream(feed, settings, hooks.ranks)
         self._step = 0
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
@@ -181,11 +182,11 @@ class Session:
         state = checkpoint.load(path)
         changed = checkpoint.check_continues(path, state, self._identity())
         checkpoint.check_same_store(path, state, self._feed.plan_requests())
-        recovery = state.get("recovery", {"good": None, "best": None})  # older checkpoints have no recovery
+        recovery = state["recovery"]
         settle_files(self._run, recovery["good"])
         self._good.restore(state, self._run, recover=self._settings.recover)
         if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
-            self._best = BestValidation.of(recovery["best"])
+            self._best = recovery["best"]
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
         self._seconds_logged = dict(state["seconds"])
@@ -197,7 +198,7 @@ class Session:
     def _send_begin(self, *, continues: bool) -> None:
         spec = self._feed.spec
         beginning = {"scene_id": spec.scene_id, "exposure": spec.exposure, "step": self._step, "continues": continues}
-        self._hooks.group.send("begin", beginning)
+        self._hooks.ranks.send("begin", beginning)
 
     def _identity(self) -> dict[str, Any]:
         spec = self._feed.spec
@@ -209,7 +210,7 @@ class Session:
 
     def _save(self) -> None:
         with self._watch.on("save"):
-            recovery = {**self._good.state(), "best": self._best.state() if self._best else None}
+            recovery = {**self._good.state(), "best": self._best}
             state = {**self._learner.state(), **self._state(), "recovery": recovery}
             with self._good.save_with(self._run):
                 checkpoint.save(self._run / CHECKPOINT, state)
@@ -221,7 +222,7 @@ class Session:
 
     def _state(self) -> dict[str, Any]:
         """What a checkpoint says beyond the learner and what it may go back to."""
-        samples = len(self._stream.growth.rows)
+        samples = len(self._stream.arrived)
         return {
             **self._identity(),
             "step": self._step,
@@ -237,7 +238,7 @@ class Session:
             return "stopped"
         if self._step >= self._settings.max_steps:
             return "steps"
-        if self._settings.max_seconds is not None and self._watch.total >= self._settings.max_seconds:
+        if self._settings.max_seconds is not None and sum(self._watch.seconds.values()) >= self._settings.max_seconds:
             return "seconds"
         return None
 
@@ -259,11 +260,11 @@ class Session:
         """
         if self._presence.is_to_end():
             with self._watch.on("wait_data"), self._feed.quiet():
-                self._hooks.group.send("quiet")
-                self._hooks.group.meet()  # no process reads any more
+                self._hooks.ranks.send("quiet")
+                self._hooks.ranks.meet()  # no process reads any more
                 self._presence.end()
                 self._presence.begin(self._stop, lambda: self._ended() is not None)
-                self._hooks.group.send("on")
+                self._hooks.ranks.send("on")
         before, self._missing = self._missing, self._feed.missing
         if self._missing and not before:
             self._hooks.on_wait(f"training waits: {self._missing} samples were set aside; workers render them again")
@@ -292,7 +293,7 @@ class Session:
         other = self._feed.other_hold_out()
         remedy = f"plan more {one}s" if other is None else f"--hold-out {other:g} holds out one {one} of these"
         raise SpecError(
-            f"hold_out = {self._settings.hold_out:g}: of the {len(self._stream.growth.rows)} samples planned {fault}; "
+            f"hold_out = {self._settings.hold_out:g}: of the {len(self._stream.arrived)} samples planned {fault}; "
             f"{remedy}"
         )
 
@@ -334,18 +335,18 @@ class Session:
     def _compare(self, now: Validation) -> None:
         self._compared = compare(now, self._best)
         if self._compared.is_best:
-            self._best = BestValidation(now.step, now.errors, now.judge)
+            self._best = now.state()
 
     def _keep_or_go_back(self) -> None:
         """Keep the state after the last validation, or go back, in all processes."""
         comparison = self._compared
         if comparison is not None and comparison.is_clearly_worse:
             reason = f"step {self._step}: {comparison.sentence}"
-            self._hooks.group.send("back", reason)
+            self._hooks.ranks.send("back", reason)
             self._good.go_back(reason)
             self._log_recovered("held-out error", comparison)
         elif comparison is not None and not comparison.is_worse:
-            self._hooks.group.send("keep", self._step)
+            self._hooks.ranks.send("keep", self._step)
             self._keep()
 
     def _end_no_worse(self) -> None:
@@ -362,19 +363,23 @@ class Session:
 
     def _log_recovered(self, cause: str, comparison: Comparison | None = None) -> None:
         self._compared = None  # the learner has changed
+        errors = None
+        if comparison is not None:  # JSON has no number for values that are not finite
+            found = {"now": comparison.error, "best": comparison.best}
+            errors = {name: error if math.isfinite(error) else None for name, error in found.items()}
         self._log.write(
             "recovered",
             step=self._step,
             cause=cause,
             back_to=self._good.step,
-            errors=comparison.document() if comparison else None,
+            errors=errors,
             recoveries=self._good.recoveries,
             rate_factor=self._learner.rate_factor,
         )
 
     def _used(self) -> tuple[int, int]:
         """The number of draws so far, and of arrived samples."""
-        return self._step * self._settings.batch, len(self._stream.growth.rows)
+        return self._step * self._settings.batch, len(self._stream.arrived)
 
     def _report_draws(self) -> None:
         if self._hooks.on_draws is not None:

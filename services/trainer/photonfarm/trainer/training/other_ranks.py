@@ -16,9 +16,11 @@ import torch
 
 from photonfarm.core.processes import Stop
 from photonfarm.core.waiting import pause_after_look
+from photonfarm.store import SceneReader
 from photonfarm.store.model.lease import LeasedError
 from photonfarm.trainer.data.batch import ResidentSamples
-from photonfarm.trainer.data.feed import Feed, SampleSource
+from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
@@ -27,7 +29,7 @@ from photonfarm.trainer.training.learner import Learner, name_compile_errors
 from photonfarm.trainer.training.validation import GoodState
 
 
-def assist(source: Callable[[str, float], SampleSource], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
+def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
     """Train with rank 0 until that ends; `source` makes the samples of a scene, given its id and its exposure.
 
     A resumed run is read from the folder `run`, which rank 0 writes. Raises what `train` does.
@@ -39,31 +41,27 @@ def assist(source: Callable[[str, float], SampleSource], settings: TrainSettings
     own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
     resident = ResidentSamples(ranks.device(settings.device), settings.resident_gb)
     with Feed(source(value["scene_id"], value["exposure"]), own, resident=resident) as feed:
-        good, step = GoodState(Learner(feed, settings, ranks)), value["step"]
+        frame = SceneFrame.of(feed.spec, *feed.base, settings.network)
+        good, step = GoodState(Learner(frame, settings, ranks)), value["step"]
         if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run, recover=settings.recover)
         with name_compile_errors(settings.compile):
-            _follow(ranks, feed, good, step)
-
-
-def _follow(ranks: Ranks, feed: Feed, good: GoodState, step: int) -> None:
-    """Follow the commands of rank 0, until it sends the end."""
-    while (received := ranks.receive())[0] != "end":
-        command, value = received
-        if command == "rows":
-            feed.ask(ranks.part(value))
-        elif command == "keep":
-            good.keep(value)
-        elif command == "back":
-            good.go_back(value)
-        elif command == "quiet":
-            with feed.quiet():
-                ranks.meet()
-                if ranks.receive()[0] == "end":  # or "on"
-                    return
-        else:  # "take"
-            good.step_or_go_back(step, feed.take())
-            step += 1
+            while (received := ranks.receive())[0] != "end":
+                command, value = received
+                if command == "rows":
+                    feed.ask(ranks.part(value))
+                elif command == "take":
+                    good.step_or_go_back(step, feed.take())
+                    step += 1
+                elif command == "keep":
+                    good.keep(value)
+                elif command == "back":
+                    good.go_back(value)
+                else:  # "quiet"
+                    with feed.quiet():
+                        ranks.meet()
+                        if ranks.receive()[0] == "end":  # or "on"
+                            return
 
 
 LOOK_S = 2.0
@@ -73,7 +71,7 @@ LOOK_S = 2.0
 class Presence:
     """A context manager: at its end the trainer is no longer at work in the scene."""
 
-    def __init__(self, source: SampleSource, what: str, tell: Callable[[str], object]) -> None:
+    def __init__(self, source: SceneReader, what: str, tell: Callable[[str], object]) -> None:
         """Nothing is announced yet. `tell` gets a sentence when somebody else has the scene for itself."""
         self._source, self._what, self._tell = source, what, tell
         self._announced = ExitStack()

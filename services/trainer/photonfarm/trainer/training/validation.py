@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import torch
@@ -61,6 +61,16 @@ class Validation:
         """Whether the error is finite."""
         return math.isfinite(self.held_out.error.mean)
 
+    def state(self) -> dict[str, Any]:
+        """What a later validation is compared with, for a checkpoint."""
+        rows, errors = list(self.errors), list(self.errors.values())
+        return {
+            "step": self.step,
+            "judge": self.judge,
+            "rows": torch.tensor(rows, dtype=torch.int64),
+            "errors": torch.tensor(errors, dtype=torch.float64),
+        }
+
 
 def validate(
     predict: Predictor, step: int, samples: Iterator[TrainingBatch], show: Show | None = None, *, loss: str = "linear"
@@ -94,31 +104,6 @@ def validate(
     return Validation(step, tuple(rows), held_out, ALL_LIGHT if loss == "linear" else UP_TO_WHITE)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class BestValidation:
-    """The best validation of a run so far."""
-
-    step: int
-    errors: dict[int, float]  # of each measured row
-    judge: str = ALL_LIGHT
-
-    def state(self) -> dict[str, Any]:
-        """The state for a checkpoint."""
-        rows, errors = list(self.errors), list(self.errors.values())
-        return {
-            "step": self.step,
-            "judge": self.judge,
-            "rows": torch.tensor(rows, dtype=torch.int64),
-            "errors": torch.tensor(errors, dtype=torch.float64),
-        }
-
-    @classmethod
-    def of(cls, state: dict[str, Any]) -> Self:
-        """The validation of a `state`; older ones are of all light, or of an error that nothing compares any more."""
-        errors = dict(zip(state["rows"].tolist(), state["errors"].tolist(), strict=True))
-        return cls(state["step"], errors, state.get("judge", "pixels" if state.get("by_shown") else ALL_LIGHT))
-
-
 @dataclass(frozen=True, slots=True)
 class Comparison:
     """A validation compared with the best one before, over the rows that both have measured."""
@@ -136,10 +121,9 @@ class Comparison:
     @property
     def is_clearly_worse(self) -> bool:
         """Whether it is worse by more than chance as well; for a single configuration, chance is not known."""
-        if not math.isfinite(self.error):
-            return True
         deviation = self.difference.standard_error
-        return self.is_worse and deviation is not None and self.difference.mean > DEVIATIONS * deviation
+        by_chance = deviation is None or self.difference.mean <= DEVIATIONS * deviation
+        return not math.isfinite(self.error) or (self.is_worse and not by_chance)
 
     @property
     def sentence(self) -> str:
@@ -147,22 +131,17 @@ class Comparison:
         before = f", and was {self.best:.5g} at best" if math.isfinite(self.best) else ""
         return f"the held-out error is {self.error:.5g}{before}"
 
-    def document(self) -> dict[str, float | None]:
-        """Both errors for the log; its JSON has no number for values that are not finite."""
-        errors = {"now": self.error, "best": self.best}
-        return {name: error if math.isfinite(error) else None for name, error in errors.items()}
 
-
-def compare(now: Validation, best: BestValidation | None) -> Comparison:
-    """Compare a validation with the best one; with itself if there is none of the same rows and the same error.
+def compare(now: Validation, best: Mapping[str, Any] | None) -> Comparison:
+    """Compare a validation with the `state` of the best one; with itself if there is none of the same rows and error.
 
     The held-out set grows while the store does, and samples may be incomplete for a while: the mean over other rows
     would be another figure, whatever the network. Views of one configuration are averaged first, as in `measure`.
     """
-    mine = now.errors
-    theirs = mine
-    if best is not None and best.judge == now.judge and not best.errors.keys().isdisjoint(mine):
-        theirs = best.errors
+    mine = theirs = now.errors
+    if best is not None and best["judge"] == now.judge:
+        before_of = dict(zip(best["rows"].tolist(), best["errors"].tolist(), strict=True))
+        theirs = mine if before_of.keys().isdisjoint(mine) else before_of
     units = [unit for row, unit in zip(now.rows, now.held_out.units, strict=True) if row in theirs]
     rows = [row for row in now.rows if row in theirs]
     ours, others = (group_means(np.array([errors[row] for row in rows]), units) for errors in (mine, theirs))
@@ -234,8 +213,7 @@ class GoodState:
         Nothing is kept if the file is gone, or without `recover`. Raises StoreError if it cannot be read.
         """
         self._learner.restore(state)
-        if (own := state.get("recovery")) is None:  # of an older version
-            return
+        own = state["recovery"]
         self.recoveries, self._learner.rate_factor = own["recoveries"], own["rate_factor"]
         if recover and own["good"] is not None and (kept := _load(run / GOOD)).get("step") == own["good"]:
             self._kept, self.step = kept, own["good"]

@@ -10,7 +10,7 @@ from chromium import chromium, needs_chromium
 
 from photonfarm.core.records import Geometry, Photons, ViewBuffers, Visibility
 from photonfarm.plan.request import Request
-from photonfarm.renderer.tools.plan_view import PlanView, axes
+from photonfarm.renderer.tools.plan_view import PlanView, axes_of
 from photonfarm.renderer.tools.preview import photon_picture, write_contact_sheet
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.view import Camera, View, sample_view
@@ -71,14 +71,14 @@ def test_a_plan_shows_what_stands_where_it_was_put_and_nothing_that_is_gone() ->
         assert tuple(map(float, corner.split(","))) == pytest.approx(
             (x + 2 * scale, y + side * 2 * half * scale), abs=0.02
         )
-    assert len(rectangles(plan.places(), "may")) == len(rectangles(plan.places(), "origins")) == 1
+    assert len(rectangles(plan.places(""), "may")) == len(rectangles(plan.places(""), "origins")) == 1
 
 
 @pytest.mark.parametrize("up", [sign * np.eye(3)[axis] for axis in range(3) for sign in (-1, 1)], ids=str)
 def test_plans_are_seen_from_above_whatever_axis_is_up(up) -> None:
     unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
     spec = samples.small_spec(view={"origin": unit, "look_at": unit, "up": up.tolist()})
-    right, upward = (sign * np.eye(3)[axis] for axis, sign in axes(spec))
+    right, upward = axes_of(spec)
     np.testing.assert_array_equal(np.cross(right, upward), up)
 
 

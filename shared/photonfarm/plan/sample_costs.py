@@ -33,7 +33,7 @@ class SampleCosts:
     """
 
     scene_id: str
-    configuration_s: float  # bringing the scene into a new configuration: its points moved, its photons traced
+    configuration_s: float  # bringing the scene into a new configuration, with its photons traced
     view_s: float  # a view's buffers and guides, and which points and photons it sees
     pass_s: float  # a pass of a view, both halves, whatever its number of samples per pixel
     spp_s: float  # each sample per pixel of the whole image, of both halves together

@@ -155,6 +155,7 @@ def test_the_page_is_written_and_findings_name_their_lines(write: Write) -> None
     assert (finding["key"], finding["line"], finding["file"]) == ("exposure", 3, str(spec))
     page = out.read_text()
     assert page.count("<img") == samples.COUNT + 4  # and a picture of each shape
+    assert page.count('<svg class="plan"') == page.count("<image") == 2
     assert "mine.toml line 3" in page
 
 
@@ -192,8 +193,8 @@ def test_shapes_of_a_bare_scene_file_are_listed(write: Write) -> None:
 def test_a_drawing_shows_a_shape_where_points_of_it_are_projected_to(write: Write) -> None:
     spec = write()
     scene = LoadedScene.load(load_spec(spec), spec.parent).scene
-    low, high = np.array([-3.0, 0, -3]), np.array([3.0, 3, 3])
-    plan = Projection.around(np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), low, high, -1.0)  # cut at a height of 1
+    right, down, below = np.array([1.0, 0, 0]), np.array([0, 0, 1.0]), np.array([0, -1.0, 0])
+    plan = Projection(right, down, below, np.array([-3.0, -3]), np.array([3.0, 3]), -1.0)  # cut at a height of 1
     red = np.where(np.arange(4)[:, None] == 2, [1, 0, 0], [0, 0, 1]).astype(np.float32)  # the block, all else blue
     picture = draw_scene(scene, plan, 120, red)
     for place, colour in (([0.3, 0.5, -0.3], "block"), ([1.0, 0.5, -0.3], "floor"), ([2.5, 0, 2.5], "paper")):

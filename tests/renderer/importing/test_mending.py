@@ -42,18 +42,9 @@ def test_a_lamp_far_from_the_origin_has_its_back_just_behind_it(gltf: Any, loade
     assert 0 < front - back < 1e-3
 
 
-@pytest.mark.parametrize("size", [1e-5, 0.02])
-def test_a_tiny_scene_is_enlarged_and_so_are_its_lights(gltf: Any, loaded: Loaded, size: float) -> None:
-    gltf.node("Quad", gltf.mesh(QUAD * np.float32(size), FACES))
-    gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point", "intensity": size**2}]}}
-    gltf.node("Bulb", translation=[0, 0, size], extensions={"KHR_lights_punctual": {"light": 0}})
-    scene, made = loaded(gltf.write())
-    assert "is enlarged" in changed(scene)
-    extent = float(made.bbox().max[0])
-    assert 0.5 < extent <= 10
-    light = mi.traverse(made.emitters()[0])
-    assert float(np.array(light["position"]).ravel()[2]) == pytest.approx(extent, rel=1e-5)
-    assert float(np.array(light["intensity.value"]).ravel()[0]) == pytest.approx(extent**2, rel=1e-5)
+def test_a_tiny_scene_is_a_loss(gltf: Any, loaded: Loaded) -> None:
+    gltf.node("Quad", gltf.mesh(QUAD * np.float32(0.02), FACES))
+    assert "geometry differs: size: the scene is 0.028 across" in changed(loaded(gltf.write())[0])
 
 
 @pytest.mark.parametrize("flips", [False, True])

@@ -53,7 +53,7 @@ def test_a_shape_that_the_scene_names_twice_is_there_once(write_xml: Callable[..
     assert len(loaded(write_xml(f'{SPHERE}<ref id="Ball"/>'))[1].shapes()) == 1
 
 
-def test_media_are_left_out_and_named_with_shape_and_line(write_xml: Callable[..., Path], read: Read) -> None:
+def test_media_and_what_only_bounds_one_are_left_out_and_named(write_xml: Callable[..., Path], read: Read) -> None:
     content = (
         """<medium type="homogeneous" id="fog"/>
       <bsdf type="dielectric" id="Glass"/>
@@ -67,8 +67,8 @@ def test_media_are_left_out_and_named_with_shape_and_line(write_xml: Callable[..
     scene = read(path)
     assert [shape.get("id") for shape in scene.root.findall("shape")] == ["Jar", "Ball"]
     assert [(change.effect, change.name, change.places) for change in scene.changes] == [
-        ("colour", "medium", ["scene.xml: line 4: <shape> 'Jar'"]),
-        ("geometry", "medium", ["scene.xml: line 5: <shape> 'Cloud'"]),
+        ("colour", "medium", ["scene.xml: line 2: <medium> 'fog'", "scene.xml: line 5: <medium> 'interior'"]),
+        (None, "null", ["scene.xml: line 5: <shape> 'Cloud'"]),
     ]
     assert not list(scene.root.iter("medium"))
 
@@ -101,8 +101,7 @@ def test_instances_become_shapes_where_they_stand(write_xml: Callable[..., Path]
         ("cylinder", '<point name="p0" x="-1" y="0" z="0"/>', '<scale x="-1"/>'),
         ("disk", "", '<scale x="-1"/>'),
         ("rectangle", "", '<scale x="-1"/>'),
-        ("cube", "", '<scale x="-1"/>'),
-        ("cube", '<boolean name="face_normals" value="true"/>', '<scale x="-1"/>'),
+        ("cube", "", '<scale x="-1" y="-1"/>'),
         ("ply", "", '<scale x="-1"/>'),
         ("obj", "", '<scale x="-1"/>'),
         ("obj", '<boolean name="face_normals" value="true"/>', '<scale z="-1"/>'),
@@ -129,10 +128,13 @@ def test_instances_have_the_surface_and_the_front_that_mitsuba_gives_them(
     assert np.array(hit.uv).ravel() == pytest.approx(np.array(expected.uv).ravel(), abs=0.02)
 
 
-def test_round_shapes_stay_round_where_instances_stretch_them(write_xml: Callable[..., Path], read: Read) -> None:
-    content = '<shape type="shapegroup" id="G"><shape type="sphere" id="Ball"/></shape><shape type="instance">'
-    scene = read(write_xml(f'{content}<ref id="G"/><transform name="to_world"><scale x="2"/></transform></shape>'))
-    assert [(change.effect, change.name) for change in scene.changes if change.effect] == [("geometry", "sphere")]
+@pytest.mark.parametrize(("kind", "by"), [("sphere", 2), ("cube", -1)])
+def test_shapes_that_mitsuba_cannot_stretch_or_mirror_are_a_loss(
+    write_xml: Callable[..., Path], read: Read, kind: str, by: int
+) -> None:
+    content = f'<shape type="shapegroup" id="G"><shape type="{kind}" id="Ball"/></shape><shape type="instance">'
+    scene = read(write_xml(f'{content}<ref id="G"/><transform name="to_world"><scale x="{by}"/></transform></shape>'))
+    assert [(change.effect, change.name) for change in scene.changes if change.effect] == [("geometry", kind)]
 
 
 def test_names_values_and_paths_are_resolved_by_mitsuba(
@@ -168,7 +170,7 @@ def test_what_mitsuba_does_not_know_is_left_out_or_replaced_and_named(
     content = """<bsdf type="velvet" id="Velvet"><rgb name="reflectance" value=".3"/></bsdf>
       <shape type="sphere" id="Ball"><ref id="Velvet"/><float name="wobble" value="1"/></shape>
       <shape type="hair" id="Fur"><string name="filename" value="fur.hair"/></shape>
-      <emitter type="laser"/><emitter type="constant"/>"""
+      <emitter type="laser"/><emitter type="constant"><texture name="radiance" type="blackbody"/></emitter>"""
     scene, made = loaded(write_xml(content))
     assert [shape.id() for shape in made.shapes()] == ["Ball"]
     assert "0.3" in str(made.shapes()[0].bsdf())
@@ -179,6 +181,7 @@ def test_what_mitsuba_does_not_know_is_left_out_or_replaced_and_named(
         "wobble": ("geometry", ["scene.xml: line 3: <shape> 'Ball'"]),
         "hair": ("geometry", ["scene.xml: line 4: <shape> 'Fur'"]),
         "laser": ("light", ["scene.xml: line 5: <emitter>"]),
+        "blackbody": ("light", ["scene.xml: line 5: <texture> 'radiance'"]),
     }
 
 
@@ -203,11 +206,11 @@ def test_the_camera_says_where_the_room_is_and_which_axis_is_up(write_xml: Calla
         (
             '<bsdf type="conductor" id="C"><string name="material" value="Foo"/></bsdf>'
             '<shape type="sphere"><ref id="C"/></shape>',
-            "scene.xml: line 2: <bsdf> 'C': Mitsuba cannot load it: .*Foo",
+            "Mitsuba cannot load it: scene.xml: line 2: <bsdf> 'C': .*Foo",
         ),
         ('<include filename="scene.xml"/>', "line 2: .* includes itself"),
         ("&gone;", "undefined entity: line 2.*gone"),
-        (SPHERE * 2, "line 2: duplicate ID: .Ball"),
+        (SPHERE * 2, "line 2: .* duplicate ID: .Ball"),
         (
             f'{SPHERE}<emitter type="point"><rgb name="intensity" value="1 nan 1"/></emitter>',
             "line 2: <rgb> 'intensity': nan",
@@ -216,13 +219,13 @@ def test_the_camera_says_where_the_room_is_and_which_axis_is_up(write_xml: Calla
             f'{SPHERE}<emitter type="constant"><float name="radiance" value="1e39"/></emitter>',
             r"line 2: <float> 'radiance': 1e\+39",
         ),
-        (
-            '<shape type="sphere"><transform name="to_world"><scale value="inf"/></transform></shape>',
-            "line 2: .*to_world",
+        *(
+            (f'<shape type="cube"><transform name="to_world"><{step}/></transform></shape>', "line 2: ")
+            for step in ('scale value="inf"', 'rotate x="1" angle="nan"', 'translate x="nan"', 'matrix value="nan"')
         ),
         (
             '<shape type="sphere"/><emitter type="constant"/>\n<emitter type="sunsky"/>',
-            "line 2: .* and .*line 3: .*keep one .*sunsky",
+            "scene.xml: line 1: .*one environment emitter",
         ),
     ],
 )
@@ -289,21 +292,3 @@ def test_shapes_of_a_group_and_copied_files_keep_apart(write_xml: Callable[..., 
     group = '<shape type="shapegroup" id="g"><shape type="cube"/><shape type="sphere"/></shape>'
     instances = '<shape type="instance"><ref id="g"/></shape>' * 2
     assert len(loaded(write_xml(f'{group}{instances}<shape type="cube" id="g_1"/>'))[1].shapes()) == 5
-
-
-@pytest.mark.parametrize("kind", ["rotate", "matrix", "translate"])
-def test_transforms_that_are_no_numbers_are_refused(write_xml: Callable[..., Path], read: Read, kind: str) -> None:
-    step = {
-        "rotate": '<rotate x="1" angle="nan"/>',
-        "translate": '<translate x="nan"/>',
-        "matrix": f'<matrix value="nan {"0 " * 15}"/>',
-    }[kind]
-    with pytest.raises(SpecError, match="line 2"):
-        read(write_xml(f'<shape type="cube"><transform name="to_world">{step}</transform></shape>'))
-
-
-def test_a_spectrum_that_lamps_refer_to_is_not_cut_to_what_reflects(write_xml: Callable[..., Path], read: Read) -> None:
-    spectrum = '<texture type="regular" id="L"><string name="values" value="10, 20, 30"/></texture>'
-    lamp = '<shape type="sphere"><emitter type="area"><ref name="radiance" id="L"/></emitter></shape>'
-    (found,) = read(write_xml(spectrum + lamp)).root.iter("rgb")
-    assert max(map(float, found.get("value", "").split(","))) > 10

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import drjit as dr
-import mitsuba as mi
 import numpy as np
 import pytest
 from mitsuba_scenes import SPHERE, Loaded, Read, from_sky, reflectance
@@ -33,7 +31,7 @@ def test_names_of_version_0_6_are_those_of_version_3(write_xml: Callable[..., Pa
     red, shiny, chess = made.shapes()
     assert np.array(red.bbox().max) == pytest.approx([2, 2, 2])
     assert "eta = [1.39" in str(red.bsdf())
-    assert "alpha_u = UniformSpectrum[value=[0.1]]" in str(shiny.bsdf())  # 1 / √(2 · 50)
+    assert "alpha = [0.1]" in str(shiny.bsdf())  # 1 / √(2 · 50)
     assert "0.5" in str(chess.bsdf())
     assert made.emitters()[0].class_name() == "SunskyEmitter"
     notes = " ".join(map(str, scene.changes))
@@ -47,7 +45,6 @@ def test_names_of_version_0_6_are_those_of_version_3(write_xml: Callable[..., Pa
         ('<srgb name="reflectance" value="0.5"/>', [0.214] * 3),
         ('<srgb name="reflectance" value="#808080"/>', [0.216] * 3),
         ('<rgb name="reflectance" value="#808080"/>', [0.502] * 3),  # linear also in digits
-        ('<rgb name="reflectance" value="1.5, .75, 0"/>', [1, 0.5, 0]),  # energy is conserved
         ('<spectrum name="reflectance" value=".1, .2, .3"/>', [0.1, 0.2, 0.3]),
         ('<spectrum name="reflectance" value="0.3" intent="reflectance"/>', [0.3] * 3),
         ('<spectrum name="reflectance" value="400:.5, 700:.5"/>', [0.6, 0.475, 0.452]),  # of no white point
@@ -67,9 +64,6 @@ def test_colours_of_0_6_are_those_of_its_rgb_mode(
         ("", [0.216, 0.051, 1]),
         ('<float name="gamma" value="1"/>', [0.502, 0.251, 1]),
         ('<float name="gamma" value="-1"/>', [0.216, 0.051, 1]),
-        ('<float name="gamma" value="2.2"/>', [0.5019608**2.2, 0.2509804**2.2, 1]),
-        ('<string name="channel" value="g"/>', [0.051] * 3),
-        ('<string name="channel" value="a"/>', [0.8] * 3),
         ('<string name="filterType" value="ewa"/><boolean name="cache" value="true"/>', [0.216, 0.051, 1]),
     ],
 )
@@ -90,12 +84,11 @@ def test_textures_of_0_6_are_moved_and_named_as_they_say(
     Image.fromarray(np.array([[0, 255]], np.uint8)).save(tmp_path / "it.png")
     named = '<string name="filename" value="it.png"/><string name="filterType" value="nearest"/>'
     content = f"""<shape type="rectangle"><bsdf type="diffuse"><texture type="scale" id="S" name="reflectance">
-        <texture type="bitmap" id="T">{named}<float name="voffset" value="1"/></texture></texture></bsdf></shape>"""
-    for number, name in enumerate("ST"):
-        content += f"""<shape type="rectangle"><transform name="toWorld"><translate x="{4 * number + 4}"/></transform>
-        <bsdf type="diffuse"><ref name="reflectance" id="{name}"/></bsdf></shape>"""
+        <texture type="bitmap">{named}<float name="voffset" value="1"/></texture></texture></bsdf></shape>
+        <shape type="rectangle"><transform name="toWorld"><translate x="4"/></transform>
+        <bsdf type="diffuse"><ref name="reflectance" id="S"/></bsdf></shape>"""
     scene, made = loaded(write_xml(content, "0.6.0"))
-    assert [reflectance(made, x, 0)[0] for x in (-0.5, 0.5, 4.5, 8.5)] == pytest.approx([0, 1, 1, 1])
+    assert [reflectance(made, x, 0)[0] for x in (-0.5, 0.5, 4.5)] == pytest.approx([0, 1, 1])
     matrix = scene.root.find("texture/transform/matrix")
     assert matrix is not None
     assert matrix.get("value", "").split()[6:8] == ["0", "1"]  # v · 1 + 1
@@ -108,9 +101,6 @@ def test_light_of_0_6_has_its_colour_and_level(write_xml: Callable[..., Path], l
     ):
         _, made = loaded(write_xml(f'<emitter type="constant">{written}</emitter>{SPHERE}', "0.6.0"))
         assert from_sky(made, np.array([[0, 0, 1]]))[0] == pytest.approx(expected, rel=1e-3)
-    content = SPHERE + '<emitter type="constant"><spectrum name="radiance" type="blackbody">'
-    _, made = loaded(write_xml(content + '<float name="temperature" value="3000"/></spectrum></emitter>'))
-    assert from_sky(made, np.array([[0, 0, 1]]))[0] == pytest.approx([733.1, 349.6, 112.7], rel=1e-3)
 
 
 def test_the_sun_of_0_6_stands_where_its_place_and_time_say(write_xml: Callable[..., Path], loaded: Loaded) -> None:
@@ -134,21 +124,11 @@ def test_skies_of_0_6_are_above(case: Callable[[str], Path], loaded: Loaded) -> 
     assert from_sky(made, np.array([[-0.31, 0.94, 0.10]])).mean() == pytest.approx(0.065, rel=0.01)
 
 
-MIXTURE = """<bsdf type="mixturebsdf"><string name="weights" value="{}"/><bsdf type="diffuse">
-  <rgb name="reflectance" value="1 0 0"/></bsdf><bsdf type="diffuse"><rgb name="reflectance" value="0 1 0"/></bsdf>
-  </bsdf>"""
-
-
 @pytest.mark.parametrize(
     ("written", "described", "said"),
     [
         ('<bsdf type="conductor"/>', "0.201005, 0.92375, 1.10222", None),  # copper
         ('<bsdf type="roughdielectric"><string name="distribution" value="phong"/></bsdf>', "beckmann", "distribution"),
-        (
-            '<bsdf type="ward"><float name="alphaU" value=".2"/><float name="alphaV" value=".3"/></bsdf>',
-            "alpha_u = UniformSpectrum[value=[0.2]], alpha_v = UniformSpectrum[value=[0.3]]",
-            "ward",
-        ),
         ('<bsdf type="roughdiffuse"><float name="alpha" value=".3"/></bsdf>', "SmoothDiffuse", "roughdiffuse"),
         (
             '<bsdf type="conductor"><spectrum name="eta" value="1.5"/><spectrum name="k" value="400:3, 700:3"/></bsdf>',
@@ -167,7 +147,6 @@ MIXTURE = """<bsdf type="mixturebsdf"><string name="weights" value="{}"/><bsdf t
             "NormalMap",
             None,
         ),
-        (MIXTURE.format(".5, .5"), "weight = UniformSpectrum[value=[0.5]]", None),
         (
             '<bsdf type="bumpmap"><texture type="scale"><float name="scale" value=".25"/><texture type="checkerboard"/>'
             '</texture><bsdf type="diffuse"/></bsdf>',
@@ -217,11 +196,13 @@ def test_materials_of_0_6_have_its_defaults_or_are_the_nearest(
             "gamma",
         ),
         (
-            '<shape type="disk"><bsdf type="phong"><texture name="exponent" type="checkerboard"/></bsdf></shape>',
+            '<texture type="bitmap"><string name="filename" value="grey.png"/><string name="channel" value="a"/>'
+            "</texture>",
             "colour",
-            "exponent",
+            "channel",
         ),
-        (f'<shape type="disk">{MIXTURE.format(".5, .2")}</shape>', "colour", "mixturebsdf"),
+        ('<shape type="disk"><bsdf type="ward"/></shape>', "colour", "ward"),
+        ('<shape type="disk"><bsdf type="mixturebsdf"><bsdf type="diffuse"/></bsdf></shape>', "colour", "mixturebsdf"),
         ('<shape type="disk"><bsdf type="coating"><bsdf type="diffuse"/></bsdf></shape>', "colour", "coating"),
         (
             '<shape type="disk"><bsdf type="mask"><rgb name="opacity" value=".9 .1 .1"/><bsdf type="diffuse"/></bsdf>'
@@ -232,12 +213,6 @@ def test_materials_of_0_6_have_its_defaults_or_are_the_nearest(
         ('<shape type="heightfield"/>', "geometry", "heightfield"),
         ('<shape type="sphere"><subsurface type="dipole"/></shape>', "colour", "subsurface"),
         ('<shape type="obj"><string name="filename" value="it.obj"/></shape>', "colour", "mtllib"),
-        (
-            '<shape type="obj"><string name="filename" value="it.obj"/><bsdf type="diffuse" name="Red"/>'
-            '<bsdf type="diffuse" name="BlueWall"/></shape>',
-            "colour",
-            "usemtl",
-        ),
         ('<shape type="sphere"><float name="maxSmoothAngle" value="30"/></shape>', "geometry", "maxSmoothAngle"),
     ],
 )
@@ -256,30 +231,6 @@ def test_what_0_6_has_and_mitsuba_3_has_not_is_a_loss_by_its_name(
     assert [(change.effect, change.name) for change in scene.changes if change.effect] == [(effect, name)]
 
 
-@pytest.mark.parametrize(("kind", "width"), [("phong", '<float name="exponent" value="98"/>'), ("ward", "")])
-def test_glossy_materials_of_0_6_reflect_as_much(
-    write_xml: Callable[..., Path], loaded: Loaded, kind: str, width: str
-) -> None:
-    for written, expected in (
-        ("", 0.7),  # 0.5 diffuse and 0.2 specular, the defaults
-        ('<rgb name="specularReflectance" value="0.4 0.2 0.1"/><spectrum name="diffuseReflectance" value="0.1"/>', 0.5),
-        ('<spectrum name="specularReflectance" value="1"/>', 1),  # energy is conserved
-    ):
-        _, made = loaded(write_xml(f'<shape type="disk"><bsdf type="{kind}">{width}{written}</bsdf></shape>', "0.6.0"))
-        count = 10000
-        hit = dr.zeros(mi.SurfaceInteraction3f, count)
-        hit.wi = mi.Vector3f(0, 0, 1)
-        random = mi.PCG32(count)
-        points = mi.Point2f(random.next_float32(), random.next_float32())
-        _, weight = made.shapes()[0].bsdf().sample(mi.BSDFContext(), hit, random.next_float32(), points)
-        assert np.array(weight[0]).mean() == pytest.approx(expected, rel=0.02)
-
-
-def test_what_looks_at_something_has_the_up_of_0_6(write_xml: Callable[..., Path], read: Read) -> None:
-    sensor = '<sensor type="perspective"><transform name="toWorld"><lookAt origin="0 0 0" target="1 0 0"/></transform>'
-    assert read(write_xml(f"{sensor}</sensor>{SPHERE}", "0.6.0")).up == (0, -1, 0)  # by 0.6's coordinateSystem
-
-
 @pytest.mark.parametrize(
     ("content", "named"),
     [
@@ -287,14 +238,16 @@ def test_what_looks_at_something_has_the_up_of_0_6(write_xml: Callable[..., Path
         ('<transform name="toWorld"><lookat origin="0 0 5" target="0 0"/></transform>', "line 2: .* got 2"),
         ('<transform name="toWorld"><lookAt target="0 0 0" up="0 1 0"/></transform>', "line 2: .*origin"),
         (
-            '<emitter type="area"/></shape><emitter type="sun"/><emitter type="sky"/><shape type="disk">',
-            "line 2: .* and .*line 2: .*keep one",
+            '</shape><shape type="obj"><string name="filename" value="it.obj"/><bsdf type="diffuse" name="Red"/>'
+            '<bsdf type="diffuse" name="BlueWall"/>',
+            "line 2: <shape> .*single BSDF",
         ),
     ],
 )
 def test_what_is_wrong_in_0_6_is_named(
-    write_xml: Callable[..., Path], loaded: Loaded, content: str, named: str
+    write_xml: Callable[..., Path], loaded: Loaded, tmp_path: Path, content: str, named: str
 ) -> None:
+    (tmp_path / "it.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     with pytest.raises(SpecError, match=named):
         loaded(write_xml(f'<shape type="rectangle">{content}</shape>', "0.6.0"))
 
@@ -307,5 +260,5 @@ def test_terms_before_0_4_are_refused(write_xml: Callable[..., Path], read: Read
 def test_a_phong_with_a_texture_keeps_its_texels(write_xml: Callable[..., Path], loaded: Loaded) -> None:
     texture = '<texture name="diffuseReflectance" type="checkerboard"><rgb name="color0" value="0.8"/></texture>'
     scene, made = loaded(write_xml(f'<shape type="rectangle"><bsdf type="phong">{texture}</bsdf></shape>', "0.6.0"))
-    assert {(change.effect, change.name) for change in scene.changes} == {(None, "phong"), (None, "")}
+    assert {(change.effect, change.name) for change in scene.changes} == {("colour", "phong"), (None, "")}
     assert "RoughPlastic" in str(made.shapes()[0].bsdf())

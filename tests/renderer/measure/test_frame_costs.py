@@ -55,7 +55,7 @@ def plain(film: int = 16, **changes: Any) -> SceneSpec:
 
 
 def frame(view: View, modification: Modification, key: str = "same", row: int = 0) -> TimedFrame:
-    return TimedFrame(row, modification, key.encode(), view)
+    return TimedFrame(row, modification, view, key.encode())
 
 
 # ------------------------------------------------------------------------------------------------------------- surfaces

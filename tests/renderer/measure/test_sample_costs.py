@@ -116,7 +116,7 @@ def test_a_pass_of_more_samples_takes_the_seconds_that_were_predicted() -> None:
     costs = sample_costs(scene, 5)
     view = View(np.array([0, 1, 3.5], np.float32), np.array([0, 1, 0], np.float32))
     scene.render_halves(view, (1, 2), 16)
-    measured_s = min(time_work(lambda: scene.render_halves(view, (3, 4), 16))[0] for _ in range(3))
+    measured_s = min(time_work(lambda: scene.render_halves(view, (3, 4), 16), backend.work_s)[0] for _ in range(3))
     predicted_s = costs.seconds(32, configurations=0, views=0, samples=1)
     assert 0.4 < predicted_s / measured_s < 2.5
 

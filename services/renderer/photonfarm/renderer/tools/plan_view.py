@@ -1,4 +1,4 @@
-"""A scene from above, as SVG: what stands where in a configuration, and where cameras stand and look.
+"""A scene from above or from one side, as SVG: what stands where, what may stand where, and cameras.
 
 Shape letters: N points, G movable groups, S shapes.
 """
@@ -12,6 +12,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
+from photonfarm.core.pictures import Picture, data_uri
 from photonfarm.core.records import Geometry
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import Box, SceneSpec
@@ -22,7 +23,31 @@ F64 = NDArray[np.float64]
 MOST_SHAPES = 1000  # that never move and are drawn: the largest ones
 WIDTH = 100.0  # of a plan, in its own units
 MARGIN = 0.03  # of the scene's larger side
+REACH = 0.6  # of what may be placed: how far what never moves is drawn beyond that
 GOLDEN_ANGLE = 137.508  # degrees between the hues of two groups that follow each other
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A movable group, and where it stands in a configuration."""
+
+    number: int  # in the plans
+    name: str
+    is_light: bool
+    place: str | None  # None: it is not there
+
+    @classmethod
+    def of(cls, spec: SceneSpec, i: int, modification: Modification | None = None) -> Standing:
+        """Where a group stands, or where it was modelled."""
+        group, place = spec.groups[i], None
+        if modification is None or modification.present[i]:
+            place = said(np.array(group.at) + (0 if modification is None else modification.translation[i]))
+        return cls(i + 1, group.name, i >= len(spec.objects), place)
+
+
+def said(point: NDArray[np.floating]) -> str:
+    """A point in words."""
+    return f"({', '.join(f'{value:.3g}' for value in np.where(np.abs(point) < 1e-6, 0, point))})"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -30,24 +55,32 @@ class PlanView:
     """What all plans of a scene have in common."""
 
     spec: SceneSpec
+    axes: F64  # (2, 3) the directions to the right and up in the plan
     footprints: F64  # (G, 2, 3) lower and upper corner of each group at rest; NaN without triangles
     still: F64  # (N, 2, 3) the same of shapes that never move
     low: F64  # (2,) what the plans show, in the plan's axes
     high: F64
 
     @classmethod
-    def of(cls, spec: SceneSpec, geometry: Geometry) -> PlanView:
-        """The scene at rest, and the part that plans show: what never moves, and all places of objects and cameras."""
+    def of(cls, spec: SceneSpec, geometry: Geometry, *, from_above: bool = True) -> PlanView:
+        """The scene at rest, and the part that plans show: all places of objects and cameras, and what is near them."""
         boxes = shape_boxes(geometry)
-        groups = geometry.shape_group
-        still = boxes[(groups < 0) & np.isfinite(boxes).all(axis=(1, 2))]
-        footprints = np.array([_around(boxes[groups == g]) for g in range(len(spec.groups))]).reshape(-1, 2, 3)
-        places = [(box.low, box.high) for box in (spec.view.origin, spec.view.look_at, *(g.box for g in spec.groups))]
-        low, high = _extent(_flat(spec, np.concatenate([still, np.array(places)]).reshape(-1, 3)))
+        still = boxes[(geometry.shape_group < 0) & np.isfinite(boxes).all(axis=(1, 2))]
+        footprints = np.array([_around(boxes[geometry.shape_group == g]) for g in range(len(spec.groups))])
+        places = [(box.low, box.high) for box in (spec.view.origin, spec.view.look_at)]
+        for group, corners in zip(spec.groups, footprints, strict=True):
+            own = np.where(np.isfinite(corners), corners, group.at) - group.at
+            places.append((group.box.low + np.minimum(own[0], 0), group.box.high + np.maximum(own[1], 0)))
+        core = _around(np.array(places))
+        reach = REACH * np.ptp(core, axis=0).max()
+        near = np.clip(still, core[0] - reach, core[1] + reach)
+        axes = axes_of(spec, from_above=from_above)
+        flat = np.concatenate([core[None], near]) @ axes.T
+        low, high = _extent(flat.reshape(-1, 2))
         margin = MARGIN * (high - low).max()
-        area = np.prod(np.abs(np.diff(_flat(spec, still), axis=1)[:, 0]), axis=-1)
+        area = np.prod(np.abs(np.diff(still @ axes.T, axis=1)[:, 0]), axis=-1)
         largest = np.sort(np.argsort(area)[::-1][:MOST_SHAPES])
-        return cls(spec, footprints, still[largest], low - margin, high + margin)
+        return cls(spec, axes, footprints.reshape(-1, 2, 3), still[largest], low - margin, high + margin)
 
     @property
     def height(self) -> float:
@@ -57,24 +90,23 @@ class PlanView:
 
     def shell(self) -> Markup:
         """What never moves, once in a page, as the symbol that all plans use."""
-        shapes = Markup("").join(self._rectangle(_flat(self.spec, box), "still") for box in self.still)
+        shapes = Markup("").join(self._rectangle(box, "still") for box in self.still)
         return Markup(
             '<svg class="shared" width="0" height="0" aria-hidden="true"><defs><g id="still">{}</g></defs></svg>'
         ).format(shapes)
 
-    def places(self) -> Markup:
-        """The scene at rest, and the boxes that objects, lights and cameras are placed in."""
-        boxes = [self._rectangle(self._place(g.box), f"may hue{i}") for i, g in enumerate(self.spec.groups)]
-        boxes += [self._rectangle(self._place(self.spec.view.origin), "origins")]
-        return self._svg([*boxes, *self._groups(rest(self.spec))], "where objects and cameras may stand, from above")
+    def places(self, about: str, behind: Picture | None = None) -> Markup:
+        """The scene at rest, before a picture of it or its shell, and the boxes that all is placed in."""
+        view, groups = self.spec.view, self.spec.groups
+        boxes = [self._rectangle(_corners(g.box), f"may hue{i}") for i, g in enumerate(groups)]
+        boxes += [self._rectangle(_corners(view.look_at), "looked"), self._rectangle(_corners(view.origin), "origins")]
+        ats = [self._point(np.array(group.at), f"at hue{i}") for i, group in enumerate(groups)]
+        return self._svg([*boxes, *self._groups(rest(self.spec)), *ats], about, behind)
 
     def configuration(self, modification: Modification, views: Sequence[View]) -> Markup:
         """The plan of one configuration, and cameras with their fields of view."""
         cameras = [part for view in views for part in self._camera(view)]
         return self._svg([*self._groups(modification), *cameras], "what stands where, from above, and the camera")
-
-    def _place(self, box: Box) -> F64:
-        return _flat(self.spec, np.stack([box.low, box.high]))
 
     def _groups(self, modification: Modification) -> list[Markup]:
         """The groups that are there: lights last, as they hang above."""
@@ -82,7 +114,7 @@ class PlanView:
         for i, corners in enumerate(self.footprints):
             if not modification.present[i] or not np.isfinite(corners).all():
                 continue
-            corners = _flat(self.spec, corners + modification.translation[i])
+            corners = corners + modification.translation[i]
             kind = "light" if i >= len(self.spec.objects) else "thing"
             x, y = self._at(corners.mean(axis=0))
             drawn.append(self._rectangle(corners, f"{kind} hue{i}"))
@@ -94,31 +126,40 @@ class PlanView:
         far = np.linalg.norm(view.target.astype(np.float64) - camera.origin)
         half = 0.5 * camera.width / camera.focal_px
         rays = (camera.forward + side * half * camera.right for side in (-1, 1))
-        corners = [self._at(_flat(self.spec, camera.origin + far * ray)) for ray in rays]
-        eye, target = (self._at(_flat(self.spec, point)) for point in (camera.origin, view.target.astype(np.float64)))
+        corners = [self._at(camera.origin + far * ray) for ray in rays]
+        eye, target = (self._at(point) for point in (camera.origin, view.target.astype(np.float64)))
         wedge = " ".join(f"{x:.2f},{y:.2f}" for x, y in (eye, *corners))
         return [
             Markup('<polygon class="sees" points="{}"/>').format(wedge),
             Markup('<line class="sees" x1="{:.2f}" y1="{:.2f}" x2="{:.2f}" y2="{:.2f}"/>').format(*eye, *target),
-            Markup('<circle class="eye" cx="{:.2f}" cy="{:.2f}" r="1.5"/>').format(*eye),
+            self._point(camera.origin, "eye"),
         ]
 
     def _at(self, point: F64) -> tuple[float, float]:
-        """A point of the plan's axes, (2,), in the SVG's units; y goes down there."""
+        """A world point (3,) in the SVG's units; y goes down there."""
+        x, y = self.axes @ point
         scale = WIDTH / (self.high[0] - self.low[0])
-        return float(scale * (point[0] - self.low[0])), float(scale * (self.high[1] - point[1]))
+        return float(scale * (x - self.low[0])), float(scale * (self.high[1] - y))
+
+    def _point(self, point: F64, kind: str) -> Markup:
+        return Markup('<circle class="{}" cx="{:.2f}" cy="{:.2f}" r="1.5"/>').format(kind, *self._at(point))
 
     def _rectangle(self, corners: F64, kind: str) -> Markup:
-        """The rectangle around points (N, 2) of the plan's axes."""
-        (left, bottom), (right, top) = (self._at(corner) for corner in _extent(corners))
+        """The rectangle around a box (2, 3)."""
+        left, top, right, bottom = np.concatenate(_extent(np.array([self._at(corner) for corner in corners])))
         return Markup('<rect class="{}" x="{:.2f}" y="{:.2f}" width="{:.2f}" height="{:.2f}"/>').format(
             kind, left, top, max(right - left, 0.3), max(bottom - top, 0.3)
         )
 
-    def _svg(self, parts: Sequence[Markup], about: str) -> Markup:
-        return Markup(
-            '<svg class="plan" viewBox="0 0 {:.2f} {:.2f}" role="img" aria-label="{}"><use href="#still"/>{}</svg>'
-        ).format(WIDTH, self.height, about, Markup("").join(parts))
+    def _svg(self, parts: Sequence[Markup], about: str, behind: Picture | None = None) -> Markup:
+        shell = Markup('<use href="#still"/>')
+        if behind is not None:
+            shell = Markup('<image href="{}" width="{:.2f}" height="{:.2f}"/>').format(
+                data_uri(behind), WIDTH, self.height
+            )
+        return Markup('<svg class="plan" viewBox="0 0 {:.2f} {:.2f}" role="img" aria-label="{}">{}{}</svg>').format(
+            WIDTH, self.height, about, shell, Markup("").join(parts)
+        )
 
 
 def hue(group: int) -> float:
@@ -126,12 +167,11 @@ def hue(group: int) -> float:
     return (195 + 310 / 360 * ((GOLDEN_ANGLE * group) % 360)) % 360
 
 
-def axes(spec: SceneSpec) -> tuple[tuple[int, int], tuple[int, int]]:
-    """The plan's axes, to the right and up, each as a world axis and its sign: as seen from above, not mirrored."""
-    up = int(np.abs(spec.view.up).argmax())
-    sign = int(spec.view.up[up])
-    right, upward = {0: (1, 2), 1: (0, 2), 2: (0, 1)}[up]
-    return (right, 1), (upward, -sign if up == 1 else sign)
+def axes_of(spec: SceneSpec, *, from_above: bool = True) -> F64:
+    """A plan's axes to the right and up, (2, 3): as seen from above, not mirrored, or from a side."""
+    upwards = np.array(spec.view.up, np.float64)
+    right = np.eye(3)[0 if upwards[0] == 0 else 1]
+    return np.array([right, np.cross(upwards, right) if from_above else upwards])
 
 
 def shape_boxes(geometry: Geometry) -> F64:
@@ -146,15 +186,14 @@ def shape_boxes(geometry: Geometry) -> F64:
     return boxes
 
 
+def _corners(box: Box) -> F64:
+    return np.stack([box.low, box.high])
+
+
 def _around(boxes: F64) -> F64:
     """The box around boxes (N, 2, 3); NaN around none."""
     known = boxes[np.isfinite(boxes).all(axis=(1, 2))]
     return np.stack([known[:, 0].min(axis=0), known[:, 1].max(axis=0)]) if len(known) else np.full((2, 3), np.nan)
-
-
-def _flat(spec: SceneSpec, points: F64) -> F64:
-    """World points (..., 3) on the plan's axes, (..., 2)."""
-    return np.stack([sign * points[..., axis] for axis, sign in axes(spec)], axis=-1)
 
 
 def _extent(points: F64) -> tuple[F64, F64]:

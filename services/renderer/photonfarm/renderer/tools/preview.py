@@ -7,15 +7,13 @@ from pathlib import Path
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
 from photonfarm.core import pictures
 from photonfarm.core.errors import store_errors
 from photonfarm.core.page import render_page
 from photonfarm.core.pictures import Picture
 from photonfarm.core.records import Geometry, Photons
-from photonfarm.renderer.tools.plan_view import PlanView, hue
-from photonfarm.scene.modification import Modification
+from photonfarm.renderer.tools.plan_view import PlanView, Standing, hue, said
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera
 from photonfarm.store.read.batch import Sample
@@ -29,16 +27,6 @@ NO_GEOMETRY = Geometry(
 """What is known of a scene before its first job."""
 
 TEMPLATE = Path(__file__).with_name("preview.html.j2")
-
-
-@dataclass(frozen=True, slots=True)
-class Standing:
-    """A movable group, and where it stands in a configuration."""
-
-    number: int  # in the plans
-    name: str
-    is_light: bool
-    place: str | None  # None: it is not there
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +53,8 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
         complete=len(reader.rows),
         hues=[hue(i) for i in range(len(spec.groups))],
         shell=plan.shell(),
-        places=plan.places(),
-        groups=[(_find_group(spec, i), group) for i, group in enumerate(spec.groups)],
+        places=plan.places("where objects and cameras may stand, from above"),
+        groups=[(Standing.of(spec, i), group) for i, group in enumerate(spec.groups)],
         rows=[_row(reader, plan, int(row)) for row in shown],
     )
 
@@ -93,22 +81,9 @@ def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:
         row,
         f"camera at {said(sample.view.origin)}, looking at {said(sample.view.target)}",
         plan.configuration(sample.modification, [sample.view]),
-        [_find_group(spec, i, sample.modification) for i in range(len(spec.groups))],
+        [Standing.of(spec, i, sample.modification) for i in range(len(spec.groups))],
         list(zip(COLUMNS, panels, strict=True)),
     )
-
-
-def _find_group(spec: SceneSpec, i: int, modification: Modification | None = None) -> Standing:
-    """Where a group stands, or where it was modelled."""
-    group, place = spec.groups[i], None
-    if modification is None or modification.present[i]:
-        place = said(np.array(group.at) + (0 if modification is None else modification.translation[i]))
-    return Standing(i + 1, group.name, i >= len(spec.objects), place)
-
-
-def said(point: NDArray[np.floating]) -> str:
-    """A point in words."""
-    return f"({', '.join(f'{value:.3g}' for value in np.where(np.abs(point) < 1e-6, 0, point))})"
 
 
 def photon_picture(sample: Sample, photons: Photons | None, spec: SceneSpec) -> Picture:

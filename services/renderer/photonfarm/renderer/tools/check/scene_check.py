@@ -6,23 +6,19 @@ What was found is a page (HTML), one file that needs no other.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from markupsafe import Markup
 
 from photonfarm.core.errors import store_errors
 from photonfarm.core.page import render_page
-from photonfarm.core.pictures import Picture, display_values
-from photonfarm.core.records import F32
+from photonfarm.core.pictures import Picture
+from photonfarm.core.records import F32, Geometry
 from photonfarm.core.waiting import Log, WorkLog
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.tools.check import drawings, samples, shape_pictures
-from photonfarm.renderer.tools.check.drawings import COLOURS, Drawing
+from photonfarm.renderer.tools.check import samples, shape_pictures
 from photonfarm.renderer.tools.check.findings import (
     CUT_AT_ALL,
     INSIDE,
@@ -34,14 +30,17 @@ from photonfarm.renderer.tools.check.findings import (
     collect_findings,
     percent,
 )
+from photonfarm.renderer.tools.check.shape_pictures import Projection, draw_scene
 from photonfarm.renderer.tools.check.shapes import ShapeFacts, facts_of, groups_by_shape, placements
 from photonfarm.renderer.tools.measure.exposure import TARGET
+from photonfarm.renderer.tools.plan_view import PlanView, Standing, hue
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec, SpecLines
 
-TEMPLATE = Path(__file__).with_name("check.html.j2")
+TEMPLATE = Path(__file__).parents[1] / "check.html.j2"
 
-BINS = 32
+PIXELS = 640
+"""The width of plan and elevation."""
 
 PICTURED = 240
 """The most shapes that get a picture: those of movable groups, and then the largest."""
@@ -54,9 +53,8 @@ class SceneCheck:
     spec: SceneSpec
     shapes: list[ShapeFacts]
     pictures: dict[int, Picture]  # of some shapes, by their number
-    room: F32  # (2, 3) the box of what does not move
     measured: Measured
-    drawings: list[Drawing]
+    drawings: list[tuple[str, Markup]]  # titles, and plans as SVG
     findings: list[Finding]
     seconds: float
 
@@ -73,25 +71,34 @@ def _check(named: NamedSpec, work: WorkLog) -> SceneCheck:
     scene = LoadedScene.load(samples.small(spec), named.file.parent)
     group_of = groups_by_shape(spec)
     shapes = facts_of(scene.scene, group_of)
-    boxes, still = scene.boxes, scene.still
-    room = _around(boxes[still] if still.any() else boxes)
     work.begin(f"{len(shapes)} shapes; drawing them, and moving groups to {len(spec.groups)} boxes' ends")
     geometry, cloud = scene.base()
     placed = placements(scene, geometry)
     colours = shape_pictures.shape_colours(scene.scene, geometry)
-    drawn = drawings.drawings(scene.scene, spec, geometry, colours, placed, room)
+    drawn = [_draw_plan(scene, spec, geometry, colours, from_above=from_above) for from_above in (True, False)]
     up = int(np.abs(spec.view.up).argmax())
-    pictured = _choose_pictured(shapes, boxes)
+    pictured = _choose_pictured(shapes, scene.boxes)
     pictures = {number: shape_pictures.draw_from_corner(geometry, number, colours[number], up) for number in pictured}
     rendered = samples.render(scene, spec, cloud, work)
-    low, high = _around(boxes)
-    measured = Measured(low, high, placed, rendered)
+    measured = Measured(scene.boxes[:, 0].min(axis=0), scene.boxes[:, 1].max(axis=0), placed, rendered)
     findings = collect_findings(spec, named.lights, measured)
-    return SceneCheck(spec, shapes, pictures, room, measured, drawn, findings, time.monotonic() - begun)
+    return SceneCheck(spec, shapes, pictures, measured, drawn, findings, time.monotonic() - begun)
 
 
-def _around(boxes: F32) -> F32:
-    return np.array([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+def _draw_plan(
+    scene: LoadedScene, spec: SceneSpec, geometry: Geometry, colours: F32, *, from_above: bool
+) -> tuple[str, Markup]:
+    """The plan or the elevation of a scene at rest, over a picture of it that is cut open in front of cameras."""
+    plan = PlanView.of(spec, geometry, from_above=from_above)
+    (right, upward), (left, bottom), (width, height) = plan.axes, plan.low, plan.high - plan.low
+    forward = np.cross(right, -upward)
+    view = spec.view
+    start = min(float(box @ forward) for each in (view.origin, view.look_at) for box in (each.low, each.high))
+    low, high = np.array([left, -bottom - height]), np.array([left + width, -bottom])
+    picture = draw_scene(scene.scene, Projection(right, -upward, forward, low, high, start), PIXELS, colours)
+    cut = "Plan, cut open above the cameras" if from_above else "Elevation, cut open in front of the cameras"
+    title = f"{cut}: {width:.3g} wide and {height:.3g} high"
+    return title, plan.places(title, picture)
 
 
 def _choose_pictured(shapes: list[ShapeFacts], boxes: F32) -> list[int]:
@@ -111,15 +118,6 @@ class Fact:
     doubtful: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Tile:
-    """A shape with its picture, if it has one, and its place in the plan."""
-
-    shape: ShapeFacts
-    picture: Picture | None
-    place: tuple[float, float, float, float]  # x, y, width and height of its box in a plan of 1 × 1
-
-
 def write(check: SceneCheck, lines: SpecLines, out: Path) -> None:
     """Write the page of a check to a file; raises StoreError where that cannot be."""
     with store_errors("write the page", out):
@@ -131,14 +129,13 @@ def page(check: SceneCheck, lines: SpecLines) -> str:
     """The page."""
     spec, seen = check.spec, check.measured.samples
     groups = [
-        (group, COLOURS[number % len(COLOURS)], placed)
+        (Standing.of(spec, number), group, placed)
         for number, (group, placed) in enumerate(zip(spec.groups, check.measured.placed, strict=True))
     ]
     shown = [
         (each, [g.name for g, there in zip(spec.groups, each.modification.present, strict=True) if not there])
         for each in seen.shown
     ]
-    exposed = spec.exposure * np.nan_to_num(seen.images.halves.mean(axis=1))
     return render_page(
         TEMPLATE,
         title=f"photonfarm: {spec.name}",
@@ -146,13 +143,11 @@ def page(check: SceneCheck, lines: SpecLines) -> str:
         spec=spec,
         file=lines.file.name,
         findings=[(finding, lines.line(finding.key)) for finding in check.findings],
+        hues=[hue(number) for number in range(len(spec.groups))],
         groups=groups,
         shown=shown,
         cameras=_camera_facts(check),
         light=_light_facts(check),
-        seen=_bars(seen.cameras.seen, (0.0, float(max(seen.cameras.seen.max(), 1e-6)))),
-        brightness=_bars(display_values(exposed.astype(np.float32)).mean(axis=-1), (0.0, 1.0)),
-        most_seen=f"{100 * float(seen.cameras.seen.max()):.0f} %",
         sections=_sections(check),
         limits={"outside": OUTSIDE, "cut": CUT_AT_ALL},
     )
@@ -183,32 +178,11 @@ def _light_facts(check: SceneCheck) -> list[Fact]:
     return [Fact("display mean", f"{mean:.2f}", note, not MEANS[0] <= mean <= MEANS[1])]
 
 
-def _bars(values: NDArray[Any], ends: tuple[float, float]) -> list[float]:
-    """A histogram's bars, of height 1 at most."""
-    counts, _ = np.histogram(np.clip(values, *ends), BINS, ends)
-    return [float(count) for count in counts / max(counts.max(), 1)]
-
-
-def _sections(check: SceneCheck) -> list[tuple[str, list[Tile], list[Tile]]]:
+def _sections(check: SceneCheck) -> list[tuple[str, list[tuple[ShapeFacts, Picture]], list[ShapeFacts]]]:
     """Shapes by movable group, and then those that do not move: with pictures, and without."""
-    names = [group.name for group in check.spec.groups]
-    order = sorted(range(len(check.shapes)), key=lambda number: _place(check.shapes[number], names))
     sections = []
-    for name, numbers in groupby(order, key=lambda number: check.shapes[number].group):
-        tiles = [_tile(check, number) for number in numbers]
-        with_picture = [tile for tile in tiles if tile.picture is not None]
-        sections.append((name or "", with_picture, [tile for tile in tiles if tile.picture is None]))
+    for name in (*(group.name for group in check.spec.groups), None):
+        own = [(shape, check.pictures.get(i)) for i, shape in enumerate(check.shapes) if shape.group == name]
+        pictured = [(shape, picture) for shape, picture in own if picture is not None]
+        sections.append((name or "", pictured, [shape for shape, picture in own if picture is None]))
     return sections
-
-
-def _place(shape: ShapeFacts, names: Sequence[str]) -> int:
-    return len(names) if shape.group is None else names.index(shape.group)
-
-
-def _tile(check: SceneCheck, number: int) -> Tile:
-    shape, up = check.shapes[number], int(np.abs(check.spec.view.up).argmax())
-    across, along = (axis for axis in range(3) if axis != up)
-    low, size = check.room[0], np.maximum(check.room[1] - check.room[0], 1e-9)
-    corners = (np.array([shape.min, shape.max]) - low) / size
-    (x0, y0), (x1, y1) = np.clip(corners[:, [across, along]], 0, 1)
-    return Tile(shape, check.pictures.get(number), (float(x0), float(y0), float(x1 - x0), float(y1 - y0)))

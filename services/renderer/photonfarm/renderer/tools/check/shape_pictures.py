@@ -6,7 +6,7 @@ Shape letters: H W image, S shapes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -48,13 +48,6 @@ class Projection:
     low: Vector  # (2,) what lies in the picture's upper left corner, along right and down
     high: Vector  # (2,) in its lower right corner
     start: float  # nothing nearer along `forward` is shown
-
-    @classmethod
-    def around(cls, right: Vector, down: Vector, low: Vector, high: Vector, start: float) -> Self:
-        """The projection that shows a box (3,) to (3,)."""
-        corners = np.array([low, high])
-        flat = np.stack([corners @ right, corners @ down], axis=1)
-        return cls(right, down, np.cross(right, down), flat.min(axis=0), flat.max(axis=0), start)
 
     @property
     def size(self) -> Vector:

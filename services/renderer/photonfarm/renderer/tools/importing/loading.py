@@ -1,14 +1,16 @@
 """An imported scene loaded by Mitsuba, which tells what it does not know or refuses, and mended by what is found.
 
-Its place and size, normals, lights, and shapes that hold several things.
+Its place, normals, lights, and shapes that hold several things.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -26,7 +28,7 @@ FAR = 10.0
 """A scene whose middle is farther from the origin than so many of its diagonals is moved there. Coordinates are single
 precision in renderers, and the offsets of rays grow with them."""
 
-SMALL = 0.1  # a scene whose diagonal is shorter is enlarged, as Mitsuba's offsets of rays are 1e-4 at least
+SMALL = 0.1  # a scene whose diagonal is shorter is too small, as Mitsuba's offsets of rays are 1e-4 at least
 ROUGH = 1e-3  # of its diagonal: a shape is seen to be rough if its vertices are rounded by more
 
 _NOWHERE = ("constant", "envmap", "sunsky", "timed_sunsky", "directional", "area")
@@ -41,7 +43,7 @@ def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
     log(f"loading {len(scene.root.findall('shape'))} shapes")
     scene.write_meshes(folder / "meshes")
     loaded = _load(scene)
-    for mended in (_fit, _make_normals_usable):
+    for mended in (_move_near, _make_normals_usable):
         if mended(scene, loaded):
             scene.write_meshes(folder / "meshes")
             loaded = _load(scene)
@@ -49,60 +51,88 @@ def load(scene: ImportedScene, folder: Path, log: Log) -> Any:
     return loaded
 
 
+class Parsed(NamedTuple):
+    """Elements of a scene as Mitsuba parses them."""
+
+    config: Any
+    state: Any
+    lines: list[Element]  # the element that begins or ends in each line of the document
+    text: str  # which has to last as long as the state
+
+    def element_of(self, node: Any) -> Element:
+        """The element that a node of the state was made of."""
+        import mitsuba as mi
+
+        return self.lines[int(re.sub(_LINE, r"\1", mi.parser.file_location(self.state, node))) - 1]
+
+
+_LINE = r"string \(line (\d+), col \d+\)"
+"""How Mitsuba names an element of a document that is a string."""
+
+
+def parse_elements(root: Element, *, literally: bool = False) -> Parsed:
+    """Let Mitsuba parse a scene; raises SpecError for what it refuses, and for names of nothing.
+
+    A `$` begins the name of a value, unless all is meant `literally`.
+    """
+    import mitsuba as mi
+
+    config = mi.parser.ParserConfig(mi.variant())
+    config.unused_properties = mi.LogLevel.Debug  # they are looked for below
+    config.merge_equivalent = config.merge_meshes = False
+    text, nodes = elements.text(root), root.iter()
+    text = text.replace("$", r"\$") if literally else text
+    lines: list[Element] = []
+    for line in text.splitlines():
+        lines.append(lines[-1] if line.lstrip().startswith("</") else next(nodes))
+    with _explain_refusals(lines):
+        state = mi.parser.parse_string(config, text)
+        mi.parser.transform_resolve(config, mi.parser.ParserState(state))
+        return Parsed(config, state, lines, text)
+
+
+@contextmanager
+def _explain_refusals(lines: list[Element]) -> Iterator[None]:
+    """Raise SpecError for what Mitsuba refuses, which names elements in place of lines of our document."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        said = re.sub(r"\[\w+\.(cpp|h):\d+\]|Error while loading |At (?=string)", "", str(error))
+        said = re.sub(_LINE, lambda match: elements.place(lines[int(match[1]) - 1]), said)
+        raise SpecError(f"Mitsuba cannot load it: {' '.join(said.split())}") from error
+
+
 def _load(scene: ImportedScene) -> Any:
     import mitsuba as mi
 
     from photonfarm.renderer.scene.loading import threads_to_read_with
 
-    config = mi.parser.ParserConfig(mi.variant())
-    config.unused_properties = mi.LogLevel.Debug  # they are looked for below
-    config.merge_equivalent = config.merge_meshes = False
-    objects = [node for node in scene.root.iter() if node.tag == "scene" or (node.get("type") and node.tag != "ref")]
-    state = mi.parser.ParserState()
-    try:
-        text = elements.text(scene.root).replace("$", r"\$")  # which begins no name of a value here
-        state = mi.parser.parse_string(config, text)
-        mi.parser.transform_all(config, state)
-        with threads_to_read_with():
-            loaded = mi.parser.instantiate(config, state)
-    except (RuntimeError, ValueError) as error:
-        raise SpecError(_explain(str(error), state, objects)) from error
-    _drop_unknown(scene, objects, [node.props.unqueried() for node in state.nodes])
+    parsed = parse_elements(scene.root, literally=True)
+    with _explain_refusals(parsed.lines), threads_to_read_with():
+        mi.parser.transform_all(parsed.config, parsed.state)
+        loaded = mi.parser.instantiate(parsed.config, parsed.state)
+    above = elements.parents(scene.root)
+    for node in parsed.state.nodes:
+        _drop_unknown(scene, parsed.element_of(node), node.props.unqueried(), above)
     return loaded
 
 
-def _explain(message: str, state: Any, objects: list[Element]) -> str:
-    """What Mitsuba refuses, by the element in place of its line in our document."""
-    import mitsuba as mi
-
-    said = " ".join(re.sub(r"\[\w+\.(cpp|h):\d+\]", "", message).split())
-    match = re.search(r"string \(line \d+, col \d+\)", said)
-    places = [mi.parser.file_location(state, node) for node in state.nodes]
-    if match is None or match[0] not in places:
-        return f"Mitsuba cannot load the scene: {said}"
-    place = elements.place(objects[places.index(match[0])])
-    return f"{place}: Mitsuba cannot load it: {said[match.end() :].lstrip(': ')}"
-
-
-def _drop_unknown(scene: ImportedScene, objects: list[Element], unknown: list[list[str]]) -> None:
+def _drop_unknown(scene: ImportedScene, node: Element, names: list[str], above: dict[Element, Element]) -> None:
     """Take out the properties that no plugin asked for: they changed nothing, and are said."""
-    above = elements.parents(scene.root)
-    for node, names in zip(objects, unknown, strict=True):
-        unnamed = [part for part in node if part.get("name") is None]  # Mitsuba numbers these
-        parts = {f"_arg_{number}": part for number, part in enumerate(unnamed)}
-        parts |= {part.get("name", ""): part for part in node if part not in unnamed}
-        for name in names:
-            node.remove(parts[name])
-            said = scene.names.get(name, name) if parts[name] not in unnamed else parts[name].tag
-            scene.changes.lose(
-                effect_of(node, above), said, "is not known to Mitsuba 3, and is left out", elements.place(node)
-            )
+    unnamed = [part for part in node if part.get("name") is None]  # Mitsuba numbers these
+    parts = {f"_arg_{number}": part for number, part in enumerate(unnamed)}
+    parts |= {part.get("name", ""): part for part in node if part not in unnamed}
+    for name in names:
+        node.remove(parts[name])
+        said = scene.names.get(name, name) if parts[name] not in unnamed else parts[name].tag
+        meaning = "is not known to Mitsuba 3, and is left out"
+        scene.changes.lose(effect_of(node, above), said, meaning, elements.place(node))
 
 
-def _fit(scene: ImportedScene, loaded: Any) -> bool:
-    """Move a scene that is far from the origin there, and enlarge one that is tiny; whether either was done.
+def _move_near(scene: ImportedScene, loaded: Any) -> bool:
+    """Move a scene that is far from the origin there, its lower corner first; whether that was done.
 
-    Its lower corner is near the origin then. What readers made is in double precision and is moved so.
+    What readers made is in double precision and is moved so; vertices of other files are rounded already.
     """
     low, high = np.array(loaded.bbox().min, np.float64), np.array(loaded.bbox().max, np.float64)
     if scene.meshes:
@@ -110,66 +140,52 @@ def _fit(scene: ImportedScene, loaded: Any) -> bool:
         low = np.minimum.reduce([each.min(axis=0) for each in vertices])
         high = np.maximum.reduce([each.max(axis=0) for each in vertices])
     diagonal = float(np.linalg.norm(high - low))
-    is_far = bool(np.linalg.norm(low + high) / 2 > FAR * diagonal)
-    if not 0 < diagonal < np.inf or not (is_far or diagonal < SMALL):
-        _say_roughness(scene, loaded, moved=False)
+    if 0 < diagonal < SMALL:
+        meaning = f"the scene is {diagonal:.2g} across, where rays are rough; make it larger in your program"
+        scene.changes.lose("geometry", "size", meaning)
+    is_far = bool(np.linalg.norm(low + high) / 2 > FAR * diagonal) and 0 < diagonal < np.inf
+    _say_roughness(scene, loaded, exact=scene.meshes.keys() if is_far else ())
+    if not is_far:
         return False
     step = 10.0 ** np.floor(np.log10(diagonal))
-    factor = float(1 / step) if diagonal < SMALL else 1.0
-    by = 0.0 - np.floor(low / step) * step if is_far else np.zeros(3)
-    if is_far:
-        offset = ", ".join(f"{part:.10g}" for part in by)
-        scene.changes.note(f"the scene is far from the origin, where coordinates are rough, and is moved by ({offset})")
-        _say_roughness(scene, loaded, moved=True)
-    if factor > 1:
-        meaning = f"the scene is {diagonal:.2g} across, where rays are rough, and is enlarged {factor:g} times"
-        scene.changes.note(meaning)
+    by = 0.0 - np.floor(low / step) * step
+    offset = ", ".join(f"{part:.10g}" for part in by)
+    scene.changes.note(f"the scene is far from the origin, where coordinates are rough, and is moved by ({offset})")
     for shape_id, mesh in scene.meshes.items():
-        scene.meshes[shape_id] = replace(mesh, vertices=(mesh.vertices + by) * factor)
+        scene.meshes[shape_id] = replace(mesh, vertices=mesh.vertices + by)
     for node in [*scene.root.findall("shape"), *scene.root.findall("emitter")]:
         if node.get("id") not in scene.meshes and node.get("type") not in _NOWHERE:
-            _move(scene, node, by, factor)
+            _move(node, by)
     if scene.camera is not None:
-        x, y, z = ((np.array(scene.camera) + by) * factor).tolist()
+        x, y, z = (np.array(scene.camera) + by).tolist()
         scene.camera = (x, y, z)
     return True
 
 
-def _say_roughness(scene: ImportedScene, loaded: Any, *, moved: bool) -> None:
-    """Say which shapes are rounded too much, where they are more than half of the surface."""
+def _say_roughness(scene: ImportedScene, loaded: Any, exact: Collection[str]) -> None:
+    """Say which shapes but the `exact` ones are rounded too much, where they are more than half of the surface."""
     area = {shape.id(): float(np.array(shape.surface_area()).ravel()[0]) for shape in loaded.shapes()}
     rough = {}
     for shape in loaded.shapes():
         corners = np.array([shape.bbox().min, shape.bbox().max], np.float32).reshape(2, 3)
         rounding = float(np.spacing(np.abs(corners).max()))
-        if rounding > ROUGH * np.linalg.norm(corners[1] - corners[0]) and not (moved and shape.id() in scene.meshes):
+        if rounding > ROUGH * np.linalg.norm(corners[1] - corners[0]) and shape.id() not in exact:
             rough[shape.id()] = rounding
     for shape_id, rounding in rough.items() if 2 * sum(area[each] for each in rough) > sum(area.values()) else ():
         meaning = "vertices are rounded, as coordinates are single precision; move all of it near the origin"
         scene.changes.lose("geometry", "coordinates", meaning, f"shape {shape_id!r} by up to {rounding:.2g}")
 
 
-def _move(scene: ImportedScene, node: Element, by: Floats, factor: float) -> None:
-    """Move and enlarge a shape or a light, after all that moves it already."""
-    name = "irradiance" if node.get("type") == "projector" else "intensity"
-    intensity = elements.child(node, name)
-    if intensity is None and node.tag == "emitter":
-        intensity = elements.put_value(node, name, 1.0)
-    if intensity is not None and factor > 1:  # which is by the square of lengths
-        if intensity.tag in ("rgb", "float"):
-            numbers = [float(word) for word in intensity.get("value", "").replace(",", " ").split()]
-            intensity.set("value", elements.numbers([factor**2 * number for number in numbers]))
-        else:
-            scene.changes.lose("light", name, "is too low, as the scene is enlarged", elements.place(node))
+def _move(node: Element, by: Floats) -> None:
+    """Move a shape or a light, after all that moves it already."""
     place = elements.child(node, "position")
     if place is not None:
         for axis, part in zip("xyz", by, strict=True):
-            place.set(axis, f"{(float(place.get(axis, '0')) + part) * factor:.10g}")
+            place.set(axis, f"{float(place.get(axis, '0')) + part:.10g}")
         return
     if (transform := elements.child(node, "to_world")) is None:
         transform = SubElement(node, "transform", name="to_world")
     SubElement(transform, "translate", {axis: f"{part:.10g}" for axis, part in zip("xyz", by, strict=True)})
-    SubElement(transform, "scale", value=f"{factor:g}")
 
 
 def _make_normals_usable(scene: ImportedScene, loaded: Any) -> bool:

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from photonfarm.core.archives import PARTS, FrameCosts, Surface
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.core.keys import Key, view_key
-from photonfarm.core.records import F32, BasePointCloud, Guides, arrays_of
+from photonfarm.core.records import F32, BasePointCloud, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, locate
 from photonfarm.renderer.scene.gbuffer import first_surfaces
@@ -99,6 +99,7 @@ WARM_UPS = 2
 """The untimed first frames: the first compiles kernels, the second is the first to replay recorded launches."""
 
 T = TypeVar("T")
+Clock = Callable[[], float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,8 +108,8 @@ class TimedFrame:
 
     row: int
     modification: Modification
-    key: Key  # of the modification
     view: View
+    key: Key  # of the modification
 
 
 def write_frame_costs(
@@ -124,7 +125,7 @@ def write_frame_costs(
     reader = SceneReader(store, scene_named(opened, scene))
     reader.refresh()
     _check_complete(reader, rows)
-    frames = [_frame(reader, row) for row in rows]
+    frames = [TimedFrame(row, *reader.inputs(row)[:2], reader.modification_key(row)) for row in rows]
     used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
     spec = locate(reader.spec)
     costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed)
@@ -145,11 +146,6 @@ def _check_complete(reader: SceneReader, rows: Sequence[int]) -> None:
         )
 
 
-def _frame(reader: SceneReader, row: int) -> TimedFrame:
-    modification, view, _ = reader.inputs(row)
-    return TimedFrame(row, modification, reader.modification_key(row), view)
-
-
 def frame_costs(
     scene: LoadedScene, cloud: BasePointCloud, frames: Sequence[TimedFrame], kept: Sequence[int], timed: int
 ) -> FrameCosts:
@@ -158,12 +154,15 @@ def frame_costs(
     If there are fewer frames than are timed, they are repeated.
     """
     films = [PartialFilm(scene.spec, k) for k in kept]
-    surface = np.stack([_surfaces(scene, frame) for frame in frames])
+    surface = []
+    for frame in frames:
+        scene.apply(frame.modification)
+        surface.append(surface_kinds(scene.scene, frame.view, scene.spec))
     parts, render_s = np.split(_seconds(scene, cloud, films, frames, timed), [len(PARTS)])
     return FrameCosts(
         scene.spec.scene_id,
         np.array([frame.row for frame in frames], np.int64),
-        surface,
+        np.stack(surface),
         **dict(zip(PARTS, parts, strict=True)),
         kept=np.array(kept, np.int64),
         render_s=render_s,
@@ -179,14 +178,6 @@ def take_turns(frames: Sequence[TimedFrame]) -> Iterator[TimedFrame]:
         yield next(turn)
 
 
-def _surfaces(scene: LoadedScene, frame: TimedFrame) -> NDArray[np.uint8]:
-    scene.apply(frame.modification)
-    return surface_kinds(scene.scene, frame.view, scene.spec)
-
-
-# ---------------------------------------------------------------------------------------------------------------- times
-
-
 def _seconds(
     scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frames: Sequence[TimedFrame], timed: int
 ) -> NDArray[np.float64]:
@@ -196,47 +187,42 @@ def _seconds(
     for seed, frame in enumerate(islice(take_turns(frames), WARM_UPS + timed)):
         if stays:  # else there would be nothing to edit
             scene.apply(rest(scene.spec))
-        measured.append(_time_frame(scene, cloud, films, frame, seed))
+        parts = time_parts(scene, cloud, frame.modification, frame.key, frame.view, time.perf_counter)
+        renders = [partial(film.render, scene.scene, frame.view, seed) for film in films]
+        render_s = [time_work(render, time.perf_counter)[0] for render in renders]
+        measured.append([*(parts[name] for name in PARTS), *render_s])
     return np.array(measured[WARM_UPS:]).T
 
 
-def _time_frame(
-    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frame: TimedFrame, seed: int
-) -> list[float]:
-    edit_s, _ = _wall_timed(partial(_edit, scene, frame.modification))
-    buffers_s, _ = _wall_timed(partial(scene.buffers, frame.view))
-    guides_s, _ = _wall_timed(partial(_guides, scene, cloud, frame))
-    points_s, _ = _wall_timed(partial(_points_seen, scene, cloud, frame))
-    photons = _time_photons(scene, frame)
-    render_s = [_wall_timed(partial(film.render, scene.scene, frame.view, seed))[0] for film in films]
-    return [edit_s, buffers_s, guides_s, points_s, *photons, *render_s]
+def time_parts(
+    scene: LoadedScene, cloud: BasePointCloud, modification: Modification, key: Key, view: View, clock: Clock
+) -> dict[str, float]:
+    """Seconds of each of `PARTS`, by a clock; `key` is the modification's. Photons of a scene without take none."""
+    seconds: dict[str, float] = {}
 
+    def timed(name: str, work: Callable[[], T]) -> T:
+        seconds[name], result = time_work(work, clock)
+        return result
 
-def _time_photons(scene: LoadedScene, frame: TimedFrame) -> tuple[float, float]:
-    """Seconds to trace the configuration's photons, and to find those that the view sees; zeros for a scene without."""
-    photons_s, (photons, _) = _wall_timed(partial(photons_of, scene, frame.key))
+    timed("edit_s", partial(_edit, scene, modification))
+    timed("buffers_s", partial(scene.buffers, view))
+    guided = view_key(key, view.vector)
+    timed("guides_s", lambda: scene.guides(view, guided, scene.spec.guides, lit_points(cloud, modification)))
+    timed("points_s", lambda: scene.sees(view, rebuild(cloud, modification)[0]))
+    photons = timed("photons_s", lambda: photons_of(scene, key)[0])
     if photons is None:
-        return 0.0, 0.0
-    seen_s, _ = _wall_timed(partial(scene.sees, frame.view, photons.position))
-    return photons_s, seen_s
+        return seconds | {"photons_s": 0.0, "photons_seen_s": 0.0}
+    timed("photons_seen_s", lambda: scene.sees(view, photons.position))
+    return seconds
 
 
 def _edit(scene: LoadedScene, modification: Modification) -> None:
     scene.apply(modification)
-    dr.sync_thread()
+    dr.sync_thread()  # pending evaluations would be charged to the view
 
 
-def _guides(scene: LoadedScene, cloud: BasePointCloud, frame: TimedFrame) -> Guides:
-    key = view_key(frame.key, frame.view.vector)
-    return scene.guides(frame.view, key, scene.spec.guides, lit_points(cloud, frame.modification))
-
-
-def _points_seen(scene: LoadedScene, cloud: BasePointCloud, frame: TimedFrame) -> NDArray[np.bool_]:
-    position, present = rebuild(cloud, frame.modification)
-    return scene.sees(frame.view, position) & present
-
-
-def _wall_timed(work: Callable[[], T]) -> tuple[float, T]:
-    begun = time.perf_counter()
+def time_work(work: Callable[[], T], clock: Clock) -> tuple[float, T]:
+    """The seconds of some work, by a clock, and its result."""
+    begun = clock()
     result = work()
-    return time.perf_counter() - begun, result
+    return clock() - begun, result

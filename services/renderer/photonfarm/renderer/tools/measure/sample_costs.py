@@ -9,31 +9,25 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
-import drjit as dr
 import numpy as np
-from numpy.typing import NDArray
 
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.core.files import write_whole
-from photonfarm.core.keys import view_key
-from photonfarm.core.records import F32, BasePointCloud, Photons
+from photonfarm.core.records import BasePointCloud
 from photonfarm.core.waiting import Log, Steps, WorkLog
 from photonfarm.plan.sample_costs import SampleCosts, relative_variance
-from photonfarm.renderer.jobs.estimates import photons_of
-from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.strategy.budget import Budget
 from photonfarm.renderer.strategy.measurement import digest_here, file_of
-from photonfarm.renderer.tools.measure.frame_costs import WARM_UPS
-from photonfarm.scene.modification import Modification, rebuild, sample_modification
+from photonfarm.renderer.tools.measure.frame_costs import WARM_UPS, time_parts, time_work
+from photonfarm.scene.modification import sample_modification
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.view import View, sample_view
+from photonfarm.scene.view import sample_view
 
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
@@ -51,18 +45,6 @@ Clean images would take minutes, and beyond one launch of the integrator time is
 """
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True, slots=True)
-class _Frame:
-    """The measurements in one view, named as in `SampleCosts`."""
-
-    configuration_s: float
-    view_s: float  # with guides
-    guides_s: float
-    pass_s: float
-    spp_s: float
-    noise: float | None  # None if nothing is seen, or values are not finite
 
 
 def find_or_measure(
@@ -112,7 +94,7 @@ def sample_costs(scene: LoadedScene, frames: int, log: Log = lambda _: None) -> 
 
 def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: WorkLog) -> tuple[SampleCosts, int]:
     """The costs, and of how many frames; as many as the budget allows, and one at least after the one that compiles."""
-    name, measured = scene.spec.name, list[_Frame]()
+    name, measured = scene.spec.name, list[dict[str, float]]()
     views = Steps(WARM_UPS + frames, slow=WARM_UPS, most_s=_seconds_left(budget))
     within = f", in about {budget.seconds:.0f} s of processor time in all" if math.isfinite(budget.seconds) else ""
     work_log.begin(
@@ -134,7 +116,9 @@ def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: Work
         views.reach(len(measured))
         last_s = budget.spent_s - before
     measured = measured[min(WARM_UPS, len(measured) - 1) :]
-    return _medians(scene.spec.scene_id, measured), len(measured)
+    known = {key: [each[key] for each in measured if not math.isnan(each[key])] for key in measured[0]}
+    medians = {key: float(np.median(values or [0.0])) for key, values in known.items()}
+    return SampleCosts(scene.spec.scene_id, **medians), len(measured)
 
 
 def _seconds_left(budget: Budget) -> Callable[[], float]:
@@ -148,62 +132,26 @@ def _seconds_left(budget: Budget) -> Callable[[], float]:
     return left_s
 
 
-def _medians(scene_id: str, measured: list[_Frame]) -> SampleCosts:
-    noise = [frame.noise for frame in measured if frame.noise is not None]
-    return SampleCosts(
-        scene_id,
-        _median([frame.configuration_s for frame in measured]),
-        _median([frame.view_s for frame in measured]),
-        _median([frame.pass_s for frame in measured]),
-        _median([frame.spp_s for frame in measured]),
-        _median(noise) if noise else 0.0,
-        _median([frame.guides_s for frame in measured]),
-    )
-
-
-def _measure_frame(scene: LoadedScene, cloud: BasePointCloud, number: int) -> _Frame:
-    spec = scene.spec
+def _measure_frame(scene: LoadedScene, cloud: BasePointCloud, number: int) -> dict[str, float]:
+    """What `SampleCosts` holds, in one view; the noise is NaN if nothing is seen, or values are not finite."""
+    spec, few = scene.spec, fewer_samples(scene.spec)
     modification = sample_modification(spec, SEED, number)
-    view = sample_view(spec, modification.key(spec.radiance_id), SEED, number, modification)
-    configuration_s, (points, photons) = time_work(partial(_configure, scene, cloud, modification))
-    view_s, _ = time_work(partial(_render_buffers, scene, view, points, photons))
-    guides_s, _ = time_work(partial(_guide, scene, view, cloud, modification))
-    few = fewer_samples(spec)
-    few_s, halves = time_work(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few))
-    many_s, _ = time_work(partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few))
-    pass_s, spp_s = line_through(2 * few, few_s, 2 * RANGE * few, many_s)
+    key = modification.key(spec.radiance_id)
+    view = sample_view(spec, key, SEED, number, modification)
+    parts = time_parts(scene, cloud, modification, key, view, backend.work_s)
+    configuration_s = parts["edit_s"] + parts["photons_s"]
+    few_s, halves = time_work(partial(scene.render_halves, view, (4 * number, 4 * number + 1), few), backend.work_s)
+    many = partial(scene.render_halves, view, (4 * number + 2, 4 * number + 3), RANGE * few)
+    pass_s, spp_s = line_through(2 * few, few_s, 2 * RANGE * few, time_work(many, backend.work_s)[0])
     noise = relative_variance(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
-    return _Frame(configuration_s, view_s + guides_s, guides_s, pass_s, spp_s, noise)
-
-
-def _configure(
-    scene: LoadedScene, cloud: BasePointCloud, modification: Modification
-) -> tuple[tuple[F32, NDArray[np.bool_]], Photons | None]:
-    """Bring a scene into a configuration; returns its points, as `rebuild` does, and its photons."""
-    scene.apply(modification)
-    dr.sync_thread()  # pending evaluations would be charged to the view
-    return rebuild(cloud, modification), photons_of(scene, modification.key(scene.spec.radiance_id))[0]
-
-
-def _render_buffers(
-    scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
-) -> None:
-    """Render the buffers of a view, and which points and photons it sees."""
-    scene.buffers(view)
-    visibility_of(scene, view, points, photons)
-
-
-def _guide(scene: LoadedScene, view: View, cloud: BasePointCloud, modification: Modification) -> None:
-    """Render the guides of a view."""
-    key = view_key(modification.key(scene.spec.radiance_id), view.vector)
-    scene.guides(view, key, scene.spec.guides, lit_points(cloud, modification))
-
-
-def time_work(work: Callable[[], T]) -> tuple[float, T]:
-    """The processor seconds of some work, and its result."""
-    begun = backend.work_s()
-    result = work()
-    return backend.work_s() - begun, result
+    return {
+        "configuration_s": configuration_s,
+        "view_s": sum(parts.values()) - configuration_s,
+        "pass_s": pass_s,
+        "spp_s": spp_s,
+        "relative_variance": math.nan if noise is None else noise,
+        "guides_s": parts["guides_s"],
+    }
 
 
 def fewer_samples(spec: SceneSpec) -> int:
@@ -216,7 +164,3 @@ def line_through(few: int, few_s: float, many: int, many_s: float) -> tuple[floa
     """Fixed seconds, and seconds a sample, from the times at two numbers of samples; neither is below 0."""
     spp_s = max((many_s - few_s) / (many - few), 0.0)
     return max(few_s - few * spp_s, 0.0), spp_s
-
-
-def _median(values: list[float]) -> float:
-    return float(np.median(values))

@@ -13,15 +13,18 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import elements, images
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
-from photonfarm.renderer.tools.importing.readers.mitsuba_parts import numbers_of, put_colour, read_old
+
+Colour = NDArray[np.float64]
+"""Linear sRGB, (3,)."""
 
 _HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
 
-_NEAREST = {"roughdiffuse": "diffuse", "sky": "sunsky", "sun": "sunsky", "phong": "blendbsdf", "ward": "blendbsdf"}
+_NEAREST = {"roughdiffuse": "diffuse", "sky": "sunsky", "sun": "sunsky"}
 """The usual counterparts of what Mitsuba 3 has not."""
 
 _UNSEEN = ("cache", "max_anisotropy", "collapse", "resolution", "use_fast_approx")
@@ -34,14 +37,11 @@ class Upgrade:
 
     changes: Changes
     names: dict[str, str]  # of properties, as the files have them
-    scratch: Path
     root: Element = field(default_factory=elements.scene)  # of the file at hand
-    find: Callable[[str], Path | None] = Path  # the file of a name in it
 
-    def run(self, root: Element, find: Callable[[str], Path | None]) -> None:
+    def run(self, root: Element) -> None:
         """Upgrade a file's elements in place; raises SpecError for a value that is none."""
-        self.root, self.find = root, find
-        root.set("version", "3.0.0")
+        self.root = root
         for node in root.iter():
             self._rename(node)
         try:
@@ -53,9 +53,9 @@ class Upgrade:
                 if kind in _UPGRADES:
                     _UPGRADES[kind](self, node)
                 if kind in _NEAREST:
-                    made = node.get("type") if node.get("type") != kind else _NEAREST[kind]
+                    made = _NEAREST[kind]
                     self.changes.note(f"became {made!r}, the nearest in Mitsuba 3", elements.place(node), name=kind)
-                    node.set("type", str(made))
+                    node.set("type", made)
         except ValueError as error:
             raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
 
@@ -82,26 +82,66 @@ class Upgrade:
         elif name == "distribution" and part.get("value", "").lower() in ("as", "phong"):
             part.set("value", "beckmann")  # Walter et al. 2007: of the same α, they are about as wide
             self.changes.note("became 'beckmann', of the same width", elements.place(node), name="distribution")
-        elif part.tag == "lookat" and not part.get("up"):
-            part.set("up", _any_up(*(numbers_of(part.get(key, "")) for key in ("origin", "target"))))
-        elif name == "ext_eta" and part.get("value") in ("air", "vacuum", "1", "1.0"):
-            node.remove(part)
-        elif (colour := read_old(part)) is not None:
-            if node.tag == "bsdf" and re.search("reflectance|transmittance", name):
-                colour = colour / max(1.0, float(colour.max()))  # as 0.6 does, to conserve energy
-            put_colour(part, colour)
+        elif (colour := read_colour(part)) is not None:
+            part.tag, part[:] = "rgb", []
+            part.attrib = {"name": name, "value": elements.numbers(colour.tolist())}
 
     def lose(self, effect: Effect, name: str, meaning: str, node: Element) -> None:
         """Say what is lost of an element."""
         self.changes.lose(effect, self.names.get(name, name), meaning, elements.place(node))
 
 
-def _any_up(origin: list[float], target: list[float]) -> str:
-    """The `up` that 0.6 takes where none is given; Mitsuba 3 takes another."""
-    if len(origin) != 3 or len(target) != 3:
-        return ""  # Mitsuba says what is wrong
-    x, y, z = np.subtract(target, origin).tolist()
-    return elements.numbers(np.cross((z, 0, -x) if abs(x) > abs(y) else (0, z, -y), (x, y, z)).tolist())
+def read_colour(node: Element) -> Colour | None:
+    """The colour of an element, None for what is none; raises ValueError for numbers that are none.
+
+    `rgb` is linear also in hexadecimal digits, and `srgb` is not. Spectra and black bodies are integrated against the
+    CIE's curves without a white point, as 0.6's RGB mode does.
+    """
+    text = node.get("value", "").strip()
+    if node.tag == "blackbody":  # Planck's radiance in W / (m² sr nm)
+        kelvin = float(node.get("temperature", "").strip().rstrip("Kk"))
+        wavelengths = np.linspace(360.0, 830.0, 95)
+        metres = wavelengths * 1e-9
+        radiance = 1.191042972e-25 / metres**5 / np.expm1(0.01438776877 / (metres * kelvin))
+        scale = float(node.get("scale") or node.get("multiplier") or 1)
+        return _integrate(wavelengths.tolist(), radiance.tolist()) * scale
+    if node.tag == "spectrum" and node.get("filename"):
+        import mitsuba as mi
+
+        return _integrate(*mi.spectrum_from_file(node.get("filename", "")))
+    if node.tag == "spectrum" and ":" in text:
+        samples = read_numbers(text.replace(":", " "))
+        return _integrate(samples[::2], samples[1::2])
+    if node.tag not in ("rgb", "srgb", "xyz", "spectrum"):
+        return None
+    digits = re.fullmatch("#([0-9a-fA-F]{6})", text)
+    numbers = [byte / 255 for byte in bytes.fromhex(digits[1])] if digits else read_numbers(text)
+    if len(numbers) not in (1, 3):
+        raise ValueError(f"{text!r} has {len(numbers)} numbers, and a colour has one or three")
+    values = np.broadcast_to(np.array(numbers), 3)
+    if node.tag == "xyz":
+        return images.RGB_OF_XYZ @ values
+    return images.linear(values.astype(np.float32)).astype(np.float64) if node.tag == "srgb" else values
+
+
+def read_numbers(text: str) -> list[float]:
+    """Numbers with spaces or commas between; raises ValueError for what is none, or is not finite."""
+    numbers = [float(each) for each in re.findall(r"[^\s,]+", text)]
+    if not np.isfinite(numbers).all():
+        raise ValueError(f"{text!r} is no number")
+    return numbers
+
+
+def _integrate(wavelengths: list[float], values: list[float]) -> Colour:
+    import mitsuba as mi
+
+    return np.array(mi.spectrum_list_to_srgb(wavelengths, values, False, False), np.float64).clip(0)
+
+
+def value_of(node: Element, name: str) -> str:
+    """The value of a property; empty for one that is not there."""
+    property_ = elements.child(node, name)
+    return "" if property_ is None else property_.get("value", "")
 
 
 def _take(node: Element, name: str, otherwise: str) -> str:
@@ -111,12 +151,6 @@ def _take(node: Element, name: str, otherwise: str) -> str:
         return otherwise
     node.remove(property_)
     return property_.get("value", otherwise).lower()
-
-
-def value_of(node: Element, name: str) -> str:
-    """The value of a property; empty for one that is not there."""
-    property_ = elements.child(node, name)
-    return "" if property_ is None else property_.get("value", "")
 
 
 def _texture(_: Upgrade, texture: Element) -> None:
@@ -131,20 +165,14 @@ def _texture(_: Upgrade, texture: Element) -> None:
 def _bitmap(upgrade: Upgrade, texture: Element) -> None:
     """Gamma 1 is `raw`; filters but `nearest` are `bilinear`, the default; one way to wrap for both axes."""
     _texture(upgrade, texture)
-    name = value_of(texture, "filename")
-    is_float = Path(name).suffix.lower() in (".exr", ".hdr", ".rgbe", ".pfm")
+    is_float = Path(value_of(texture, "filename")).suffix.lower() in (".exr", ".hdr", ".rgbe", ".pfm")
     gamma = float(_take(texture, "gamma", "1" if is_float else "-1"))
-    channels = _take(texture, "channel", "rgb") if not is_float else "rgb"
-    if channels not in (*"rgba", "rgb", "rgba"):
-        upgrade.lose("colour", "channel", f"{channels!r} is left out", texture)
-    if gamma == 1 or channels == "a":
+    if gamma == 1:
         elements.put_value(texture, "raw", True)
-    if is_float and gamma != 1:
+    if gamma not in ((1,) if is_float else (1, -1)):
         upgrade.lose("colour", "gamma", f"{gamma:g} is left out: texels are read as their file says", texture)
-    elif (channels in tuple("rgba") or gamma not in (1, -1)) and (file := upgrade.find(name)):
-        to = upgrade.scratch / f"{len(list(upgrade.scratch.iterdir()))}-{file.stem}.png"
-        _take(texture, "filename", "")
-        elements.put_value(texture, "filename", str(_bake(file, gamma, channels, to)))
+    if (channel := _take(texture, "channel", "rgb")) != "rgb":
+        upgrade.lose("colour", "channel", f"{channel!r} is left out; make it an image of its own", texture)
     if _take(texture, "filter_type", "ewa") == "nearest":
         elements.put_value(texture, "filter_type", "nearest")
     both = _take(texture, "wrap_mode", "repeat")
@@ -156,45 +184,27 @@ def _bitmap(upgrade: Upgrade, texture: Element) -> None:
     elements.put_value(texture, "wrap_mode", mode)
 
 
-def _bake(file: Path, gamma: float, channels: str, to: Path) -> Path:
-    """An image of some channels of another, with sRGB in place of another gamma."""
-    texels = images.decode(file.read_bytes(), str(file), raw=True)
-    if gamma not in (1, -1):
-        texels[..., :3] = images.encode(texels[..., :3] ** gamma)
-    return images.save(texels[..., ["rgba".index(channel) for channel in channels]], to)
-
-
 def _scale_texture(upgrade: Upgrade, texture: Element) -> None:
-    """The texture that was scaled; a height's factor becomes that of its bump map."""
-    factor = np.array(numbers_of(_take(texture, "scale", "1")))
+    """The texture that was scaled takes its place; a height's factor becomes that of its bump map."""
+    factor = np.array(read_numbers(_take(texture, "scale", "1")))
     inner = next((part for part in texture if part.tag in ("texture", "ref")), None)
     if inner is None:
         raise ValueError("it has no texture to scale; put one in, or a colour in its place")
+    if inner.tag == "ref":
+        inner = next(node for node in upgrade.root.iter("texture") if node.get("id") == inner.get("id"))
     above, name = elements.parents(upgrade.root), texture.get("id")
     for user in [above[texture], *(above[ref] for ref in upgrade.root.iter("ref") if ref.get("id") == name)]:
         if user.get("type") == "bumpmap":
             elements.put_value(user, "scale", float(factor.mean()))
         elif user is not upgrade.root and (factor != 1).any():
             upgrade.lose("colour", "scale", "a factor of a texture is left out: Mitsuba 3 has none", texture)
-    inner.attrib.pop("name", None)
-    inner.attrib.update({key: text for key, text in texture.attrib.items() if key == "name"})
-    if name and inner.tag == "texture":
-        inner.attrib.setdefault("id", name)
-    above[texture][list(above[texture]).index(texture)] = inner
-    if name and inner.get("id") != name:
-        SubElement(upgrade.root, "alias", {"id": inner.get("id", ""), "as": name})
+    texture.set("type", inner.get("type", ""))
+    texture[:] = [elements.copy_element(part) for part in inner]
 
 
 def _obj(upgrade: Upgrade, shape: Element) -> None:
-    """Materials by the names of `usemtl`, and those of the MTL file where the shape has none, are lost."""
-    file, materials = upgrade.find(value_of(shape, "filename")), [part for part in shape if part.tag in ("bsdf", "ref")]
-    text = file.read_bytes() if file and (len(materials) != 1 or materials[0].get("name")) else b""
-    used = set(re.findall(rb"^\s*usemtl\s+(.*\S)", text, re.MULTILINE))
-    if len(used) > 1 and used & {part.get("name", "").encode() for part in materials}:
-        upgrade.lose("colour", "usemtl", "all faces get the first material; make a shape of those of each", shape)
-        for part in materials[1:]:
-            shape.remove(part)
-    elif not materials and b"mtllib" in text:
+    """The materials of the MTL file, where the shape has none of its own, are lost."""
+    if not any(part.tag in ("bsdf", "ref") for part in shape):
         upgrade.lose("colour", "mtllib", "is not read: Mitsuba 3 wants a material for the shape", shape)
 
 
@@ -205,50 +215,24 @@ def _conductor(_: Upgrade, bsdf: Element) -> None:
 
 
 def _glossy(upgrade: Upgrade, bsdf: Element) -> None:
-    """A blend of what is diffuse and of rough metal, which add up to the levels that `phong` and `ward` have.
+    """A rough plastic of the same base and width.
 
     A Phong lobe of exponent n, around the mirrored direction, is as high as a Beckmann lobe of α = 1 / √(2 (n + 2)).
     """
-    for name in ("exponent", "specular_reflectance"):
-        if (child := elements.child(bsdf, name)) is not None and child.tag in ("texture", "ref"):
-            upgrade.lose("colour", name, "its texture became the default: a blend has numbers here", bsdf)
-    shine = np.array(numbers_of(_take(bsdf, "specular_reflectance", "0.2")))
-    diffuse, metal = Element("bsdf", type="diffuse"), Element("bsdf", type="roughconductor")
-    if bsdf.get("type") == "phong":
-        elements.put_value(metal, "alpha", math.sqrt(0.5 / (float(_take(bsdf, "exponent", "30")) + 2)))
-    else:
-        metal.extend(part for part in bsdf if part.get("name") in ("alpha_u", "alpha_v"))  # 0.1 by default in both
-    stated = elements.child(bsdf, "diffuse_reflectance")
-    matt = elements.put_value(diffuse, "reflectance", (0.5, 0.5, 0.5)) if stated is None else stated
-    if matt.tag != "rgb":  # whose texels a blend would darken
-        matt.set("name", "diffuse_reflectance")
-        bsdf[:] = [matt, *(part for part in metal if part.get("name") == "alpha")]
-        bsdf.set("type", "roughplastic")
-        return
-    matt.set("name", "reflectance")
-    diffuse[:] = [matt]
-    base = np.array(numbers_of(matt.get("value", "")))
-    total = min(1.0, float(base.max() + shine.max()))  # as 0.6 does, to conserve energy
-    put_colour(matt, base * total / max(float(base.max()), 1e-9))
-    put_colour(elements.put_value(metal, "specular_reflectance", 0.0), np.resize(shine * total / max(*shine, 1e-9), 3))
-    bsdf[:] = [diffuse, metal]
-    elements.put_value(bsdf, "weight", float(shine.max() / max(1e-9, base.max() + shine.max())))
+    kind = bsdf.get("type", "")
+    stated = [part for part in bsdf if part.get("name") == "diffuse_reflectance"]
+    exponent, alpha = value_of(bsdf, "exponent"), float(value_of(bsdf, "alpha_u") or 0.1)
+    bsdf[:] = stated
+    elements.put_value(bsdf, "alpha", math.sqrt(0.5 / (float(exponent or 30) + 2)) if kind == "phong" else alpha)
+    bsdf.set("type", "roughplastic")
+    upgrade.lose("colour", kind, "became 'roughplastic', which reflects as its index of refraction says", bsdf)
 
 
 def _mask(upgrade: Upgrade, bsdf: Element) -> None:
     """An opacity by colour is lost: Mitsuba 3 has one for all."""
     opacity = elements.child(bsdf, "opacity")
-    if opacity is not None and opacity.tag == "rgb" and len({*numbers_of(opacity.get("value", ""))}) > 1:
+    if opacity is not None and opacity.tag == "rgb" and len({*read_numbers(opacity.get("value", ""))}) > 1:
         upgrade.lose("colour", "opacity", "became grey: Mitsuba 3 has one opacity for all colours", bsdf)
-
-
-def _mixture(_: Upgrade, bsdf: Element) -> None:
-    """A blend, where all of two materials is mixed; Mitsuba 3 has no other mixture."""
-    weights = numbers_of(value_of(bsdf, "weights"))
-    if len(weights) == 2 and math.isclose(sum(weights), 1, abs_tol=1e-3):
-        _take(bsdf, "weights", "")
-        bsdf.set("type", "blendbsdf")
-        elements.put_value(bsdf, "weight", weights[1])
 
 
 def _normalmap(upgrade: Upgrade, bsdf: Element) -> None:
@@ -289,7 +273,6 @@ _UPGRADES: dict[str, Callable[[Upgrade, Element], None]] = {
     "phong": _glossy,
     "ward": _glossy,
     "mask": _mask,
-    "mixturebsdf": _mixture,
     "normalmap": _normalmap,
     "sky": _sky,
     "sun": _sky,

@@ -1,110 +1,25 @@
-"""Parts of Mitsuba scenes: colours in each way of writing them, as linear sRGB; and what photonfarm cannot render.
-
-The latter is taken out of a scene or replaced by what is nearest, and named.
-"""
+"""What photonfarm cannot render of Mitsuba scenes: taken out, or replaced by what is nearest, and named."""
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Iterator
-from functools import cache, partial
-from pathlib import Path
+from collections.abc import Iterator
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
-from numpy.typing import NDArray
 
-from photonfarm.core.errors import SpecError
-from photonfarm.renderer.tools.importing import elements, images
+from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
 from photonfarm.renderer.tools.importing.imported import Ids
-from photonfarm.renderer.tools.importing.meshes import Floats, read_mesh, write_ply
+from photonfarm.renderer.tools.importing.meshes import Floats
 from photonfarm.scene.files import POLARISED, SHAPES
-
-Colour = NDArray[np.float64]
-"""Linear sRGB, (3,)."""
-
-
-def read_old(node: Element) -> Colour | None:
-    """The colour of an element of Mitsuba 0.6, None for what is none; raises ValueError for numbers that are none.
-
-    `rgb` is linear also in hexadecimal digits, and `srgb` is not. Spectra and black bodies are integrated against the
-    CIE's curves without a white point, as 0.6's RGB mode does.
-    """
-    text = node.get("value", "").strip()
-    if node.tag == "blackbody":
-        scale = float(node.get("scale") or node.get("multiplier") or 1)
-        return _blackbody(float(node.get("temperature", "").strip().rstrip("Kk"))) * scale
-    if node.tag == "spectrum" and node.get("filename"):
-        import mitsuba as mi
-
-        return _integrate(*mi.spectrum_from_file(node.get("filename", "")))
-    if node.tag == "spectrum" and ":" in text:
-        samples = numbers_of(text.replace(":", " "))
-        return _integrate(samples[::2], samples[1::2])
-    if node.tag not in ("rgb", "srgb", "xyz", "spectrum"):
-        return None
-    digits = re.fullmatch("#([0-9a-fA-F]{6})", text)
-    numbers = [byte / 255 for byte in bytes.fromhex(digits[1])] if digits else numbers_of(text)
-    if len(numbers) not in (1, 3):
-        raise ValueError(f"{text!r} has {len(numbers)} numbers, and a colour has one or three")
-    values = np.broadcast_to(np.array(numbers), 3)
-    if node.tag == "xyz":
-        return images.RGB_OF_XYZ @ values
-    return images.linear(values.astype(np.float32)).astype(np.float64) if node.tag == "srgb" else values
-
-
-def read_new(texture: Element, *, shines: bool) -> Colour | None:
-    """The colour of a texture that Mitsuba 3 evaluates in its spectral modes alone, None for others."""
-    values = {part.get("name", ""): part.get("value", "") for part in texture}
-    kind = texture.get("type")
-    if kind == "blackbody":
-        return _blackbody(float(values.get("temperature", "5000"))) * float(values.get("scale", "1"))
-    if kind not in ("regular", "irregular") or "values" not in values:
-        return None
-    samples = numbers_of(values["values"])
-    ends = float(values.get("wavelength_min", "360")), float(values.get("wavelength_max", "830"))
-    at = np.linspace(*ends, len(samples)).tolist() if kind == "regular" else numbers_of(values.get("wavelengths", ""))
-    if len(at) != len(samples):
-        raise ValueError(f"it has {len(samples)} values and {len(at)} wavelengths")
-    return _integrate(at, samples, reflects=not shines)
-
-
-def put_colour(node: Element, colour: Colour) -> None:
-    """Let an element be a colour, of the same name."""
-    node.tag, node[:] = "rgb", []
-    node.attrib = {"name": node.get("name", ""), "value": elements.numbers(colour.tolist())}
-
-
-def numbers_of(text: str) -> list[float]:
-    """Numbers with spaces or commas between; raises ValueError for what is none, or is not finite."""
-    numbers = [float(each) for each in re.findall(r"[^\s,]+", text)]
-    if not np.isfinite(numbers).all():
-        raise ValueError(f"{text!r} is no number")
-    return numbers
-
-
-def _blackbody(kelvin: float) -> Colour:
-    """Planck's radiance in W / (m² sr nm), as a colour."""
-    wavelengths = np.linspace(360.0, 830.0, 95)
-    metres = wavelengths * 1e-9
-    radiance = 1.191042972e-25 / metres**5 / np.expm1(0.01438776877 / (metres * kelvin))
-    return _integrate(wavelengths.tolist(), radiance.tolist())
-
-
-def _integrate(wavelengths: list[float], values: list[float], *, reflects: bool = False) -> Colour:
-    """The colour of light; of what reflects, as Mitsuba 3 has it: under daylight, and within 0 and 1."""
-    import mitsuba as mi
-
-    return np.array(mi.spectrum_list_to_srgb(wavelengths, values, reflects, reflects), np.float64).clip(0)
-
-
-_SHAPES = (*SHAPES, "instance", "shapegroup")  # the last two become others
 
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "texture": "Texture"}
 """What Mitsuba has plugins for, by element."""
 
-_MEDIA = ("medium", "volume", "phase")
+_NOT_RENDERED = {
+    "shape": lambda kind: kind not in (*SHAPES, "instance", "shapegroup"),  # the last two become others
+    "texture": lambda kind: kind in ("blackbody", "regular", "irregular"),  # of Mitsuba's spectral modes
+}
 
 MOST = 5000
 """The most shapes that instances are expanded into; more are a forest, which no memory holds."""
@@ -112,22 +27,23 @@ MOST = 5000
 _ROUND = ("sphere", "cylinder", "disk")
 """The shapes that Mitsuba keeps round under each transform of their own."""
 
-_MESHES = ("obj", "ply", "serialized", "cube")
+_TURNED = ("obj", "ply", "serialized", "sphere")
 """The shapes whose normals turn where a transform of their own mirrors them, and turn not in an instance."""
-
-_IDENTITY, _MIRROR = np.eye(4), np.diag([-1.0, 1.0, 1.0, 1.0])
 
 
 def mend(root: Element, changes: Changes) -> None:
     """Mend a scene in place, and say what was left out or replaced."""
     _keep_used(root)
-    _drop_media(root, changes)
     above = elements.parents(root)
     left_out = list(_leave_out(root, above, changes))
     gone = {part.get("id") for node in left_out for part in node.iter() if part.tag != "ref"}
     for node in list(root.iter()):
         node[:] = [part for part in node if not (part.tag == "ref" and part.get("id") in gone)]
-    _integrate_spectra(root, above)
+    unseen = {node.get("id") for node in root.findall("bsdf") if node.get("type") == "null"} - {None}
+    for shape in root.findall("shape"):
+        if any(part.get("type") == "null" or (part.tag == "ref" and part.get("id") in unseen) for part in shape):
+            root.remove(shape)
+            changes.note("is left out, as nothing of it is seen", elements.place(shape), name="null")
 
 
 def effect_of(node: Element, above: dict[Element, Element]) -> Effect:
@@ -155,48 +71,35 @@ def _keep_used(root: Element) -> None:
     root[:] = [node for node in root if node not in left_out]
 
 
-def _drop_media(root: Element, changes: Changes) -> None:
-    """Take media out; a shape that only bounds one goes with it, as nothing of it would be seen."""
-    media = {node.get("id") for node in root.iter() if node.tag in _MEDIA} - {None}
-    unseen = {node.get("id") for node in root.iter("bsdf") if node.get("type") == "null"} - {None}
-    above = elements.parents(root)
-    for node in list(root.iter()):
-        kept = [part for part in node if part.tag not in _MEDIA and part.get("id") not in media]
-        held, node[:] = len(node), kept
-        if len(kept) == held or node.tag not in ("shape", "emitter"):
-            continue
-        seen = [part for part in kept if part.tag in ("bsdf", "emitter", "ref") and part.get("id") not in unseen]
-        has_material = any(part.tag in ("bsdf", "ref") for part in kept)  # Mitsuba gives others a grey one
-        if node.tag == "shape" and has_material and all(part.get("type") == "null" for part in seen):
-            above[node].remove(node)
-            changes.lose("geometry", "medium", "is left out, with what only bounds it", elements.place(node))
-        else:
-            changes.lose("colour", "medium", "is left out: only surfaces are rendered", elements.place(node))
-
-
 def _leave_out(parent: Element, above: dict[Element, Element], changes: Changes) -> Iterator[Element]:
     """Take out, or replace, what is not rendered of all that is in an element; what was taken out."""
     for node in list(parent):
-        kind, is_known = node.get("type", ""), node.tag not in _KINDS or _is_known(node)
-        if (node.tag == "shape" and kind not in _SHAPES) or (node.tag != "bsdf" and not is_known):
-            meaning = "is not rendered here, and is left out"
-            changes.lose(effect_of(node, above), kind, meaning, elements.place(node))
-            parent.remove(node)
-            yield node
+        kind, where, is_known = node.get("type", ""), elements.place(node), _is_known(node)
+        if node.tag != "bsdf" and not is_known:
+            changes.lose(effect_of(node, above), kind, "is not rendered here, and is left out", where)
+        elif node.tag in ("medium", "volume", "phase"):
+            changes.lose("colour", "medium", "is left out: only surfaces are rendered", where)
+        else:
+            if node.tag == "bsdf" and (kind in POLARISED or not is_known):
+                changes.lose("colour", kind, f"is not rendered here, and became {_replace(node)}", where)
+            elif kind == "directionalarea":
+                node.set("type", "area")
+                changes.lose("light", kind, "became an area light, which shines in all directions", where)
+            yield from _leave_out(node, above, changes)
             continue
-        if node.tag == "bsdf" and (kind in POLARISED or not is_known):
-            changes.lose("colour", kind, f"is not rendered here, and became {_replace(node)}", elements.place(node))
-        elif kind == "directionalarea":
-            node.set("type", "area")
-            changes.lose("light", kind, "became an area light, which shines in all directions", elements.place(node))
-        yield from _leave_out(node, above, changes)
+        parent.remove(node)
+        yield node
 
 
 def _is_known(node: Element) -> bool:
     import mitsuba as mi
 
-    kind = mi.PluginManager.instance().plugin_type(node.get("type", ""))
-    return kind == getattr(mi.ObjectType, _KINDS[node.tag]) or node.get("type") in ("rgb", "spectrum")
+    kind = node.get("type", "")
+    if node.tag in _NOT_RENDERED and _NOT_RENDERED[node.tag](kind):
+        return False
+    if node.tag not in _KINDS or kind in ("rgb", "spectrum"):
+        return True
+    return bool(mi.PluginManager.instance().plugin_type(kind) == getattr(mi.ObjectType, _KINDS[node.tag]))
 
 
 def _replace(bsdf: Element) -> str:
@@ -216,34 +119,17 @@ def _replace(bsdf: Element) -> str:
     return "diffuse"
 
 
-def _integrate_spectra(root: Element, above: dict[Element, Element]) -> None:
-    """Make colours of black bodies and sampled spectra, which Mitsuba 3 evaluates in its spectral modes alone."""
-    for node in list(root.iter("texture")):
-        users = [part for part in root.iter("ref") if part.get("id") == node.get("id")]
-        for user in users or [node]:
-            shines = effect_of(above[user] if users else node, above) == "light"
-            try:
-                colour = read_new(node, shines=shines)
-            except ValueError as error:
-                raise SpecError(f"{elements.place(node)}: cannot be read: {error}") from error
-            if colour is not None:
-                put_colour(user, colour)
-        if users and users[0].tag == "rgb" and node in list(root):
-            root.remove(node)
-
-
-def expand(root: Element, changes: Changes, scratch: Path) -> None:
+def expand(root: Element, changes: Changes) -> None:
     """Put copies of its group's shapes, which can move and be sampled as lights, in the place of each instance."""
     groups = {group.get("id"): group for group in root.findall("shape[@type='shapegroup']")}
     copies: dict[Element, list[Element]] = {}
     ids, made = Ids(root), 0
-    mirrored = cache(partial(_mirror, scratch=scratch))
     for number, instance in enumerate(root.findall("shape[@type='instance']"), 1):
         ref, placed = instance.find("ref"), elements.child(instance, "to_world")
         group = instance.find("shape") if ref is None else groups.get(ref.get("id"))
-        matrix = _IDENTITY if placed is None else np.array(placed[0].get("value", "").split(), np.float64)
+        matrix = np.eye(4) if placed is None else np.array(placed[0].get("value", "").split(), np.float64)
         shapes = [] if group is None or made >= MOST else group.findall("shape")
-        copies[instance] = [_place(shape, matrix.reshape(4, 4), mirrored, changes) for shape in shapes]
+        copies[instance] = [_place(shape, matrix.reshape(4, 4), changes) for shape in shapes]
         for shape, copy in zip(shapes, copies[instance], strict=True):
             name = shape.get("id") or (ref is not None and ref.get("id")) or "instance"
             copy.set("id", ids.make(f"{name}_{number}"))
@@ -256,44 +142,21 @@ def expand(root: Element, changes: Changes, scratch: Path) -> None:
         changes.lose("geometry", "instance", meaning)
 
 
-def _place(shape: Element, matrix: Floats, mirrored: Callable[[Element], Element], changes: Changes) -> Element:
+def _place(shape: Element, matrix: Floats, changes: Changes) -> Element:
     """A copy of a shape, moved by the matrix of an instance; its front stays its front, as in Mitsuba's instances."""
-    kind, is_mirrored = shape.get("type", ""), np.linalg.det(matrix[:3, :3]) < 0
-    square = matrix[:3, :3].T @ matrix[:3, :3]
-    if kind in _ROUND and not np.allclose(square, np.eye(3) * np.trace(square) / 3, atol=1e-5 * np.trace(square)):
-        meaning = "stays round where an instance stretches it; make it a mesh"
+    kind, square = shape.get("type", ""), matrix[:3, :3].T @ matrix[:3, :3]
+    is_mirrored = np.linalg.det(matrix[:3, :3]) < 0
+    is_stretched = not np.allclose(square, np.eye(3) * np.trace(square) / 3, atol=1e-5 * np.trace(square))
+    if (kind in _ROUND and is_stretched) or (kind == "cube" and is_mirrored):
+        meaning = "stays round where an instance stretches it, or shows its inside where one mirrors it; make it a mesh"
         changes.lose("geometry", kind, meaning, elements.place(shape))
-    if is_mirrored and kind in _MESHES:
-        shape, matrix = mirrored(shape), matrix @ _MIRROR
     copy = elements.copy_element(shape)
     if (own := elements.child(copy, "to_world")) is None:
         own = SubElement(copy, "transform", name="to_world")
     SubElement(own, "matrix", value=" ".join(map(repr, matrix.ravel().tolist())))
-    if is_mirrored and kind == "sphere":
-        if (flipped := elements.child(copy, "flip_normals")) is not None:
+    if is_mirrored and kind in _TURNED:
+        flipped = elements.child(copy, "flip_normals")
+        if flipped is not None:
             copy.remove(flipped)
         elements.put_value(copy, "flip_normals", flipped is None or flipped.get("value") != "true")
     return copy
-
-
-def _mirror(shape: Element, scratch: Path) -> Element:
-    """A mesh as a mirror at x = 0 shows it, with its fronts; one that Mitsuba refuses stays, and is told later."""
-    import mitsuba as mi
-
-    alone = elements.copy_element(shape)
-    alone[:] = [part for part in alone if part.tag not in ("bsdf", "emitter", "ref")]
-    alone.set("version", "3.0.0")
-    config = mi.parser.ParserConfig(mi.variant())
-    config.unused_properties = mi.LogLevel.Debug
-    try:
-        state = mi.parser.parse_string(config, elements.text(alone).replace("$", r"\$"))
-        mi.parser.transform_all(config, state)
-        mesh = read_mesh(mi.parser.instantiate(config, state)).transform(_MIRROR)
-    except RuntimeError:
-        return shape
-    made = Element("shape", type="ply")
-    file = write_ply(mesh, scratch / f"{len(list(scratch.iterdir()))}-mirrored.ply")
-    elements.put_value(made, "filename", str(file))
-    elements.put_value(made, "face_normals", mesh.normals is None)
-    made.extend(elements.copy_element(part) for part in shape if part.tag in ("bsdf", "emitter", "ref"))
-    return made

@@ -14,6 +14,9 @@ import pytest
 from imported_scenes import FOUR, Loaded, Read, colour_at, losses
 
 from photonfarm.core.errors import SpecError
+from photonfarm.renderer.tools.importing import images
+
+Quad = Callable[..., Path]
 
 TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4"), np.array([[0, 1, 2]], "<u4")
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4"), np.array([[0, 1, 2], [0, 2, 3]], "<u4")
@@ -58,7 +61,7 @@ def test_strips_and_fans_become_triangles(gltf: Any, loaded: Loaded) -> None:
     assert np.array(si.n)[2].tolist() == [1, 1]
 
 
-def test_lights_stand_and_shine_where_the_file_says(gltf: Any, quad: Callable[..., Path], loaded: Loaded) -> None:
+def test_lights_stand_and_shine_where_the_file_says(gltf: Any, quad: Quad, loaded: Loaded) -> None:
     lights = [
         {"type": "point", "intensity": 3},
         {"type": "spot", "spot": {"outerConeAngle": 0.5}},
@@ -91,7 +94,7 @@ def test_integers_that_are_normalised_are_read(gltf: Any, loaded: Loaded) -> Non
     assert float(np.array(made.shapes()[0].surface_area())[0]) == pytest.approx(1)
 
 
-def test_a_glb_is_the_same_scene(gltf: Any, quad: Callable[..., Path], read: Read, tmp_path: Path) -> None:
+def test_a_glb_is_the_same_scene(gltf: Any, quad: Quad, read: Read, tmp_path: Path) -> None:
     from photonfarm.renderer.tools.importing.elements import text
 
     separate = text(read(quad()).root)
@@ -142,7 +145,7 @@ def test_points_and_lines_are_losses_of_geometry(gltf: Any, read: Read) -> None:
 
 @pytest.mark.parametrize(("inner", "outer"), [(0, np.pi / 4), (0.3, 0.31), (0, np.pi / 2)])
 def test_spots_fade_as_the_extension_recommends(
-    gltf: Any, quad: Callable[..., Path], loaded: Loaded, inner: float, outer: float
+    gltf: Any, quad: Quad, loaded: Loaded, inner: float, outer: float
 ) -> None:
     spot = {"type": "spot", "intensity": 3, "spot": {"innerConeAngle": inner, "outerConeAngle": outer}}
     put_lights(gltf, spot)
@@ -160,14 +163,12 @@ def test_spots_fade_as_the_extension_recommends(
     ("light", "lost"),
     [({"color": [-1, 1, 1]}, "intensity"), ({"type": "spot", "spot": {"outerConeAngle": 0}}, "outerConeAngle")],
 )
-def test_lights_that_no_light_can_be_are_losses(
-    gltf: Any, quad: Callable[..., Path], read: Read, light: Any, lost: str
-) -> None:
+def test_lights_that_no_light_can_be_are_losses(gltf: Any, quad: Quad, read: Read, light: Any, lost: str) -> None:
     put_lights(gltf, {"type": "point"} | light)
     assert losses(read(quad())) == [("light", lost)]
 
 
-def test_the_units_of_blenders_lamps_are_said(gltf: Any, quad: Callable[..., Path], read: Read) -> None:
+def test_the_units_of_blenders_lamps_are_said(gltf: Any, quad: Quad, read: Read) -> None:
     gltf.document["asset"]["generator"] = "Khronos glTF Blender I/O v5.0.21"
     assert not [change for change in read(quad()).changes if "683" in str(change)]
     gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": [{"type": "point"}]}}
@@ -175,24 +176,17 @@ def test_the_units_of_blenders_lamps_are_said(gltf: Any, quad: Callable[..., Pat
     assert (said.effect, said.name) == (None, "KHR_lights_punctual")
 
 
-def test_what_has_no_effect_on_a_still_picture_is_no_loss(gltf: Any, quad: Callable[..., Path], read: Read) -> None:
+def test_what_has_no_effect_on_a_still_picture_is_no_loss(gltf: Any, quad: Quad, read: Read) -> None:
     gltf.document |= {"animations": [{}, {}], "extensionsUsed": ["EXT_unused"]}
     gltf.document["extensionsRequired"] = ["KHR_materials_variants"]
-    neutral = {
-        "KHR_materials_clearcoat": {"clearcoatFactor": 0},
-        "KHR_xmp_json_ld": {},
-        "KHR_materials_specular": {},
-    }
+    neutral = {"KHR_materials_clearcoat": {"clearcoatFactor": 0}, "KHR_xmp_json_ld": {}, "KHR_materials_specular": {}}
     changes = list(read(quad(extensions=neutral, occlusionTexture={"index": 0})).changes)
     assert {change.effect for change in changes} == {None}
     assert {change.name for change in changes} == {"animations", "KHR_xmp_json_ld", "occlusionTexture"}
 
 
-def test_extensions_that_are_not_read_are_named_by_what_they_sit_on(
-    gltf: Any, quad: Callable[..., Path], read: Read
-) -> None:
-    lights = [{"type": "point", "extensions": {"EXT_of_light": {}}}, {"type": "area"}]
-    put_lights(gltf, *lights)
+def test_extensions_that_are_not_read_are_named_by_what_they_sit_on(gltf: Any, quad: Quad, read: Read) -> None:
+    put_lights(gltf, {"type": "point", "extensions": {"EXT_of_light": {}}}, {"type": "area"})
     path = quad(extensions={"KHR_materials_unlit": {}, "KHR_materials_sheen": {"sheenColorFactor": [0, 0, 0.1]}})
     document = json.loads(path.read_text())
     document["scenes"][0]["extensions"] = {"EXT_lights_image_based": {}}
@@ -211,9 +205,7 @@ def test_extensions_that_are_not_read_are_named_by_what_they_sit_on(
     }
 
 
-def test_extensions_of_images_and_numbers_are_named_where_they_are_used(
-    gltf: Any, quad: Callable[..., Path], read: Read
-) -> None:
+def test_extensions_of_images_and_numbers_are_named_where_they_are_used(gltf: Any, quad: Quad, read: Read) -> None:
     quad(pbrMetallicRoughness={"baseColorTexture": gltf.image(FOUR, "four.png")})
     gltf.document["samplers"], gltf.document["textures"][0]["sampler"] = [{}], 0
     for kind in ("textures", "samplers", "images", "accessors", "bufferViews"):
@@ -271,27 +263,21 @@ def test_normal_maps_keep_their_upper_side_where_images_are_mirrored(
 
 
 def test_grey_of_16_bits_has_its_value(case: Callable[[str], Path], loaded: Loaded) -> None:
-    _, scene = loaded(case("gltf-16-bit-grey/scene.gltf"))
+    made, scene = loaded(case("gltf-16-bit-grey/scene.gltf"))
     assert colour_at(scene, 0.5, 0.5) == pytest.approx([0.214] * 3, abs=0.01)
+    (roughness,) = (node for node in made.root.iter("texture") if node.get("name") == "roughness")
+    file = next(node.get("value", "") for node in roughness if node.get("name") == "filename")
+    assert images.decode(Path(file).read_bytes(), "it")[0, 0, 0] == pytest.approx(0.5, abs=0.01)
 
 
 def test_images_wrap_differently_along_both_axes(case: Callable[[str], Path], loaded: Loaded) -> None:
     _, scene = loaded(case("gltf-wrap/scene.gltf"))
     blue, white, green, red = [0, 0, 1], [1, 1, 1], [0, 1, 0], [1, 0, 0]
-    for place, colour in (
-        ((0.1, 0.9), blue),
-        ((0.9, 0.9), white),
-        ((0.9, 0.1), green),
-        ((2.1, 0.9), green),
-        ((2.9, 0.9), red),
-        ((2.1, 0.1), white),
-    ):
-        assert colour_at(scene, *place) == colour
+    places = (0.1, 0.9), (0.9, 0.9), (0.9, 0.1), (2.1, 0.9), (2.9, 0.9), (2.1, 0.1)
+    assert [colour_at(scene, *place) for place in places] == [blue, white, green, green, red, white]
 
 
-def test_images_that_are_not_there_leave_their_factors(
-    gltf: Any, quad: Callable[..., Path], loaded: Loaded, tmp_path: Path
-) -> None:
+def test_images_that_are_not_there_leave_their_factors(gltf: Any, quad: Quad, loaded: Loaded, tmp_path: Path) -> None:
     surface = {"baseColorTexture": gltf.image(FOUR, "four.png"), "baseColorFactor": [0.5, 0.25, 0.75, 1]}
     path = quad(pbrMetallicRoughness=surface)
     (tmp_path / "four.png").unlink()

@@ -162,7 +162,6 @@ def test_numbers_of_materials_that_are_none_are_refused_with_their_line(
     ("stated", "there"),
     [
         ("a b.mtl", ["a b.mtl"]),
-        ("x.mtl a b.mtl", ["x.mtl", "a b.mtl"]),
         ("x.mtl\nmtllib y.mtl", ["x.mtl", "y.mtl"]),
         ("SUB\\Y.MTL", ["sub/y.mtl"]),
         ("C:\\my files\\y.mtl", ["y.mtl"]),

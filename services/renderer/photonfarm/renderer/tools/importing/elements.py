@@ -124,15 +124,12 @@ WIDEST = math.radians(89.5)
 """The widest half angle of a spot, whose image is flat."""
 
 
-def cone_image(profile: Profile, cut: float, file: Path) -> Path:
-    """The image of a spot within an angle; `profile`: its share at tangents (x, y) off the axis."""
+def put_cones(spots: Sequence[Element], profile: Profile, cut: float, file: Path) -> None:
+    """Let spots end at an angle and fade as a profile says, by an image that is written."""
     texels = 1024 if cut < math.radians(80) else 2048  # as tangents are large there
     y, x = np.meshgrid(*[math.tan(cut) * (2 * (np.arange(texels) + 0.5) / texels - 1)] * 2, indexing="ij")
-    return images.save(profile(x, y).astype(np.float32), file)
-
-
-def put_cone(spot: Element, cut: float, file: Path) -> None:
-    """Let a spot end at an angle and fade as an image says."""
-    put_value(spot, "cutoff_angle", math.degrees(cut))
-    put_value(spot, "beam_width", math.degrees(cut) * 0.999)
-    put_value(put_bitmap(spot, "texture", file, raw=True), "wrap_mode", "clamp")
+    file = images.save(profile(x, y).astype(np.float32), file)
+    for spot in spots:
+        put_value(spot, "cutoff_angle", math.degrees(cut))
+        put_value(spot, "beam_width", math.degrees(cut) * 0.999)
+        put_value(put_bitmap(spot, "texture", file, raw=True), "wrap_mode", "clamp")

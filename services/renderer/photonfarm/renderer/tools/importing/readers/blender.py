@@ -24,7 +24,7 @@ import numpy as np
 from photonfarm.core.errors import BackendError, SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing import elements
-from photonfarm.renderer.tools.importing.elements import WIDEST, Profile, cone_image, put_cone
+from photonfarm.renderer.tools.importing.elements import WIDEST, Profile, put_cones
 from photonfarm.renderer.tools.importing.imported import ImportedScene
 from photonfarm.renderer.tools.importing.meshes import Floats, unit
 from photonfarm.renderer.tools.importing.readers import gltf
@@ -188,11 +188,10 @@ class Lamps:
     ) -> None:
         """Add spots at offsets (N, 3) that share an intensity; `profile`: its share at tangents (x, y) off the axis."""
         spots = [self._emitter("spot", lamp["name"]) for _ in places]
-        file = cone_image(profile, cut, self._scratch / f"{spots[0].get('id')}.png")
         for spot, place in zip(spots, places, strict=True):
             elements.put_value(spot, "intensity", (intensity / len(places)).tolist())
             _place(spot, _frame(matrix) * TURN, matrix[:3, 3] + place)
-            put_cone(spot, cut, file)
+        put_cones(spots, profile, cut, self._scratch / f"{spots[0].get('id')}.png")
         if len(places) > 1:
             meaning = f"became {PARTS} spots, whose shadows are as soft, for its radius or its spread"
             self._scene.changes.note(meaning, f"lamp {lamp['name']!r}")

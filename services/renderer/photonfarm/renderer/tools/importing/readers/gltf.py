@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing import elements
-from photonfarm.renderer.tools.importing.elements import WIDEST, cone_image, put_cone
+from photonfarm.renderer.tools.importing.elements import WIDEST, put_cones
 from photonfarm.renderer.tools.importing.imported import ImportedScene
 from photonfarm.renderer.tools.importing.meshes import Floats, Mesh
 from photonfarm.renderer.tools.importing.readers.gltf_file import GltfFile, Node, extension, normalise, numbers
@@ -25,9 +25,6 @@ from photonfarm.renderer.tools.importing.readers.gltf_materials import Look, Mat
 
 OBJECT_SHARE = 0.34
 """A node is an object as a whole up to this share of all meshes; above, it is a folder of objects."""
-
-_ONE_COLOUR = 2e-3  # colours of vertices that differ by no more are one colour
-_UNNAMED = (0.8, 0.8, 0.8, 1.0)  # the colour of what has neither a material nor colours of vertices
 
 _LIGHTS, _INSTANCES = "KHR_lights_punctual", "EXT_mesh_gpu_instancing"
 _OF_BLENDER = (
@@ -232,28 +229,22 @@ class _Reader:
         return values[first]
 
     def _colour(self, mesh: Mesh, colours: Floats | None, number: int | None, place: str) -> _Piece:
-        """A mesh with its colours of vertices, if they differ, or a material with their one colour."""
-        if colours is None or not len(mesh.faces):
-            if number is not None:
-                return mesh, Look(number)
+        """A mesh with its colours of vertices, which multiply a plain one of the material, and its material."""
+        if number is None and colours is None:
             self.scene.changes.note("what has no material is light grey", place)
-            return mesh, Look(None, tint=_UNNAMED)
-        used = colours[np.unique(mesh.faces)]
-        used = np.column_stack([used, np.ones((len(used), 4 - used.shape[1]))])
-        mean, same = np.round(used.mean(axis=0), 4).tolist(), np.ptp(used, axis=0) <= _ONE_COLOUR
+        if colours is None or (colours == 1).all():
+            return mesh, Look(number)
         entry = self.materials.entry(number)
         surface = entry.get("pbrMetallicRoughness", {})
-        if not same[3] and entry.get("alphaMode", "OPAQUE") != "OPAQUE":
-            self.scene.changes.lose("colour", "COLOR_0", "the alpha of vertices is their mean", place)
-        if same[:3].all():
-            return mesh, Look(number, tint=tuple(mean))
-        look = Look(number, tint=(1.0, 1.0, 1.0, mean[3]))
+        if (colours[:, 3:] < 1).any() and entry.get("alphaMode", "OPAQUE") != "OPAQUE":
+            self.scene.changes.lose("colour", "COLOR_0", "vertices have no opacity of their own", place)
         if surface.get("baseColorTexture") is not None:
             self.scene.changes.lose("colour", "COLOR_0", "colours of vertices are left out beside an image", place)
-            return mesh, look
-        factor = numbers(surface, "baseColorFactor", (1, 1, 1, 1))
-        painted = {"vertex_color": (colours[:, :3] * factor[:3]).clip(0, 1)}
-        return replace(mesh, attributes=painted), look._replace(painted=True)
+            return mesh, Look(number)
+        factor = numbers(surface, "baseColorFactor", (1, 1, 1, 1))[:3] if number is not None else 1.0
+        return replace(mesh, attributes={"vertex_color": (colours[:, :3] * factor).clip(0, 1)}), Look(
+            number, painted=True
+        )
 
     def _put_light(self, light: Node, matrix: Floats) -> None:
         """Candela and lux are taken as radiometric units, as emissive strength is, so that all lights agree."""
@@ -289,7 +280,7 @@ class _Reader:
             cosine, edge = 1 / np.sqrt(1 + x * x + y * y), np.cos(outer)
             return np.clip((cosine - edge) / max(1e-3, np.cos(inner) - edge), 0, 1) ** 2
 
-        put_cone(emitter, cut, cone_image(profile, cut, self.materials.scratch / f"{emitter.get('id')}_cone.png"))
+        put_cones([emitter], profile, cut, self.materials.scratch / f"{emitter.get('id')}_cone.png")
 
 
 def _matrix(node: Node) -> Floats:

@@ -40,7 +40,7 @@ _PARTS = {
 }
 """Properties of `principled`: where glTF has them, their factor and its default, their image and its channel."""
 
-_UNNAMED: Node = {"pbrMetallicRoughness": {"metallicFactor": 0.0}}  # the material of what has none
+_UNNAMED: Node = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.8, 0.8, 1], "metallicFactor": 0.0}}
 _DULLEST = 1.01  # the least index of refraction of `principled`; what has it reflects by its colour alone
 
 
@@ -49,7 +49,6 @@ class Look(NamedTuple):
 
     number: int | None
     mirrored: bool = False  # its images are on the mesh, and so its normal map is
-    tint: tuple[float, ...] = _WHITE  # by which all vertices multiply its colour and alpha
     painted: bool = False  # its colour is the mesh's attribute `vertex_color`
 
 
@@ -84,7 +83,7 @@ class Materials:
     def is_unseen(self, look: Look) -> bool:
         """Whether a material is wholly transparent by its factors."""
         entry = self.entry(look.number)
-        alpha = look.tint[3] * numbers(entry.get("pbrMetallicRoughness", {}), "baseColorFactor", _WHITE)[3]
+        alpha = numbers(entry.get("pbrMetallicRoughness", {}), "baseColorFactor", _WHITE)[3]
         mode = entry.get("alphaMode", "OPAQUE")
         return bool(alpha < entry.get("alphaCutoff", 0.5)) if mode == "MASK" else bool(mode == "BLEND" and alpha <= 0)
 
@@ -113,7 +112,7 @@ class Materials:
             writer.note("light is computed here", "occlusionTexture")
         top = Element("bsdf", id=made)
         self.scene.root.insert(len(self.scene.root.findall("bsdf")), top)
-        factor = (np.array(look.tint) * numbers(surface, "baseColorFactor", _WHITE)).tolist()
+        factor = numbers(surface, "baseColorFactor", _WHITE).tolist()
         colour = self._map(surface.get("baseColorTexture"), factor, _RGBA, colour=True)
         opacity, normals = _opacity(entry, colour), self._normals(entry, look, writer)
         plugin, parts = self._surface(entry, colour, look.painted, writer)

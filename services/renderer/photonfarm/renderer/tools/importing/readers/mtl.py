@@ -65,7 +65,14 @@ def statements(file: Path) -> Iterator[tuple[int, str, str]]:
 def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[str, Material]:
     """The materials of the `mtllib` statements of a file, by name; of two of one name the first is taken."""
     materials: dict[str, Material] = {}
-    for file in dict.fromkeys(file for names in stated for file in _libraries(path.parent, names, changes)):
+    files: list[Path] = []
+    for text in stated:  # one name, which may have spaces, or several
+        for name in [text] if _locate(path.parent, text, changes) else text.split():
+            if file := _locate(path.parent, name, changes):
+                files.append(file)
+            else:
+                changes.lose("colour", "mtllib", "material files are not there", text)
+    for file in dict.fromkeys(files):
         material: Material | None = None
         for line, word, rest in statements(file):
             if word.lower() == "newmtl":
@@ -79,19 +86,6 @@ def read_libraries(path: Path, stated: Sequence[str], changes: Changes) -> dict[
                     material.say(None, word, "is stated twice, and the last is taken")
                 material.lines[word.lower()] = (line, word, rest)
     return materials
-
-
-def _libraries(folder: Path, stated: str, changes: Changes) -> Iterator[Path]:
-    """The files of a statement, which may be several, and have spaces in their names."""
-    words = stated.split()
-    while words:
-        ends = range(len(words), 0, -1)
-        end = next((end for end in ends if _find(folder, " ".join(words[:end]))), len(words))
-        if file := _locate(folder, " ".join(words[:end]), changes):
-            yield file
-        else:
-            changes.lose("colour", "mtllib", "material files are not there", " ".join(words))
-        words = words[end:]
 
 
 def _locate(folder: Path, name: str, changes: Changes) -> Path | None:

@@ -12,7 +12,7 @@ import redis
 import s3_server
 
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.queue import connect
+from photonfarm.queue.connection import connect
 from photonfarm.store import Store
 
 # Read where torch is loaded, also by processes that tests start: threads that turn while they wait would take from

@@ -13,10 +13,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from photonfarm import queue
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.submission import submit
 from photonfarm.plan.request import Request
+from photonfarm.queue.job import RenderArguments
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.worker.child import RenderWorker
 from photonfarm.renderer.worker.settings import WorkerSettings
@@ -101,7 +101,7 @@ def keep_account(pipe: Any, store: Path, url: str) -> None:
     ledger = Ledger()
 
     class Watched(RenderWorker):
-        def _render(self, job: queue.RenderArguments) -> None:
+        def _render(self, job: RenderArguments) -> None:
             if not ledger.copies:
                 ledger.copy()
             super()._render(job)

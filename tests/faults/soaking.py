@@ -23,7 +23,8 @@ import soak_evidence as evidence
 
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, reconcile
+from photonfarm.queue.connection import connect
+from photonfarm.queue.reconciliation import reconcile
 from photonfarm.renderer.worker.settings import GRACE_S
 from photonfarm.store import SceneStore, Store
 

@@ -19,7 +19,8 @@ import pytest
 
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, reconcile
+from photonfarm.queue.connection import connect
+from photonfarm.queue.reconciliation import reconcile
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.model.lease import read_leases

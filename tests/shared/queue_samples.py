@@ -7,8 +7,8 @@ import redis
 import store_samples as samples
 
 from photonfarm.plan.request import Request
-from photonfarm.queue import WorkerReport, beat
 from photonfarm.queue.rq_adapter import Execution, fail, open_queue, take
+from photonfarm.queue.workers import WorkerReport, beat
 from photonfarm.store import SceneStore, Store
 
 SCENE_ID = "0123456789abcdef" * 2

@@ -8,10 +8,11 @@ import queue_samples
 import redis
 import store_samples as samples
 
-from photonfarm import queue
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.request import Request
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.workers import Activity, WorkerReport
 from photonfarm.store import SceneStore, Store
 
 
@@ -43,15 +44,15 @@ def run(tmp_path: Path) -> Path:
 @pytest.fixture
 def farm(scene: SceneStore, run: Path, store: Store, connection: redis.Redis, common_redis: EmbeddedRedis) -> FarmWatch:
     """A farm with a queue, three workers, a failure and a run."""
-    queue.reconcile(store, connection)
+    reconcile(store, connection)
     name = queue_samples.taken(connection, "ada").job_id
-    doing = queue.Activity("renders samples", 1, 2, name)
+    doing = Activity("renders samples", 1, 2, name)
     left = {scene.scene_id: "room.xml is missing"}
     for worker, report in (
         ("ada", {"doing": doing}),
         ("bob", {"paused": "the disk is full", "left": left}),
         ("eve", {}),
     ):
-        queue_samples.told(connection, worker, queue.WorkerReport(host="elsewhere", process=1, **report))
+        queue_samples.told(connection, worker, WorkerReport(host="elsewhere", process=1, **report))
     queue_samples.failed(connection, "ValueError: 7 is odd")
     return FarmWatch(store, common_redis.url, [run])

@@ -18,12 +18,14 @@ import redis
 import store_samples as samples
 from prometheus_client.parser import text_string_to_metric_families
 
-from photonfarm import queue
 from photonfarm.cli.main import main
 from photonfarm.core.errors import StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.request import Request
+from photonfarm.queue.failures import keep_failure
+from photonfarm.queue.job import job_name
+from photonfarm.queue.reconciliation import reconcile
 from photonfarm.store import SceneStore, Store
 from photonfarm.web.metrics import MOST_ERRORS, OTHER, FarmMetrics
 
@@ -80,7 +82,7 @@ def test_a_scrape_says_what_store_queue_workers_and_run_hold(farm: FarmWatch, sc
 def test_without_a_redis_the_store_is_told_and_failures_that_it_has_kept(
     scene: SceneStore, store: Store, tmp_path: Path
 ) -> None:
-    queue.keep_failure(store, queue.job_name(scene.scene_id, 3), "ValueError: 7", worker="ada")
+    keep_failure(store, job_name(scene.scene_id, 3), "ValueError: 7", worker="ada")
     found = scraped(FarmMetrics(FarmWatch(store, f"unix://{tmp_path}/none").look))
     assert of(found, "samples_committed_total") == 4
     assert of(found, "queue_up") == 0
@@ -102,7 +104,7 @@ def test_failures_take_few_labels_whatever_their_messages_are(
 ) -> None:
     more = Request(modifications=200)
     store.plan(samples.small_spec(points=18), more, shard_rows=1)
-    queue.reconcile(store, connection)
+    reconcile(store, connection)
     for job in range(200):
         reason = f"Error{'abcdefghij'[job % 10]}{'klmno'[job // 10 % 5]}: {job}" if job % 2 else f"\x1b[2J{job} <\"'\n>"
         queue_samples.failed(connection, reason)

@@ -198,13 +198,14 @@ def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
     started for what is queued. A job whose worker died is queued again once its heartbeat has run out; jobs that
     failed too often wait for `submit --retry`.
     """
-    from photonfarm import queue
     from photonfarm.cli import show
+    from photonfarm.queue.connection import connect
+    from photonfarm.queue.reconciliation import reconcile
     from photonfarm.store import Store
 
     opened = Store(store)
-    with queue.connect(redis_url) as connection:
-        show.print_queued(queue.reconcile(opened, connection), as_json)
+    with connect(redis_url) as connection:
+        show.print_queued(reconcile(opened, connection), as_json)
 
 
 @click.command("redis")

@@ -102,7 +102,7 @@ def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
         _refuse_password(url)
     if (file := password_file()) is None:
         return url
-    from photonfarm.queue import add_password
+    from photonfarm.queue.connection import add_password
 
     return add_password(file, url)
 
@@ -138,7 +138,7 @@ def names_redis() -> bool:
 
 
 def _refuse_password(url: str) -> None:
-    from photonfarm.queue import has_password
+    from photonfarm.queue.connection import has_password
 
     if has_password(url):
         raise click.BadParameter(

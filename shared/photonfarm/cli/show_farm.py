@@ -21,7 +21,7 @@ from photonfarm.farm.progress import FarmProgress, SceneProgress, describe_faile
 
 if TYPE_CHECKING:
     from photonfarm.farm.watch import FarmWatch
-    from photonfarm.queue import FailureCause
+    from photonfarm.queue.failures import FailureCause
 
 LOOK_S = 2.0
 PLAIN_S = 5.0  # where there is no terminal
@@ -97,7 +97,7 @@ def list_lines(farm: FarmProgress, store: str | Path) -> Iterator[str]:
     yield from (f"  {wait.sentence}" for wait in farm.waits if wait.kind != "job_failed")
     for when, causes in (("", farm.queue.causes), ("before: ", farm.queue.kept)):
         for cause in causes:
-            from photonfarm.queue import repeating_command
+            from photonfarm.queue.failures import repeating_command
 
             yield f"  {when}{describe_failed(cause)}"
             yield f"      to repeat one: {repeating_command(store, cause.example)}"
@@ -166,7 +166,7 @@ def print_document(farm: FarmProgress, store: str | Path) -> None:
 
 
 def _list_failures(causes: Sequence[FailureCause], store: str | Path) -> list[dict[str, Any]]:
-    from photonfarm.queue import repeating_command
+    from photonfarm.queue.failures import repeating_command
 
     return [
         {

@@ -118,7 +118,7 @@ def slurm(
         click.echo(f"scene {found.scene_id}: {found.planned} samples planned, {found.planned_before} before", err=True)
         planned.append(found)
     if queue_url is not None:
-        from photonfarm.queue import add_password
+        from photonfarm.queue.connection import add_password
 
         queue_missing(Store(store), add_password(password_file(), queue_url), retry=retry)
     started = launch(scripts, asked.logs.absolute())

@@ -13,7 +13,9 @@ from photonfarm.farm.training import WAITS, TrainingProgress
 from photonfarm.store import SceneStatus
 
 if TYPE_CHECKING:
-    from photonfarm.queue import Activity, FailureCause, QueueStatus
+    from photonfarm.queue.failures import FailureCause
+    from photonfarm.queue.rq_adapter import QueueStatus
+    from photonfarm.queue.workers import Activity
 
 CommittedAndPlanned = tuple[int, int]
 

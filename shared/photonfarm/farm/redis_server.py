@@ -21,7 +21,7 @@ from typing import IO, NoReturn, Self
 
 from photonfarm.core.errors import QueueError
 from photonfarm.core.processes import tie
-from photonfarm.queue import connect
+from photonfarm.queue.connection import connect
 
 START_S = 20.0
 STOP_S = 20.0

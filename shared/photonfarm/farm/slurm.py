@@ -126,7 +126,7 @@ def _make_script(
 
 
 def _has_password(redis_url: str) -> bool:
-    from photonfarm.queue import has_password
+    from photonfarm.queue.connection import has_password
 
     return has_password(redis_url)
 

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import numpy as np
 
-from photonfarm import queue
 from photonfarm.core.errors import QueueError, SpecError, StoreError, store_errors
 from photonfarm.core.formatting import format_count
 from photonfarm.core.keys import Key
@@ -23,6 +22,10 @@ from photonfarm.core.models import differing
 from photonfarm.plan.hold_out import HOLD_OUT, are_held_out, enough, units_of
 from photonfarm.plan.request import SHARD_ROWS, PlannedContent, Request, expand
 from photonfarm.plan.top_up import PlannedViews, TopUp, spp_per_pass
+from photonfarm.queue.connection import connect
+from photonfarm.queue.failures import keep_retry
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.workers import OtherStoreError
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
@@ -283,7 +286,7 @@ def _queue(store: Store, redis_url: str | None, *, retry: bool | str) -> int | N
     """The number of jobs that are queued now; None without Redis. Workers that have none learn it from the store."""
     if retry is True:
         with store_errors("note a retry", store.storage.where):
-            queue.keep_retry(store)
+            keep_retry(store)
     return None if redis_url is None else queue_missing(store, redis_url, retry=retry)
 
 
@@ -302,9 +305,9 @@ def queue_missing(
     is `stored` nevertheless, and that --no-queue {verb} without Redis.
     """
     try:
-        connection = queue.connect(redis_url)
-        return queue.reconcile(store, connection, scene_id=scene_id, retry=retry)
-    except queue.OtherStoreError as error:
+        connection = connect(redis_url)
+        return reconcile(store, connection, scene_id=scene_id, retry=retry)
+    except OtherStoreError as error:
         raise QueueError(f"{error}. {stored} in {store.storage.where}") from error
     except QueueError as error:
         raise QueueError(

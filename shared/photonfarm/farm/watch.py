@@ -25,7 +25,8 @@ from photonfarm.store import SceneStatus, SceneStore, Store
 from photonfarm.store.model.store import FAILURES_FOLDER
 
 if TYPE_CHECKING:
-    from photonfarm.queue import Activity, Failure
+    from photonfarm.queue.failures import Failure
+    from photonfarm.queue.workers import Activity
 
 ANSWER_S = 5.0
 """How long an answer of Redis is waited for; workers wait longer."""
@@ -171,7 +172,7 @@ def _read_marker(scene: SceneStore, job: int) -> dict[str, Any] | StoreError:
 
 
 def _is_of(activity: Activity, scene_id: str) -> bool:
-    from photonfarm.queue import RenderArguments
+    from photonfarm.queue.job import RenderArguments
 
     return activity.job is not None and RenderArguments.of(activity.job).scene_id == scene_id
 
@@ -183,19 +184,22 @@ def read_queue(store: Store, redis_url: str) -> QueueProgress:
     """
     if (refused := _why_refused(redis_url)) and not store.storage.names(FAILURES_FOLDER):
         return QueueProgress(None, refused)
-    from photonfarm import queue
+    from photonfarm.queue.connection import connect, redis_errors
+    from photonfarm.queue.failures import group_causes, read_kept_failures
+    from photonfarm.queue.rq_adapter import queue_status
+    from photonfarm.queue.workers import check_served
 
     with store_errors("look for failures", store.storage.where):
-        kept = queue.read_kept_failures(store, lambda name: _is_missing(store, name))
+        kept = read_kept_failures(store, lambda name: _is_missing(store, name))
     try:
-        with queue.redis_errors("asked"), queue.connect(redis_url, only_s=ANSWER_S) as connection:
-            queue.check_served(connection, store)
-            found = queue.queue_status(connection)
+        with redis_errors("asked"), connect(redis_url, only_s=ANSWER_S) as connection:
+            check_served(connection, store)
+            found = queue_status(connection)
     except QueueError as error:
-        return QueueProgress(None, str(error), kept=queue.group_causes(kept))
+        return QueueProgress(None, str(error), kept=group_causes(kept))
     failed = {name: failure for name, failure in found.failed.items() if _is_missing(store, name)}
     unknown: dict[str, Failure] = {name: failure for name, failure in kept.items() if name not in failed}
-    return QueueProgress(found, causes=queue.group_causes(failed), kept=queue.group_causes(unknown))
+    return QueueProgress(found, causes=group_causes(failed), kept=group_causes(unknown))
 
 
 def _why_refused(redis_url: str) -> str | None:
@@ -218,7 +222,7 @@ def _why_refused(redis_url: str) -> str | None:
 
 def _is_missing(store: Store, name: str) -> bool:
     """Whether a job is one of this store's, and to be rendered; False for one whose scene is damaged."""
-    from photonfarm.queue import RenderArguments
+    from photonfarm.queue.job import RenderArguments
 
     job = RenderArguments.of(name)
     with contextlib.suppress(CorruptError, IndexError):

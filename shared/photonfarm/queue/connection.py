@@ -16,6 +16,10 @@ from redis.retry import Retry
 from photonfarm.core.errors import QueueError
 
 SOCKET_TIMEOUT_S = 30
+
+RETRY = Retry(ExponentialBackoff(cap=0.5, base=0.1), 3)
+"""Three tries within a second, for short faults; the supervisor waits out longer outages."""
+
 PASSWORD_VARIABLE = "PHOTONFARM_REDIS_PASSWORD_FILE"  # noqa: S105 - the name of a variable
 USER = "photonfarm"
 """The user of a URL without a name, if the password comes from a file."""
@@ -54,10 +58,12 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
     With `only_s`, each answer is awaited once, for so many seconds: for commands that a user waits for.
     """
     shown = without_password(url)
-    retry = _retry() if only_s is None else Retry(NoBackoff(), 0)
+    retry = RETRY if only_s is None else Retry(NoBackoff(), 0)
     try:
+        if url.count("@") > 1 or ("@" in url and "@" not in urlsplit(url).netloc):
+            raise ValueError
         connection = Redis.from_url(
-            _check_url(url), socket_timeout=only_s or SOCKET_TIMEOUT_S, socket_connect_timeout=5, retry=retry
+            url, socket_timeout=only_s or SOCKET_TIMEOUT_S, socket_connect_timeout=5, retry=retry
         )
     except (ValueError, TypeError):  # their text may hold a piece of the password
         raise QueueError(
@@ -66,47 +72,26 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
         ) from None
     try:
         connection.ping()
+    except redis.AuthenticationError as error:
+        raise QueueError(f"the Redis at {shown} {_why_refused(str(error).rstrip('.'), url)}") from error
     except (redis.RedisError, OSError) as error:
-        refused = isinstance(error, redis.AuthenticationError)
-        raise QueueError(
-            f"{'the' if refused else 'no'} Redis at {shown}{' ' if refused else ': '}{_reason(error, url)}"
-        ) from error
+        remedy = "" if isinstance(error, redis.BusyLoadingError) else "; `photonfarm redis` starts one"
+        raise QueueError(f"no Redis at {shown}: {str(error).rstrip('.')}{remedy}") from error
     return connection
 
 
-def _reason(error: Exception, url: str) -> str:
-    """Why there is no connection, and the remedy if no server answers or the login fails."""
-    if isinstance(error, redis.ConnectionError) and not isinstance(
-        error, redis.AuthenticationError | redis.BusyLoadingError
-    ):
-        return f"{str(error).rstrip('.')}; `photonfarm redis` starts one"
-    if not isinstance(error, redis.AuthenticationError):
-        return str(error)
-    reason = str(error).rstrip(".")
+def _why_refused(reason: str, url: str) -> str:
+    """Why a login failed, and the remedy."""
     if not has_password(url):
         return (
             f"wants a password ({reason}); put it into a file that {PASSWORD_VARIABLE} names. That logs in as the "
             f"user {USER}, and with redis://default@host as the one that `requirepass` is for"
         )
-    if urlsplit(url).username == USER:
-        return (
-            f"does not let in the user {USER} ({reason}), which a password file ({PASSWORD_VARIABLE}) is for unless "
-            "the URL names another; check the password; a Redis with `requirepass` has the user default: "
-            "redis://default@host"
-        )
     user = urlsplit(url).username or "default"
-    return f"does not let in the user {user} ({reason}); check the password, in the URL or in a {PASSWORD_VARIABLE}"
-
-
-def _check_url(url: str) -> str:
-    if url.count("@") > 1 or ("@" in url and "@" not in urlsplit(url).netloc):
-        raise ValueError
-    return url
-
-
-def _retry() -> Retry:
-    """Three tries within a second, for short faults; the supervisor waits out longer outages."""
-    return Retry(ExponentialBackoff(cap=0.5, base=0.1), 3)
+    other = "; a Redis with `requirepass` has the user default: redis://default@host" if user == USER else ""
+    return (
+        f"does not let in the user {user} ({reason}); check the password, in the URL or in a {PASSWORD_VARIABLE}{other}"
+    )
 
 
 def without_password(url: str) -> str:

@@ -66,10 +66,10 @@ def shorten(reason: str) -> str:
 
 def group_causes(failures: Mapping[str, Failure]) -> list[FailureCause]:
     """Failures by their cause, the most frequent first."""
-    grouped: dict[str, dict[str, Failure]] = {}
+    jobs: dict[str, dict[str, Failure]] = {}
     for name, failure in sorted(failures.items(), key=lambda item: (not item[1].set_aside, item[0])):
-        grouped.setdefault(_VARYING.sub("…", failure.reason), {})[name] = failure
-    return sorted((FailureCause(*found) for found in grouped.items()), key=lambda cause: -len(cause.jobs))
+        jobs.setdefault(_VARYING.sub("…", failure.reason), {})[name] = failure
+    return sorted((FailureCause(*cause) for cause in jobs.items()), key=lambda cause: -len(cause.jobs))
 
 
 def repeating_command(store: str | Path, name: str) -> str:
@@ -119,12 +119,12 @@ def count_failures(store: Store) -> dict[str, int]:
 
 def _times_ms(store: Store) -> dict[str, list[int]]:
     """When jobs failed, in milliseconds since 1970, as the names of the files tell."""
-    named = [found for file in store.storage.names(FAILURES_FOLDER) if (found := _FILE.fullmatch(file))]
-    retried = max((int(found[2]) for found in named if found[1] == RETRIED), default=-1)
+    matches = [match for file in store.storage.names(FAILURES_FOLDER) if (match := _FILE.fullmatch(file))]
+    retried = max((int(match[2]) for match in matches if match[1] == RETRIED), default=-1)
     failed: dict[str, list[int]] = {}
-    for found in named:
-        if is_job_name(found[1]) and int(found[2]) > retried:
-            failed.setdefault(found[1], []).append(int(found[2]))
+    for name, at_ms in ((match[1], int(match[2])) for match in matches):
+        if is_job_name(name) and at_ms > retried:
+            failed.setdefault(name, []).append(at_ms)
     return failed
 
 

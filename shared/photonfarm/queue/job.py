@@ -34,9 +34,9 @@ class RenderArguments(NamedTuple):
     @classmethod
     def of(cls, name: str) -> RenderArguments:
         """The arguments that a job's name stands for; raises QueueError for an invalid name."""
-        if not (found := _NAME.fullmatch(name)):
+        if not (match := _NAME.fullmatch(name)):
             raise QueueError(f"job {name[:64]!r}: a name is <scene id>-<number>")
-        return cls(found[1], int(found[2]))
+        return cls(match[1], int(match[2]))
 
 
 def is_job_name(name: str) -> bool:

@@ -25,7 +25,6 @@ LOCK_S = 10
 """How long one process at most fills the queue alone, and how long a killed one holds the others up. If it takes
 longer, another one may queue a job twice, and the first commit stays."""
 
-_LOCK = "rq:photonfarm:reconcile"
 LOOKED = "rq:photonfarm:looked:"
 
 Look = Literal["queued", "waits", "nothing"]
@@ -51,14 +50,14 @@ def fill_seldom(store: Store, connection: Redis, *, scene_id: str | None = None,
     with redis_errors("asked what is missing"):
         if known := connection.get(key):
             return "waits" if known == b"waits" else "nothing"
-        found = _fill_alone(store, connection, scene_id)
-        if found is None:
+        filled = _fill_alone(store, connection, scene_id)
+        if filled is None:
             return "waits"
-        if found.queued:
+        if filled.queued:
             return "queued"
-        outcome: Look = "waits" if found.under_way else "nothing"
-        connection.set(key, outcome, px=int(1000 * every_s))
-        return outcome
+        look: Look = "waits" if filled.under_way else "nothing"
+        connection.set(key, look, px=int(1000 * every_s))
+        return look
 
 
 def reconcile(
@@ -73,13 +72,13 @@ def reconcile(
     Raises QueueError also if Redis fails or serves another store, StoreError if the store or the one scene cannot be
     read.
     """
-    found = _fill_alone(store, connection, scene_id, wait_s, retry=retry)
-    if found is None:
+    filled = _fill_alone(store, connection, scene_id, wait_s, retry=retry)
+    if filled is None:
         raise QueueError(
             f"another process has been filling the queue for {wait_s:g} s, so this one has queued and retried "
             "nothing; try again"
         )
-    return found.queued
+    return filled.queued
 
 
 class _Filled(NamedTuple):
@@ -93,7 +92,7 @@ def _fill_alone(
     """What `reconcile` has done; None if another process still fills the queue after `wait_s`. Raises as that does."""
     serve(connection, store)
     with redis_errors("filled with what is missing"):
-        lock = connection.lock(_LOCK, timeout=LOCK_S)
+        lock = connection.lock("rq:photonfarm:reconcile", timeout=LOCK_S)
         if not lock.acquire(blocking=wait_s > 0, blocking_timeout=wait_s):
             return None
         try:
@@ -110,16 +109,15 @@ def _fill(store: Store, connection: Redis, only: str | None) -> _Filled:
     fail_lost(queue)
     queued = queue.get_job_ids()
     under_way = {*queued, *(entry.partition(":")[0] for entry in read_started(connection))}
-    failed = set(queue.failed_job_registry.get_job_ids(cleanup=False))
-    busy = under_way | failed
-    held = Counter(name.rpartition("-")[0] for name in queued)
+    busy = under_way.union(queue.failed_job_registry.get_job_ids(cleanup=False))
+    queued_of = Counter(name.rpartition("-")[0] for name in queued)
     missing = _missing(store, only)  # after the rest: what has left the queue since is committed
     wanted = [
         (scene_id, job)
         for scene_id, jobs in missing.items()
         for job in islice(
             (job for job in jobs if job_name(scene_id, job) not in busy),
-            max(QUEUE_LIMIT - held[scene_id], 0),
+            max(QUEUE_LIMIT - queued_of[scene_id], 0),
         )
     ]
     add(queue, wanted)

@@ -155,16 +155,15 @@ def fail_of_worker(connection: Redis, worker: str, reason: str, *, counts: bool)
 
 def read_failures(queue: Queue) -> dict[str, Failure]:
     """The jobs that are set aside, by name."""
-    names = queue.failed_job_registry.get_job_ids(cleanup=False)
+    names = [name for name in queue.failed_job_registry.get_job_ids(cleanup=False) if is_job_name(name)]
     with queue.connection.pipeline(transaction=False) as pipeline:
         for name in names:
             pipeline.xrevrange(Result.get_key(name), count=1)
-        found = pipeline.execute()
-    reasons = [
-        Result.restore(name, last[0][0].decode(), last[0][1], queue.connection).exc_string if last else "unknown"
-        for name, last in zip(names, found, strict=True)
-    ]
-    return {name: Failure(str(reason), TRIES) for name, reason in zip(names, reasons, strict=True) if is_job_name(name)}
+        failures = {}
+        for name, last in zip(names, pipeline.execute(), strict=True):
+            result = Result.restore(name, last[0][0].decode(), last[0][1], queue.connection) if last else None
+            failures[name] = Failure(str(result.exc_string) if result else "unknown", TRIES)
+    return failures
 
 
 def forget_failures(queue: Queue, scene_id: str = "") -> None:

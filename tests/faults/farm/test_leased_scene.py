@@ -7,8 +7,9 @@ from types import ModuleType
 import pytest
 
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.queue import TRIES, connect, queue_status
-from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.queue.connection import connect
+from photonfarm.queue.job import TRIES
+from photonfarm.queue.rq_adapter import open_queue, queue_status
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.model.lease import hold_lease
 

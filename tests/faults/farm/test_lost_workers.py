@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.queue import TRIES, connect, queue_status, read_kept_failures
-from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.queue.connection import connect
+from photonfarm.queue.failures import read_kept_failures
+from photonfarm.queue.job import TRIES
+from photonfarm.queue.rq_adapter import open_queue, queue_status
 from photonfarm.renderer.worker.settings import GRACE_S
 from photonfarm.store import SceneReader, SceneStore, Store
 

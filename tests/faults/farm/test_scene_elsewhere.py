@@ -40,15 +40,15 @@ def test_files_that_come_later_are_found_by_a_worker_that_is_at_work(
 ) -> None:
     code = """
 import runpy, sys
-from photonfarm.renderer.worker import outcomes
-outcomes.NOT_HERE_S = 3.0
+from photonfarm.renderer.worker import child
+child.NOT_HERE_S = 3.0
 sys.argv = sys.argv[1:]
 runpy.run_path(sys.argv[0], run_name="__main__")
 """
     log, child = tmp_path / "log", (sys.executable, "-c", code, *analytic.command()[1:])
     with analytic.start_worker(store.root, redis_server.url, child, log) as running:
         try:
-            analytic.wait_for(lambda: "leaves scene" in log.read_text(), 120)
+            analytic.wait_for(lambda: "takes no jobs of scene" in log.read_text(), 120)
             assert elsewhere.missing_jobs() == [0]
             file.write_text(XML)
             analytic.wait_for(lambda: not elsewhere.missing_jobs(), 60)

@@ -12,7 +12,9 @@ from pydantic import ValidationError
 from photonfarm.cli.farm_verbs import status
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, queue_status, report_consumed
+from photonfarm.queue.connection import connect
+from photonfarm.queue.rq_adapter import queue_status
+from photonfarm.queue.workers import report_consumed
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import AHEAD_LOOK_S, TrainerPace

@@ -13,8 +13,10 @@ import pytest
 
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, job_name, queue_status, reconcile
-from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.queue.connection import connect
+from photonfarm.queue.job import job_name
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.rq_adapter import open_queue, queue_status
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.store import SceneReader, SceneStore, Store

@@ -13,7 +13,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect
+from photonfarm.queue.connection import connect
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.backpressure import TrainerPace
 from photonfarm.store import SceneStore, Store, store_status

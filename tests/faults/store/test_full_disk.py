@@ -18,7 +18,8 @@ import pytest
 from photonfarm.core.errors import StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, queue_status
+from photonfarm.queue.connection import connect
+from photonfarm.queue.rq_adapter import queue_status
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.worker.backpressure import is_full
 from photonfarm.store import SceneReader, SceneStore, Store

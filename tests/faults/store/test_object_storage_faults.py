@@ -23,7 +23,8 @@ from obstore.store import from_url
 from photonfarm.core.errors import StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import PlannedRows, Request
-from photonfarm.queue import connect, reconcile
+from photonfarm.queue.connection import connect
+from photonfarm.queue.reconciliation import reconcile
 from photonfarm.renderer.tools import doctor
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.io import object_requests

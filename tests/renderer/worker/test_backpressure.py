@@ -13,7 +13,8 @@ from click.testing import CliRunner
 from photonfarm.core.errors import StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, queue_status
+from photonfarm.queue.connection import connect
+from photonfarm.queue.rq_adapter import queue_status
 from photonfarm.renderer.cli import machine_verbs
 from photonfarm.renderer.worker import backpressure
 from photonfarm.renderer.worker.backpressure import FULL_S, DiskReserve, is_full

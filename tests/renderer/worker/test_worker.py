@@ -1,7 +1,6 @@
 """The worker as a whole: real queue, real store, real processes; only the scene is analytic."""
 
 import json
-import re
 import sys
 import threading
 import time
@@ -12,17 +11,20 @@ from types import ModuleType
 import pytest
 import queue_samples
 
-from photonfarm import queue
 from photonfarm.cli.farm_verbs import status
 from photonfarm.core.errors import BackendError, IncompleteError, QueueError, StoreError
 from photonfarm.core.processes import Stop
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, job_name, queue_status
+from photonfarm.queue.connection import connect
+from photonfarm.queue.failures import read_kept_failures
+from photonfarm.queue.job import TRIES, job_name
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.rq_adapter import queue_status
+from photonfarm.queue.workers import Activity, WorkerReport, read_workers
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.renderer.worker.source import QueueSource
-from photonfarm.renderer.worker.supervisor import ChildOutput, ending
-from photonfarm.renderer.worker.worker import check, render_job, run_worker
+from photonfarm.renderer.worker.worker import ChildOutput, check, ending, render_job, run_worker
 from photonfarm.scene.spec import Source
 from photonfarm.store import SceneStore, Store, store_status
 
@@ -65,8 +67,8 @@ def test_a_worker_says_at_its_end_what_all_its_children_have_done(
         quiet=quiet,
         **QUICK,
     )
-    summary = r"worker ada: ended: 2 jobs done, 6 samples, \d+ s"
-    assert [bool(re.fullmatch(summary, line)) for line in said] == ([] if quiet else [True])
+    summary = "worker ada: ended: 2 jobs done"
+    assert said == ([] if quiet else [summary])
 
 
 @pytest.mark.parametrize("limit", [{"max_jobs": 1}, {"max_rss_bytes": 1}])
@@ -97,8 +99,8 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
     with pytest.raises(IncompleteError):
         run_worker(root, redis_server.url, child=analytic.command(0, "broken"), **QUICK)
     failed = queue_status(connection).failed
-    assert {name: failure.times for name, failure in failed.items()} == dict.fromkeys(names, queue.TRIES)
-    assert queue.read_kept_failures(Store(root)) == failed
+    assert {name: failure.times for name, failure in failed.items()} == dict.fromkeys(names, TRIES)
+    assert read_kept_failures(Store(root)) == failed
     command = f"photonfarm work --store {root} --scene {scene.scene_id} --job 0"
     assert command in capfd.readouterr().err
 
@@ -123,7 +125,7 @@ def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and
     status.callback(root, redis_server.url, as_json=True)
     (cause,) = json.loads(capfd.readouterr().out)["queue"]["failures"]
     assert [job["name"] for job in cause["jobs"]] == names[1:], "what has been committed since has not failed"
-    assert queue.reconcile(Store(root), connection, retry=True) == 1
+    assert reconcile(Store(root), connection, retry=True) == 1
 
 
 @pytest.mark.parametrize(
@@ -150,7 +152,7 @@ def test_a_worker_for_one_scene_leaves_the_others_of_the_store_alone(
 ) -> None:
     store = Store(tmp_path / "store")
     other = store.scene(store.plan(analytic.small_spec(points=17), Request(modifications=6), shard_rows=3).scene_id)
-    queue.reconcile(store, connect(redis_server.url), scene_id=other.scene_id)
+    reconcile(store, connect(redis_server.url), scene_id=other.scene_id)
     run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), scene_id=scene.scene_id, **QUICK)
     assert scene.missing_jobs() == []
     assert other.missing_jobs() == [0, 1]
@@ -169,7 +171,7 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     elsewhere = analytic.small_spec().model_copy(update={"scene": Source(file="gone.xml")})
     other = store.scene(store.plan(elsewhere, Request(modifications=9), shard_rows=3).scene_id)
     for told in (other, scene):
-        queue.reconcile(store, connection, scene_id=told.scene_id)
+        reconcile(store, connection, scene_id=told.scene_id)
     with pytest.raises(BackendError):
         run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), **QUICK)
     assert scene.missing_jobs() == []
@@ -177,7 +179,7 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     status = queue_status(connection)
     assert (status.queued, status.failed) == (3, {}), "for workers that have the files"
     said = capfd.readouterr().err
-    assert said.count("leaves scene") == 1
+    assert said.count("takes no jobs of scene") == 1
     assert "Traceback" not in said
 
     assert queue_status(connection).left == {}, "said while it works only"
@@ -187,7 +189,7 @@ def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
     scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     left = {scene.scene_id: "gone.xml is not there", "ab" * 16: "another store's"}
-    queue_samples.told(connect(redis_server.url), "ada", queue.WorkerReport(paused="the disk is full", left=left))
+    queue_samples.told(connect(redis_server.url), "ada", WorkerReport(paused="the disk is full", left=left))
     status.callback(tmp_path / "store", redis_server.url, as_json=False)
     said = capsys.readouterr().out
     assert "gone.xml is not there" in said
@@ -202,14 +204,14 @@ def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
 ) -> None:
     monkeypatch.setattr(f"{QueueSource.__module__}.REPORT_S", 0.02)
     connection, store = connect(redis_server.url), Store(tmp_path / "store")
-    queue.reconcile(store, connection)
+    reconcile(store, connection)
     settings = WorkerSettings(store=str(store.root), redis_url=redis_server.url, name="ada", idle_s=1)
     source = QueueSource(settings, store, Stop())
     with source.open():
         job = source.take(None, {})
         name = job_name(*job)
-        source.tell_doing(queue.Activity("renders samples", 3, 8, name))
-        wanted = {"ada": queue.Activity("renders samples", 3, 8, name)}
+        source.tell_doing(Activity("renders samples", 3, 8, name))
+        wanted = {"ada": Activity("renders samples", 3, 8, name)}
         assert _once(lambda: queue_status(connection).activities == wanted)
         connection.flushall()
         assert _once(lambda: queue_status(connection).running == 1), "what Redis has lost is told again"
@@ -240,13 +242,13 @@ def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_al
     analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     connection, said = connect(redis_server.url), []
-    queue_samples.told(connection, "ada", queue.WorkerReport(host="another-machine", process=7))
+    queue_samples.told(connection, "ada", WorkerReport(host="another-machine", process=7))
     run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), report=said.append, **QUICK)
     assert scene.missing_jobs() == []
     assert scene.marker(0)["figures"]["worker"] == "ada-2"
     assert "ada-2" in said[0]
-    assert re.fullmatch(r"worker ada-2: ended: 2 jobs done, 6 samples, \d+ s", said[1])
-    assert list(queue.read_workers(connection)) == ["ada"]
+    assert said[1] == "worker ada-2: ended: 2 jobs done"
+    assert list(read_workers(connection)) == ["ada"]
 
 
 def test_no_redis_is_told_before_anything_is_started(analytic: ModuleType, scene: SceneStore, tmp_path: Path) -> None:
@@ -305,10 +307,10 @@ def test_a_store_that_refuses_a_commit_ends_the_worker_and_fails_no_job(
 
 def test_whether_a_worker_of_this_machine_is_alive_can_be_asked(redis_server: EmbeddedRedis) -> None:
     connection = connect(redis_server.url)
-    queue_samples.told(connection, "far", queue.WorkerReport(host="another-machine", process=7))
+    queue_samples.told(connection, "far", WorkerReport(host="another-machine", process=7))
     with pytest.raises(IncompleteError):
         check(redis_server.url)
-    queue_samples.told(connection, "near", queue.WorkerReport())
+    queue_samples.told(connection, "near", WorkerReport())
     check(redis_server.url)
 
 
@@ -318,7 +320,7 @@ def test_a_job_is_overdue_whether_or_not_the_dump_of_its_stacks_crashed(code: in
     stacks = ["Thread 0x1 (most recent call first):\n  File a, line 1 in beat", "Thread 0x2\n  File b, line 2 in job"]
     written = f"{JOB_IN_HAND}some-3\nTimeout (0:00:04)!\n" + "\n".join(stacks if code == 1 else stacks[:1])
     output = ChildOutput.of(written)
-    assert (output.overdue, output.in_hand) == ("some-3", True)
+    assert (output.timed_out, output.in_hand) == (True, "some-3")
     told = ending(code, output, 4.0)
     assert told.startswith("job some-3 took longer than --deadline 4 s and was ended")
     assert ("line 2 in job" in told, "line 1" in told) == (code == 1, False)

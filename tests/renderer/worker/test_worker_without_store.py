@@ -8,13 +8,15 @@ from types import ModuleType
 
 import pytest
 
-from photonfarm import queue
 from photonfarm.core.errors import StoreError
 from photonfarm.core.processes import process_space
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, job_name, queue_status, read_workers
-from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.queue.connection import connect
+from photonfarm.queue.job import job_name
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.rq_adapter import open_queue, queue_status
+from photonfarm.queue.workers import OtherStoreError, read_workers
 from photonfarm.renderer.worker.worker import check, run_worker
 from photonfarm.store import SceneStore, Store
 
@@ -33,9 +35,9 @@ def test_a_worker_for_another_store_is_refused_and_the_queue_keeps_its_jobs(
     analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     connection, store = connect(redis_server.url), Store(tmp_path / "store")
-    queue.reconcile(store, connection)
+    reconcile(store, connection)
     Store(tmp_path / "typo", create=True)
-    with pytest.raises(queue.OtherStoreError):
+    with pytest.raises(OtherStoreError):
         run_worker(tmp_path / "typo", redis_server.url, child=analytic.command(), **QUICK)
     assert queue_status(connection).queued == 2
     assert queue_status(connection).workers == 0
@@ -46,7 +48,7 @@ def test_a_store_that_vanishes_under_a_worker_ends_it_and_the_queue_keeps_its_jo
     analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, in_its_place: str
 ) -> None:
     root, connection = tmp_path / "store", connect(redis_server.url)
-    queue.reconcile(Store(root), connection)
+    reconcile(Store(root), connection)
     code = f"""
 import runpy, sys
 from pathlib import Path

@@ -8,7 +8,7 @@ import pytest
 from photonfarm.cli.main import main
 from photonfarm.farm import watch
 from photonfarm.farm.progress import QueueProgress
-from photonfarm.queue import has_password
+from photonfarm.queue.connection import has_password
 from photonfarm.store import Store
 
 SECRET = "hunter2"

@@ -12,7 +12,6 @@ import pytest
 import redis
 from click.testing import CliRunner
 
-from photonfarm import queue
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import QueueError
 from photonfarm.farm.redis_server import EmbeddedRedis
@@ -36,7 +35,7 @@ def test_the_doctor_tells_of_a_redis_that_fails(monkeypatch: pytest.MonkeyPatch)
         def info(self, _: str) -> None:
             raise redis.exceptions.NoPermissionError("no permissions to run the 'info' command")
 
-    monkeypatch.setattr(queue, "connect", lambda _: Failing())
+    monkeypatch.setattr("photonfarm.queue.connection.connect", lambda _: Failing())
     found = doctor._try("Redis", lambda: doctor._reaches("redis://h:1/0"))
     assert (found.works, found.exit_code) == (False, QueueError.exit_code)
     assert "no permissions" in found.detail

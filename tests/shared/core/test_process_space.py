@@ -10,15 +10,16 @@ import pytest
 import queue_samples
 import redis
 
-from photonfarm import queue
 from photonfarm.core.processes import process_space
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.queue import WorkerReport
+from photonfarm.queue.connection import connect
+from photonfarm.queue.rq_adapter import queue_status
+from photonfarm.queue.workers import WorkerReport, bury, read_workers, take_name
 
 
 @pytest.fixture
 def connection(tmp_path: Path) -> Iterator[redis.Redis]:
-    with EmbeddedRedis(tmp_path / "redis") as running, queue.connect(running.url) as connected:
+    with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as connected:
         yield connected
 
 
@@ -36,9 +37,9 @@ def test_a_worker_in_another_container_of_the_same_host_name_keeps_its_name(
     other = f"{os.uname().nodename}-0123abcd4026531836"
     for process in (gone(), os.getpid()):
         queue_samples.told(connection, "ada", WorkerReport(host=other, process=process))
-        assert queue.take_name(connection, "ada", ttl_s=60) == "ada-2"
-        assert list(queue.read_workers(connection)) == ["ada", "ada-2"]
-        queue.bury(connection, "ada-2")
+        assert take_name(connection, "ada", ttl_s=60) == "ada-2"
+        assert list(read_workers(connection)) == ["ada", "ada-2"]
+        bury(connection, "ada-2")
 
 
 def test_a_worker_that_was_killed_here_is_not_counted_while_its_heartbeat_lasts_and_leaves_its_name_at_once(
@@ -47,8 +48,8 @@ def test_a_worker_that_was_killed_here_is_not_counted_while_its_heartbeat_lasts_
     queue_samples.told(connection, "killed", WorkerReport(process=gone()))
     queue_samples.told(connection, "alive", WorkerReport(process=os.getppid()))
     queue_samples.told(connection, "elsewhere", WorkerReport(host="another-machine", process=gone()))
-    assert queue.queue_status(connection).workers == 2
-    assert queue.take_name(connection, "killed", ttl_s=60) == "killed"
+    assert queue_status(connection).workers == 2
+    assert take_name(connection, "killed", ttl_s=60) == "killed"
 
 
 def test_a_process_space_is_the_same_for_every_process_in_it_and_begins_with_the_hosts_name() -> None:

@@ -14,7 +14,7 @@ import pytest
 
 from photonfarm.core.errors import QueueError
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.queue import connect
+from photonfarm.queue.connection import connect
 
 
 def alive(pid: int) -> bool:

@@ -15,7 +15,6 @@ import store_samples as samples
 from click.testing import CliRunner
 from rich.console import Console
 
-from photonfarm import queue
 from photonfarm.cli.main import umbrella
 from photonfarm.cli.show_farm import describe_farm, draw_farm, list_lines
 from photonfarm.core.errors import QueueError
@@ -26,6 +25,10 @@ from photonfarm.farm.training import RunFolder
 from photonfarm.farm.watch import STEADY_S, FarmWatch, read_queue
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
+from photonfarm.queue.failures import keep_failure, repeating_command
+from photonfarm.queue.job import job_name
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.workers import Activity, WorkerReport
 from photonfarm.store import SceneStore, Store
 
 
@@ -54,10 +57,10 @@ def test_progress_pace_and_time_left_are_of_what_workers_have_in_hand_too(
     (before,) = watch.look().scenes
     assert (before.samples, before.status.jobs_committed, before.rate, before.left_s) == ((0, 8), 0, None, None)
     samples.commit(scene, 0, samples.outputs(scene, 0))
-    doing = queue.Activity("renders samples", 1, 2, queue.job_name(scene.scene_id, 1))
-    stranger = queue.Activity("renders samples", 5, 9, f"{'ab' * 16}-1")
+    doing = Activity("renders samples", 1, 2, job_name(scene.scene_id, 1))
+    stranger = Activity("renders samples", 5, 9, f"{'ab' * 16}-1")
     for worker, does in (("ada", doing), ("eve", stranger)):
-        queue_samples.told(connection, worker, queue.WorkerReport(host="elsewhere", process=1, doing=does))
+        queue_samples.told(connection, worker, WorkerReport(host="elsewhere", process=1, doing=does))
     now[0] = STEADY_S * 2
     farm = watch.look()
     (found,) = farm.scenes
@@ -72,7 +75,7 @@ def test_progress_pace_and_time_left_are_of_what_workers_have_in_hand_too(
     for each in scene.missing_jobs()[:-1]:
         samples.commit(scene, each, samples.outputs(scene, each))
     reported = replace(doing, done=9, total=9)
-    queue_samples.told(connection, "ada", queue.WorkerReport(host="elsewhere", process=1, doing=reported))
+    queue_samples.told(connection, "ada", WorkerReport(host="elsewhere", process=1, doing=reported))
     assert watch.look().scenes[0].in_hand == 2, "no more than are missing, as a report may be seconds old"
 
 
@@ -127,11 +130,11 @@ def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
 ) -> None:
     said = status("--store", str(store.root), "--redis", common_redis.url).stdout
     assert "8 samples wait for a worker" in said
-    queue.reconcile(store, connection)
+    reconcile(store, connection)
     name = queue_samples.failed(connection, "ValueError: 7 is odd")
-    queue.keep_failure(store, name, "ValueError: 7 is odd", worker="ada")
+    keep_failure(store, name, "ValueError: 7 is odd", worker="ada")
     left = {scene.scene_id: "room.xml is missing"}
-    idle = queue.WorkerReport(host="elsewhere", process=1, paused="the disk is full", left=left)
+    idle = WorkerReport(host="elsewhere", process=1, paused="the disk is full", left=left)
     for worker in ("ada", "bob"):
         queue_samples.told(connection, worker, idle)
     farm = FarmWatch(store, common_redis.url).look()
@@ -145,12 +148,12 @@ def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
         ),
     ]
     assert farm.queue.kept == [], "a failure that Redis knows is not told twice"
-    assert f"      to repeat one: {queue.repeating_command(store.root, name)}" in list_lines(farm, store.root)
+    assert f"      to repeat one: {repeating_command(store.root, name)}" in list_lines(farm, store.root)
 
 
 def test_failures_outlive_redis_until_their_job_is_committed(scene: SceneStore, store: Store, tmp_path: Path) -> None:
-    name = queue.job_name(scene.scene_id, 1)
-    queue.keep_failure(store, name, "ValueError: 7", worker="ada")
+    name = job_name(scene.scene_id, 1)
+    keep_failure(store, name, "ValueError: 7", worker="ada")
     found = read_queue(store, f"unix://{tmp_path}/none")
     assert found.status is None
     assert [list(cause.jobs) for cause in found.kept] == [[name]]
@@ -164,7 +167,7 @@ def test_a_redis_that_fails_on_the_way_ends_no_watch(
     def fail(*_: Any) -> None:
         raise redis.TimeoutError("Timeout reading from socket")
 
-    monkeypatch.setattr(queue, "check_served", fail)
+    monkeypatch.setattr("photonfarm.queue.workers.check_served", fail)
     farm = FarmWatch(store, common_redis.url).look()
     assert "Timeout reading from socket" in farm.describe_queue()
     assert farm.scenes[0].samples == (0, 8)
@@ -183,7 +186,7 @@ def test_status_finds_the_redis_of_an_up_that_is_at_work_here(
 ) -> None:
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
-    queue_samples.told(connection, "ada", queue.WorkerReport(host="elsewhere", process=1))
+    queue_samples.told(connection, "ada", WorkerReport(host="elsewhere", process=1))
     with announce(store, redis_url=common_redis.url, run=tmp_path / "run", web="http://localhost:1/"):
         found = json.loads(status("--json").stdout)
         assert found["queue"]["workers"] == 1
@@ -201,7 +204,7 @@ def test_without_a_redis_who_named_none_hears_whether_workers_are_at_work(
 
     monkeypatch.delenv("PHOTONFARM_REDIS_URL", raising=False)
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("photonfarm.queue.connect", refuse)
+    monkeypatch.setattr("photonfarm.queue.connection.connect", refuse)
     done = status()
     assert done.exit_code == 0
     assert "no Redis" not in done.output

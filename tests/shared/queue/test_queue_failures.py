@@ -9,9 +9,17 @@ import redis
 from redis.connection import AbstractConnection as Connection
 from rq.results import Result
 
-from photonfarm import queue
-from photonfarm.queue import TRIES, Failure, job_name, queue_status, reconcile
-from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.queue.failures import (
+    Failure,
+    count_failures,
+    group_causes,
+    keep_failure,
+    keep_retry,
+    read_kept_failures,
+)
+from photonfarm.queue.job import TRIES, job_name
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.rq_adapter import open_queue, queue_status
 from photonfarm.store import SceneStore, Store
 
 scene = queue_samples.scene
@@ -44,7 +52,7 @@ def test_many_failures_are_read_in_a_few_requests(connection: redis.Redis, store
 
 
 def test_failures_are_grouped_by_what_they_have_in_common() -> None:
-    first, *others = queue.group_causes(
+    first, *others = group_causes(
         {
             f"{SCENE_ID}-1": Failure(f"IncompleteError: half A of sample {'ab' * 16} came out non-finite 3 times", 1),
             f"{SCENE_ID}-2": Failure(
@@ -67,27 +75,27 @@ def test_a_failure_is_kept_in_the_store_until_it_is_retried_and_the_last_one_cou
 ) -> None:
     name = job_name(scene.scene_id, 1)
     for reason in ("ValueError: first", "ValueError: second\nand more"):
-        queue.keep_failure(store, name, reason, worker="ada")
+        keep_failure(store, name, reason, worker="ada")
         time.sleep(0.002)  # files are named by milliseconds
-    assert queue.read_kept_failures(Store(store.root)) == {name: Failure("ValueError: second and more", 2)}
-    assert queue.read_kept_failures(store, lambda _: False) == {}
-    assert queue.count_failures(store) == {name: 2}
-    queue.keep_retry(store)
+    assert read_kept_failures(Store(store.root)) == {name: Failure("ValueError: second and more", 2)}
+    assert read_kept_failures(store, lambda _: False) == {}
+    assert count_failures(store) == {name: 2}
+    keep_retry(store)
     time.sleep(0.002)
-    assert queue.read_kept_failures(store) == queue.count_failures(store) == {}
-    queue.keep_failure(store, name, "ValueError: third", worker="ada")
-    assert queue.count_failures(store) == {name: 1}
+    assert read_kept_failures(store) == count_failures(store) == {}
+    keep_failure(store, name, "ValueError: third", worker="ada")
+    assert count_failures(store) == {name: 1}
 
 
 def test_files_that_are_no_failures_do_no_harm(store: Store, scene: SceneStore) -> None:
     name = job_name(scene.scene_id, 0)
-    queue.keep_retry(store)
+    keep_retry(store)
     folder = scene.folder.parent.parent / "failures"
     assert not folder.exists() or not list(folder.iterdir()), "nothing is to be forgotten"
-    queue.keep_failure(store, name, "ValueError", worker="ada")
+    keep_failure(store, name, "ValueError", worker="ada")
     (folder / f"{scene.scene_id}-007.1.json").write_text("{}")  # no name of a job
     (folder / "notes.txt").write_text("mine")
     (kept,) = folder.glob("*-0.*.json")
     assert json.loads(kept.read_text())["job"] == name
     kept.write_text("[" * 100_000)
-    assert list(queue.read_kept_failures(store)) == [name]
+    assert list(read_kept_failures(store)) == [name]

@@ -12,9 +12,17 @@ from rq.job import Job
 from rq.serializers import JSONSerializer
 
 from photonfarm.core.errors import QueueError
-from photonfarm.queue import TRIES, RenderArguments, queue_status
-from photonfarm.queue.job import FUNCTION
-from photonfarm.queue.rq_adapter import add, fail, fail_lost, fail_of_worker, finish, keep_alive, open_queue
+from photonfarm.queue.job import FUNCTION, TRIES, RenderArguments
+from photonfarm.queue.rq_adapter import (
+    add,
+    fail,
+    fail_lost,
+    fail_of_worker,
+    finish,
+    keep_alive,
+    open_queue,
+    queue_status,
+)
 
 SCENE_ID, NAME = queue_samples.SCENE_ID, queue_samples.NAME
 OTHER_ID = "ab" * 16

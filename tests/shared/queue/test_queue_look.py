@@ -8,7 +8,8 @@ import redis
 import store_samples as samples
 
 from photonfarm.plan.request import Request
-from photonfarm.queue import fill_seldom, reconcile, reconciliation
+from photonfarm.queue import reconciliation
+from photonfarm.queue.reconciliation import fill_seldom, reconcile
 from photonfarm.queue.rq_adapter import fail_of_worker
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.io.local import LocalStorage

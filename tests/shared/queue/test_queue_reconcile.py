@@ -12,9 +12,11 @@ from rq.serializers import JSONSerializer
 from photonfarm.core.errors import QueueError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, job_name, queue_status, reconcile, reconciliation
-from photonfarm.queue.job import FUNCTION
-from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.queue import reconciliation
+from photonfarm.queue.connection import connect
+from photonfarm.queue.job import FUNCTION, job_name
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.rq_adapter import open_queue, queue_status
 from photonfarm.store import SceneStore, Store
 
 scene = queue_samples.scene

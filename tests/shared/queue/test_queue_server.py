@@ -17,13 +17,15 @@ import redis
 from redis.backoff import NoBackoff
 from redis.retry import Retry
 
-from photonfarm import queue
 from photonfarm.core.errors import QueueError
 from photonfarm.farm import submission
 from photonfarm.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.plan.request import Request
-from photonfarm.queue import add_password, connect, fill_seldom, queue_status, reconcile, rq_adapter
-from photonfarm.queue.rq_adapter import open_queue
+from photonfarm.queue import rq_adapter
+from photonfarm.queue.connection import RefusedError, add_password, connect
+from photonfarm.queue.reconciliation import fill_seldom, reconcile
+from photonfarm.queue.rq_adapter import open_queue, queue_status
+from photonfarm.queue.workers import bury, release, report_consumed, take_name
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import SceneStore, Store
 
@@ -36,7 +38,7 @@ COMPOSE = Path(__file__).parents[3] / "docker-compose.yml"
 @pytest.fixture(autouse=True)
 def at_the_first_try(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is refused, or not there, is told without the three tries more that take a second."""
-    monkeypatch.setattr(queue.connection, "_retry", lambda: Retry(NoBackoff(), 0))
+    monkeypatch.setattr("photonfarm.queue.connection.RETRY", Retry(NoBackoff(), 0))
 
 
 # ------------------------------------------------------------------------------------------------------- permissions
@@ -116,9 +118,9 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
     port, password = guarded
     with connect(add_password(password, f"redis://127.0.0.1:{port}/0")) as limited:
         assert reconcile(store, limited) == 10
-        assert queue.take_name(limited, "worker", ttl_s=60) == "worker"
-        assert queue.take_name(limited, "worker", ttl_s=60) == "worker-2"
-        queue.report_consumed(limited, SCENE_ID, 1)
+        assert take_name(limited, "worker", ttl_s=60) == "worker"
+        assert take_name(limited, "worker", ttl_s=60) == "worker-2"
+        report_consumed(limited, SCENE_ID, 1)
         assert fill_seldom(store, limited, every_s=60) == "waits"
         rq_adapter.finish(rq_adapter.open_queue(limited), queue_samples.taken(limited))
         queue_samples.failed(limited, "broken")
@@ -127,8 +129,8 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
         assert (status.queued, status.running, status.workers, len(status.failed)) == (8, 0, 2, 1)
         assert reconcile(store, limited, retry=True) == 2
         for name in ("worker", "worker-2"):
-            queue.bury(limited, name)
-        queue.release(limited, store)
+            bury(limited, name)
+        release(limited, store)
         forbidden = (
             ("FLUSHALL",),
             ("CONFIG", "GET", "dir"),
@@ -159,7 +161,7 @@ def test_a_cluster_is_refused_with_a_sentence(store: Store, scene: SceneStore, t
             connection.execute_command("CLUSTER", "ADDSLOTSRANGE", "0", "16383")
             while b"cluster_state:ok" not in connection.execute_command("CLUSTER", "INFO"):
                 assert time.monotonic() < deadline
-            with pytest.raises(queue.RefusedError, match="without cluster mode"):
+            with pytest.raises(RefusedError, match="without cluster mode"):
                 reconcile(store, connection)
         finally:
             process.terminate()
@@ -187,7 +189,7 @@ def test_an_autoscaler_may_count_what_waits_and_what_was_started(
         assert [lengths(keys=[key]) for key in (waiting, started)] == [len(jobs), 1]
         assert len(jobs) > 0
         limited.delete(waiting, started)
-        queue.release(limited, store)
+        release(limited, store)
 
 
 def test_the_health_check_of_the_compose_file_shows_the_password_to_nobody(

@@ -9,9 +9,9 @@ import pytest
 import queue_samples
 import redis
 
-from photonfarm import queue
 from photonfarm.farm.redis_server import EmbeddedRedis
-from photonfarm.queue import connect
+from photonfarm.queue.connection import connect
+from photonfarm.queue.workers import SERVED, OtherStoreError, WorkerReport, check_served, serve
 from photonfarm.store import Store
 
 
@@ -22,8 +22,8 @@ def connection(tmp_path: Path) -> Iterator[redis.Redis]:
 
 
 def refusal(connection: redis.Redis, store: Store) -> str:
-    with pytest.raises(queue.OtherStoreError) as caught:
-        queue.serve(connection, store)
+    with pytest.raises(OtherStoreError) as caught:
+        serve(connection, store)
     return str(caught.value)
 
 
@@ -38,15 +38,15 @@ def test_another_store_takes_over_when_the_time_that_it_was_told_is_over(
 ) -> None:
     """The owner was killed, and its heartbeat and its word stay behind."""
     store, other = (Store(tmp_path / name, create=True) for name in ("store", "other"))
-    queue.serve(connection, store)
-    queue_samples.told(connection, "killed", queue.WorkerReport(host="elsewhere", process=1))
+    serve(connection, store)
+    queue_samples.told(connection, "killed", WorkerReport(host="elsewhere", process=1))
     assert 110 <= seconds_told(refusal(connection, other)) <= 120
-    connection.pexpire(queue.SERVED, 1500)
+    connection.pexpire(SERVED, 1500)
     left_s = seconds_told(refusal(connection, other))
     assert left_s in (1, 2)
     time.sleep(left_s)
-    queue.check_served(connection, other)
-    queue.serve(connection, other)
+    check_served(connection, other)
+    serve(connection, other)
     assert other.store_id in refusal(connection, store)
 
 
@@ -54,8 +54,8 @@ def test_the_embedded_redis_of_a_run_remembers_its_store_and_the_time_that_is_le
     """`photonfarm up` with another store in the --run of one that was killed waits no longer than that."""
     store, other = (Store(tmp_path / name, create=True) for name in ("store", "other"))
     with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as connection:
-        queue.serve(connection, store)
-        connection.expire(queue.SERVED, 60)
+        serve(connection, store)
+        connection.expire(SERVED, 60)
     with EmbeddedRedis(tmp_path / "redis") as running, connect(running.url) as connection:
         assert 0 < seconds_told(refusal(connection, other)) <= 60
-        queue.serve(connection, store)
+        serve(connection, store)

@@ -13,7 +13,8 @@ import pytest
 from photonfarm.core.errors import IncompleteError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, read_consumed, serve
+from photonfarm.queue.connection import connect
+from photonfarm.queue.workers import read_consumed, serve
 from photonfarm.store import Store
 from photonfarm.trainer import service, train
 from photonfarm.trainer.runs.settings import TrainSettings

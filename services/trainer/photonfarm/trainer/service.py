@@ -304,13 +304,14 @@ def _report_use(
         nonlocal connection, refused
         if redis_url is None or used is None:
             return
-        from photonfarm import queue
+        from photonfarm.queue.connection import connect
+        from photonfarm.queue.workers import OtherStoreError, check_served, report_consumed
 
         try:
-            connection = connection or queue.connect(redis_url)
-            queue.check_served(connection, Store(store))
-            queue.report_consumed(connection, scene_id, used)
-        except queue.OtherStoreError as error:
+            connection = connection or connect(redis_url)
+            check_served(connection, Store(store))
+            report_consumed(connection, scene_id, used)
+        except OtherStoreError as error:
             if not refused:
                 log(f"used samples are not reported to workers: {error}")
             refused = str(error)

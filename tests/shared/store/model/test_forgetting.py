@@ -14,7 +14,8 @@ from click.testing import CliRunner
 from photonfarm.cli.store_verbs import forget as verb
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
-from photonfarm.queue import count_failures, job_name, keep_failure
+from photonfarm.queue.failures import count_failures, keep_failure
+from photonfarm.queue.job import job_name
 from photonfarm.store import JobWriter, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers

@@ -14,7 +14,9 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue import connect, queue_status, reconcile
+from photonfarm.queue.connection import connect
+from photonfarm.queue.reconciliation import reconcile
+from photonfarm.queue.rq_adapter import queue_status
 from photonfarm.store import JobWriter, SceneReader, SceneStore, Store, store_status
 from photonfarm.store.check.check import check_store
 from photonfarm.store.io.local import LocalStorage

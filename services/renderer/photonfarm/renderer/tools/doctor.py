@@ -137,7 +137,7 @@ def _starts_redis() -> str:
 def _reaches(url: str) -> str:
     from redis import RedisError
 
-    from photonfarm.queue import connect
+    from photonfarm.queue.connection import connect
 
     try:
         return f"version {connect(url).info('server')['redis_version']}"

@@ -13,9 +13,9 @@ from collections.abc import Callable
 
 from redis import Redis
 
-from photonfarm import queue
 from photonfarm.core.errors import store_errors
 from photonfarm.core.waiting import pause_after_look
+from photonfarm.queue.workers import read_consumed
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.io.local import LocalStorage
 from photonfarm.store.model.scene_store import Progress
@@ -48,9 +48,11 @@ class DiskReserve:
         """The reason why no job should be taken now, or None; raises StoreError if the store's folder is gone."""
         if self._clock() < self._refused_until:
             return "the disk is full; trying again now and then"
-        with store_errors("ask how much of the disk is free", str(self._root)):
-            free = None if self._root is None else shutil.disk_usage(self._root).free
-        if free is None or free >= self._reserve_bytes:
+        if self._root is None:
+            return None
+        with store_errors("ask how much of the disk is free", self._root):
+            free = shutil.disk_usage(self._root).free
+        if free >= self._reserve_bytes:
             return None
         return (
             f"{free / 1e9:.1f} GB are free on the disk of {self._root}, and {self._reserve_bytes / 1e9:g} GB are to "
@@ -60,7 +62,7 @@ class DiskReserve:
 
 def is_full(error: BaseException) -> bool:
     """Whether an error means that there is no space, on the disk or in a quota."""
-    cause = error.__cause__ if error.__cause__ is not None else error
+    cause = error.__cause__ or error
     return isinstance(cause, OSError) and cause.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -80,10 +82,7 @@ class TrainerPace:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Take the sources of both numbers. A ratio below 1 would stop all jobs, as no more is used than committed."""
-        self._store = store
-        self._connection = connection
-        self._ratio = ratio
-        self._scene_id = scene_id
+        self._store, self._connection, self._ratio, self._scene_id = store, connection, ratio, scene_id
         self._clock = clock
         self._due = 0.0
         self._ahead: dict[str, str] = {}
@@ -96,19 +95,17 @@ class TrainerPace:
             self._due = self._clock() + pause_after_look(self._clock() - began, AHEAD_LOOK_S)
         return self._ahead
 
-    def _progress(self) -> dict[str, Progress]:
-        """The progress of each scene, by its id; a scene that cannot be read holds back no jobs."""
-        if self._scene_id is None:
-            return self._store.each(_progress)[0]
-        return {self._scene_id: _progress(self._store.scene(self._scene_id))}
-
     def _find_ahead(self) -> dict[str, str]:
+        if self._scene_id is None:
+            progress = self._store.each(_progress)[0]  # a scene that cannot be read holds back no jobs
+        else:
+            progress = {self._scene_id: _progress(self._store.scene(self._scene_id))}
         committed = {
-            scene_id: progress.committed_samples
-            for scene_id, progress in self._progress().items()
-            if progress.committed_samples > AHEAD_MINIMUM and progress.committed_samples < progress.planned_samples
+            scene_id: scene.committed_samples
+            for scene_id, scene in progress.items()
+            if AHEAD_MINIMUM < scene.committed_samples < scene.planned_samples
         }
-        used = queue.read_consumed(self._connection, list(committed))
+        used = read_consumed(self._connection, list(committed))
         return {
             scene_id: f"{samples} samples are committed, and the trainer has used {used[scene_id]} "
             f"(--ahead {self._ratio:g})"

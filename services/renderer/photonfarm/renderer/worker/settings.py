@@ -1,4 +1,4 @@
-"""The settings of a worker; the command line passes them to the supervisor, which passes them to its child."""
+"""The settings of a worker, which its supervisor passes to its child, and what a child tells its supervisor."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 
 from photonfarm.core.errors import QueueError
 from photonfarm.core.models import Count, Frozen, Positive
-from photonfarm.queue import Share
+from photonfarm.queue.share import Share
 
 GRACE_S = 5.0
 """The seconds that a job in hand has to end after its worker was asked to stop.
@@ -17,17 +17,14 @@ So a job that is nearly done is kept, and the worker ends within the 10 s that D
 it has no marker, it is rendered again.
 """
 
-RECYCLED = 75
-"""The exit code of a child that wants to be replaced by a new one."""
+RECYCLED, REFUSED = 75, 76
+"""The exit codes of a child that wants to be replaced by a new one, and of one whose Redis would refuse that one too"""
 
-REFUSED = 76
-"""The exit code of a child whose Redis refuses what it would refuse its successor too."""
+JOB_IN_HAND, JOB_ENDED = "job in hand: ", "job ended: "
+"""How lines begin in which a child reports the job that it begins, by its name, and how it has ended.
 
-JOB_IN_HAND = "job in hand: "
-"""The prefix of the line in which a child reports the job that it begins; the job's name follows."""
-
-JOBS_SO_FAR = "so far: "
-"""The prefix of the line in which a child reports its jobs so far; the numbers of `JobCounts` follow."""
+It is "done", put back ("again"), "failed", or "left" to another worker.
+"""
 
 LOG_FORMAT = "%(asctime)s %(name)s: %(message)s"
 """The format of log lines of a supervisor and its child."""

@@ -1,9 +1,11 @@
-"""Where a worker's jobs come from: the queue in Redis, or a share of what the store lacks, behind one interface.
+"""Where a worker's jobs come from, and where it tells what they come to: the queue, or a share of what the store lacks.
 
 With a queue, others see what this worker does, and no two workers take one job. A share needs no Redis: the store alone
 is truth. A worker looks up what is missing now and then, and each job once more before it is rendered, and after its
 share takes what is left. Nobody reserves a job, so two workers may render the same one at the end. The one that learns
 of the other's commit gives its own up.
+
+Both sources have the same methods, which raise StoreError, QueueError or redis.RedisError.
 """
 
 from __future__ import annotations
@@ -13,7 +15,6 @@ import logging
 import os
 import threading
 import time
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -21,11 +22,16 @@ from typing import Literal
 
 import redis
 
-from photonfarm import queue
 from photonfarm.core.errors import QueueError, StoreError, store_errors
 from photonfarm.core.processes import Stop, repeat
 from photonfarm.core.waiting import pause_after_look
-from photonfarm.queue import TRIES, Activity, RenderArguments, Share, job_name, rq_adapter
+from photonfarm.queue import rq_adapter
+from photonfarm.queue.connection import connect
+from photonfarm.queue.failures import count_failures, keep_failure, read_kept_failures
+from photonfarm.queue.job import TRIES, RenderArguments, job_name
+from photonfarm.queue.reconciliation import fill_seldom
+from photonfarm.queue.share import Share
+from photonfarm.queue.workers import Activity, WorkerReport, beat, serve
 from photonfarm.renderer.worker.backpressure import TrainerPace
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.store import Store
@@ -55,65 +61,21 @@ class TakenError(Exception):
     """Another worker has committed the job in hand."""
 
 
-class JobSource(ABC):
-    """Where a worker's jobs come from, and where it tells what they come to.
-
-    Methods raise StoreError, QueueError or redis.RedisError.
-    """
-
-    pause_s: float = 0.0
-    """How long to wait after `take` has found nothing."""
-
-    @contextlib.contextmanager
-    def open(self) -> Iterator[None]:
-        """Tell others of the worker until the block ends."""
-        yield
-
-    def ahead(self) -> Mapping[str, str]:
-        """The scenes of which no job should be taken now: the reason, by scene id."""
-        return {}
-
-    @abstractmethod
-    def take(self, paused: str | None, left: Mapping[str, str]) -> RenderArguments | None:
-        """The next job of the scenes that are not `left`; None if there is none now, or the worker is `paused`.
-
-        Both have reasons, `left` by scene id.
-        """
-
-    @abstractmethod
-    def tell_doing(self, doing: Activity) -> None:
-        """Tell what the worker does with the job in hand; raises TakenError if that is of no use any more."""
-
-    @abstractmethod
-    def end(self, name: str, ending: Ending, reason: str) -> bool:
-        """Tell what the job in hand has come to; returns whether it is set aside now."""
-
-    @abstractmethod
-    def has_more(self, *, may_leave: bool) -> bool:
-        """Whether there will be more to take, after nothing was; `may_leave`: what others have to do does not count."""
-
-    @abstractmethod
-    def set_aside(self) -> Mapping[str, str]:
-        """Why jobs are not tried any more, by their names."""
-
-
-class QueueSource(JobSource):
+class QueueSource:
     """Takes jobs from the queue, and fills it from the store when it is empty."""
+
+    pause_s = 0.0  # after `take` has found nothing
 
     def __init__(self, settings: WorkerSettings, store: Store, stop: Stop) -> None:
         """Connect; raises QueueError if there is no Redis."""
         self._settings, self._store, self._stop = settings, store, stop
-        self._connection = queue.connect(settings.queue_url)
+        self._connection = connect(settings.queue_url)
         self._queue = rq_adapter.open_queue(self._connection)
         self._ttl_s = max(1, int(settings.heartbeat_ttl_s))
-        self._report = queue.WorkerReport(process=os.getppid())  # replaced, never changed
+        self._report = WorkerReport(process=os.getppid())  # replaced, never changed
         self._execution: rq_adapter.Execution | None = None
         self._ending = threading.Lock()  # no heartbeat follows the end of a job
-        self._pace = (
-            None
-            if settings.ahead is None
-            else TrainerPace(store, self._connection, settings.ahead, scene_id=settings.scene_id)
-        )
+        self._pace = settings.ahead and TrainerPace(store, self._connection, settings.ahead, scene_id=settings.scene_id)
 
     @contextlib.contextmanager
     def open(self) -> Iterator[None]:
@@ -125,24 +87,23 @@ class QueueSource(JobSource):
     def _beat(self) -> None:
         with contextlib.suppress(redis.RedisError, QueueError):  # an outage is noticed where a job is taken or ends
             with self._ending, self._connection.pipeline() as pipeline:
-                queue.beat(pipeline, self._settings.name, self._report, ttl_s=self._ttl_s)
+                beat(pipeline, self._settings.name, self._report, ttl_s=self._ttl_s)
                 if self._execution is not None:
                     rq_adapter.keep_alive(self._queue, self._execution, pipeline, self._ttl_s)
                 pipeline.execute()
-            queue.serve(self._connection, self._store)
+            serve(self._connection, self._store)
 
     def ahead(self) -> Mapping[str, str]:
-        """The scenes whose trainers are far behind."""
-        return {} if self._pace is None else self._pace.ahead()
-
-    def tell_doing(self, doing: Activity) -> None:
-        """Tell it with the next heartbeat."""
-        self._report = replace(self._report, doing=doing)
+        """The scenes whose trainers are far behind, so that no job of them should be taken: the reason, by scene id."""
+        return self._pace.ahead() if self._pace else {}
 
     def take(self, paused: str | None, left: Mapping[str, str]) -> RenderArguments | None:
-        """The next job in the queue; None if there was none for a while. Reasons are told with the next heartbeat."""
+        """The next job of the scenes that are not `left`; None if there was none for a while, or while `paused`.
+
+        Both have reasons, `left` by scene id, which are told with the next heartbeat.
+        """
         self._report = replace(self._report, paused=paused, left=left)
-        queue.serve(self._connection, self._store)
+        serve(self._connection, self._store)
         until = time.monotonic() + self._settings.idle_s
         while not (paused or self._stop.is_set()):
             self._execution = rq_adapter.take(
@@ -153,11 +114,15 @@ class QueueSource(JobSource):
             self._stop.wait(self._settings.idle_s if left else POLL_S)  # each look passes all jobs that are left
         return None if self._execution is None else RenderArguments.of(self._execution.job_id)
 
+    def tell_doing(self, doing: Activity) -> None:
+        """Tell what the worker does with the job in hand, with the next heartbeat."""
+        self._report = replace(self._report, doing=doing)
+
     def end(self, name: str, ending: Ending, reason: str) -> bool:
-        """Tell the queue, and keep a failure in the store too; Redis may forget it."""
+        """Tell what the job in hand has come to, and keep a failure in the store too; whether the job is set aside."""
         if ending == "failed":
             with contextlib.suppress(OSError):
-                queue.keep_failure(self._store, name, reason, worker=self._settings.name)
+                keep_failure(self._store, name, reason, worker=self._settings.name)
         with self._ending:
             execution, self._execution = self._execution, None
             self._report = replace(self._report, doing=None)
@@ -169,18 +134,18 @@ class QueueSource(JobSource):
             return rq_adapter.fail(self._queue, execution, reason, counts=ending == "failed")
 
     def has_more(self, *, may_leave: bool) -> bool:
-        """Whether something was missing and is queued now, or is in the hands of others."""
-        state = queue.fill_seldom(
+        """Whether something was missing and is queued now, or unless the worker `may_leave` is in others' hands."""
+        state = fill_seldom(
             self._store, self._connection, scene_id=self._settings.scene_id, every_s=self._settings.idle_s
         )
         return state == "queued" or (state == "waits" and not may_leave)
 
     def set_aside(self) -> Mapping[str, str]:
-        """Why jobs failed too often."""
-        return {name: failure.reason for name, failure in queue.queue_status(self._connection).failed.items()}
+        """Why jobs failed too often, by their names."""
+        return {name: failure.reason for name, failure in rq_adapter.read_failures(self._queue).items()}
 
 
-class ShareSource(JobSource):
+class ShareSource:
     """Takes the jobs of a share, and then others."""
 
     def __init__(self, settings: WorkerSettings, store: Store, share: Share) -> None:
@@ -188,13 +153,21 @@ class ShareSource(JobSource):
         self._settings, self._store, self._share = settings, store, share
         self._waiting: deque[RenderArguments] = deque()  # in the order in which they are taken
         self._look_due = self._taken_look_due = 0.0
-        self.pause_s = settings.idle_s  # between looks that find nothing
+        self.pause_s: float = settings.idle_s  # between looks that find nothing
         self._unreadable: Mapping[str, StoreError] = {}
         self._not_kept: dict[str, str] = {}  # reasons of failures that the store refused to keep, by the jobs' names
         self._in_hand: RenderArguments | None = None
 
+    def open(self) -> contextlib.nullcontext[None]:
+        """Nobody is told of the worker."""
+        return contextlib.nullcontext()
+
+    def ahead(self) -> Mapping[str, str]:
+        """Of trainers nothing is known."""
+        return {}
+
     def take(self, paused: str | None, left: Mapping[str, str]) -> RenderArguments | None:
-        """The next job that is still missing, if there is one."""
+        """The next job that is still missing, of the scenes that are not `left`; None without one or while `paused`."""
         looked = bool(paused)
         while not looked:  # what was left at the last look may have been rendered by others
             if looked := not self._waiting or time.monotonic() >= self._look_due:
@@ -209,14 +182,16 @@ class ShareSource(JobSource):
     def _list_missing(self) -> None:
         """List what is missing, without what has failed too often; what has failed comes last."""
         self._store.check()
-        began = time.monotonic()
-        missing, unreadable = missing_jobs(self._store, self._scenes(), followed=True)
+        began, scenes = time.monotonic(), self._settings.scenes
+        if not self._settings.until_complete:  # a worker that waits for more lets the scenes come later
+            scenes = tuple(filter(self._store.has_scene, scenes))
+        missing, unreadable = missing_jobs(self._store, scenes, followed=True)
         self.pause_s = pause_after_look(time.monotonic() - began, self._settings.idle_s)
         for scene_id in unreadable.keys() - self._unreadable.keys():
             log.warning("scene %s is passed over, and the others go on: %s", scene_id, unreadable[scene_id])
         self._unreadable = unreadable
         with store_errors("look for failures", self._store.storage.where):
-            times = queue.count_failures(self._store) | dict.fromkeys(self._not_kept, TRIES)
+            times = count_failures(self._store) | dict.fromkeys(self._not_kept, TRIES)
         candidates = [
             (times.get(job_name(scene_id, job), 0), not self._share.owns(job), RenderArguments(scene_id, job))
             for scene_id, jobs in missing.items()
@@ -226,13 +201,8 @@ class ShareSource(JobSource):
         self._waiting = deque(job for failed, _, job in candidates if failed < TRIES)
         self._look_due = time.monotonic() + max(LOOK_S, self.pause_s)
 
-    def _scenes(self) -> tuple[str, ...]:
-        """The scenes to render, of those that are named; a worker that waits for more lets them come later."""
-        named = self._settings.scenes
-        return named if self._settings.until_complete else tuple(filter(self._store.has_scene, named))
-
     def tell_doing(self, doing: Activity) -> None:  # noqa: ARG002 - nobody listens
-        """Give the job in hand up if another worker has committed it."""
+        """Give the job in hand up if another worker has committed it: raises TakenError."""
         if self._in_hand is None or time.monotonic() < self._taken_look_due:
             return
         self._taken_look_due = time.monotonic() + TAKEN_LOOK_S
@@ -245,8 +215,8 @@ class ShareSource(JobSource):
         if ending != "failed":
             return False
         try:
-            queue.keep_failure(self._store, name, reason, worker=self._settings.name)
-            return queue.count_failures(self._store)[name] >= TRIES
+            keep_failure(self._store, name, reason, worker=self._settings.name)
+            return count_failures(self._store)[name] >= TRIES
         except OSError:
             self._not_kept[name] = reason
             return True
@@ -256,9 +226,9 @@ class ShareSource(JobSource):
         return False
 
     def set_aside(self) -> Mapping[str, str]:
-        """Why jobs failed too often."""
+        """Why jobs failed too often, by their names."""
         with store_errors("look for failures", self._store.storage.where):
-            kept = queue.read_kept_failures(self._store)
+            kept = read_kept_failures(self._store)
         return {name: failure.reason for name, failure in kept.items() if failure.set_aside} | self._not_kept
 
 

@@ -84,7 +84,7 @@ class Ledger:
 
         threading.Thread.run = timed  # type: ignore[method-assign, assignment]
 
-    def load(self, spec: Any) -> jobs.SceneRenderer:
+    def load(self, spec: Any) -> Any:
         """What a worker loads, watched."""
         scene = jobs.load_scene(spec)
         for name in ("apply", "buffers", "photons", "render_halves"):

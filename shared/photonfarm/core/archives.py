@@ -147,13 +147,12 @@ def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Map
 
 
 def _channels(layers: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-    found: dict[str, NDArray[Any]] = {}
+    channels: dict[str, NDArray[Any]] = {}
     for layer, values in layers.items():
         if values.ndim == 3:
-            names = "XYZ" if "normal" in layer else "RGB"
-            parts = {name: values[..., i] for i, name in enumerate(names)}
+            names, planes = "XYZ" if "normal" in layer else "RGB", np.moveaxis(values, -1, 0)
         else:
-            parts = {"Z" if "depth" in layer else "V": values}
-        contiguous = {name: np.ascontiguousarray(part) for name, part in parts.items()}  # OpenEXR minds no strides
-        found |= {f"{layer}.{name}" if layer else name: part for name, part in contiguous.items()}
-    return found
+            names, planes = "Z" if "depth" in layer else "V", values[None]
+        for name, plane in zip(names, planes, strict=True):  # OpenEXR minds no strides
+            channels[f"{layer}.{name}" if layer else name] = np.ascontiguousarray(plane)
+    return channels

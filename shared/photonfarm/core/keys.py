@@ -87,15 +87,15 @@ def uniform_of(keys: Sequence[Key], purpose: str, count: int, first: int = 0) ->
 
     A generator of numpy for each key would take minutes for a million.
     """
-    found = np.empty((len(keys), count))
+    uniform = np.empty((len(keys), count))
     begin, end = first // 4, -(-(first + count) // 4)  # blocks of four words
     for start in range(0, len(keys), AT_ONCE):
         chunk = keys[start : start + AT_ONCE]
         words = np.frombuffer(b"".join(make_key(key, purpose) for key in chunk), "<u8").reshape(-1, 2)
         raw = _philox(words.astype(np.uint64), begin, end).transpose(2, 0, 1).reshape(len(chunk), 4 * (end - begin))
         raw = raw[:, first - 4 * begin :][:, :count]
-        found[start : start + AT_ONCE] = (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
-    return found
+        uniform[start : start + AT_ONCE] = (raw >> np.uint64(11)).astype(np.float64) * 2.0**-53
+    return uniform
 
 
 def _philox(keys: NDArray[np.uint64], begin: int, end: int) -> NDArray[np.uint64]:

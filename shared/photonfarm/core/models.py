@@ -112,14 +112,14 @@ Changes = dict[str, tuple[Any, Any]]
 
 def differing(before: Mapping[str, Any], now: Mapping[str, Any], inside: str = "") -> Changes:
     """The values that differ, (then, now), by key; a key within another one as OUTER.INNER, an entry by its name."""
-    found: Changes = {}
+    changes: Changes = {}
     for key in {**before, **now}:
         then, value = _table_by_name(before.get(key)), _table_by_name(now.get(key))
         if isinstance(then, Mapping) and isinstance(value, Mapping):
-            found |= differing(then, value, f"{inside}{key}.")
+            changes |= differing(then, value, f"{inside}{key}.")
         elif then != value:
-            found[f"{inside}{key}"] = (then, value)
-    return found
+            changes[f"{inside}{key}"] = (then, value)
+    return changes
 
 
 def _table_by_name(value: Any) -> Any:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 import numpy.typing as npt
@@ -95,14 +96,8 @@ def mean_ratio(images_a: Array, images_b: Array) -> tuple[float, float]:
 
 
 def two_sided_limit(probability: float) -> float:
-    """The z that a standard normal variable exceeds in absolute value with this probability (bisection on erfc)."""
-    from math import erfc, sqrt
-
-    low, high = 0.0, 40.0
-    for _ in range(100):
-        middle = (low + high) / 2
-        low, high = (middle, high) if erfc(middle / sqrt(2)) > probability else (low, middle)
-    return (low + high) / 2
+    """The z that a standard normal variable exceeds in absolute value with this probability."""
+    return -NormalDist().inv_cdf(probability / 2)
 
 
 def student_to_normal(t: Array, freedom: Array) -> npt.NDArray[np.float64]:

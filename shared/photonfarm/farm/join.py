@@ -13,8 +13,7 @@ from pathlib import Path
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Key
-from photonfarm.plan.joined import Joined, samples_to_join
-from photonfarm.plan.request import PlannedContent, SamplesToPlan
+from photonfarm.plan.request import Joined, PlannedContent, SamplesToPlan, samples_to_join
 from photonfarm.store import Figures, JobRows, JobWriter, SceneReader, SceneStore, Store
 from photonfarm.store.model import plans
 from photonfarm.store.model.lease import OnWait, hold_lease

@@ -13,19 +13,12 @@ their views. A configuration with its views costs
 
     c = c_configuration + V·(c_view + P·(c_pass + c_spp·s)).
 
-**The best s.** A budget B pays for M = B/c configurations, so that excess·B = (α + β/n)·(γ + δ·n), where n = P·s,
-α = ρ + 1/V, β = ν/(κ·V), γ = c_configuration + V·(c_view + P·c_pass) and δ = V·c_spp. Its derivative δα − βγ/n² is
-0 at n* = √(βγ/(αδ)), which with c₀ = γ/V, the cost of a view that does not grow with s, is
-
-    s* = n*/P = √(c₀·ν / (κ·c_spp·(1 + ρ·V))) / P.
-
-**Passes.** The excess depends on P and s by n alone, while P passes pay c_pass P times: one pass of n samples is
-never worse. Passes are for top-ups of what is there.
+The excess depends on P and s by P·s alone, while P passes pay c_pass P times: one pass of P·s samples is never worse.
+Passes are for top-ups of what is there.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Self
@@ -60,18 +53,6 @@ class Allocation:
         return self.modifications * self.views * self.passes
 
 
-def seconds(costs: SampleCosts, of: Allocation) -> float:
-    """The core-seconds of an allocation."""
-    views = of.modifications * of.views
-    return costs.seconds(of.spp, configurations=of.modifications, views=views, samples=views * of.passes)
-
-
-def excess(noise: float, of: Allocation, *, kappa: float = KAPPA, rho: float = RHO) -> float:
-    """The excess of the held-out error in the module's units; `noise`: relative variance at 1 sample per pixel."""
-    of_view = 1 + noise / (kappa * of.passes * of.spp)
-    return (rho + of_view / of.views) / of.modifications
-
-
 @dataclass(frozen=True, slots=True)
 class CostModel:
     """The costs of a scene's samples, and the constants of its predicted error."""
@@ -92,23 +73,13 @@ class CostModel:
 
     def seconds(self, of: Allocation) -> float:
         """The core-seconds of an allocation."""
-        return seconds(self.costs, of)
+        views = of.modifications * of.views
+        return self.costs.seconds(of.spp, configurations=of.modifications, views=views, samples=views * of.passes)
 
     def excess(self, of: Allocation) -> float:
-        """The predicted excess of the held-out error."""
-        return excess(self.costs.relative_variance, of, kappa=self.kappa, rho=self.rho)
-
-    def best_spp(self, views: int, passes: int = 1) -> float:
-        """s*: the samples per pixel of a pass with the least excess at a fixed budget, as a real number.
-
-        Infinite where samples cost nothing, 0 where there is no noise.
-        """
-        costs = self.costs
-        besides = costs.configuration_s / views + costs.view_s + passes * costs.pass_s
-        gained, paid = besides * costs.relative_variance, self.kappa * costs.spp_s * (1 + self.rho * views)
-        if not gained:
-            return 0.0
-        return math.sqrt(gained / paid) / passes if paid else math.inf
+        """The predicted excess of the held-out error, in the module's units."""
+        of_view = 1 + self.costs.relative_variance / (self.kappa * of.passes * of.spp)
+        return (self.rho + of_view / of.views) / of.modifications
 
     def best(self, budget_s: float) -> Allocation:
         """The allocation of least excess within a budget of core-seconds, among those of `_affordable`.
@@ -116,15 +87,15 @@ class CostModel:
         Of equal ones, that with fewer views is taken, then that with fewer samples per pixel. Raises ValueError if the
         budget pays for none.
         """
-        found = list(self._affordable(budget_s))
-        if not found:
+        affordable = list(self._affordable(budget_s))
+        if not affordable:
             raise ValueError(f"budget_s is {budget_s}; one view of 2 spp costs {self.seconds(Allocation(1, 1, 1, 2))}")
-        return min(found, key=self.excess)
+        return min(affordable, key=self.excess)
 
     def improve(self, asked: Allocation) -> tuple[float, Allocation]:
         """The share of `asked`'s excess that the best allocation of the same cost saves, ≥ 0, and that allocation."""
-        found = self.best(self.seconds(asked))
-        return max(0.0, 1 - self.excess(found) / self.excess(asked)), found
+        best = self.best(self.seconds(asked))
+        return max(0.0, 1 - self.excess(best) / self.excess(asked)), best
 
     def _affordable(self, budget_s: float) -> Iterator[Allocation]:
         """One pass of 2, 4, 8 … 1024 spp for each number of views, with all configurations that the budget pays for."""

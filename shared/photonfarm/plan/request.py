@@ -1,4 +1,4 @@
-"""A request for samples, expanded into rows and jobs, without what is planned already.
+"""A request for samples, expanded into rows and jobs, without what is planned already; and samples of another store.
 
 Shape letters: R rows of a plan, G movable groups. J is `shard_rows`, the samples of one job.
 
@@ -136,29 +136,26 @@ class PlannedContent:
     @cached_property
     def modifications(self) -> dict[bytes, int]:
         """The row of each modification, by the bytes of its vector."""
-        found: dict[bytes, int] = {}
+        table: dict[bytes, int] = {}
         for first_row, rows in self.plans:
             row, _ = _own(rows.sample_modification, first_row)
-            _add(found, contents(rows.modification[row - first_row]), row)
-        return found
+            _add(table, contents(rows.modification[row - first_row]), row)
+        return table
 
     @cached_property
     def views(self) -> dict[bytes, int]:
         """The row of each view, by its `view_contents`."""
-        found: dict[bytes, int] = {}
+        table: dict[bytes, int] = {}
         for first_row, rows in self.plans:
             row, sample = _own(rows.sample_view, first_row)
-            _add(found, view_contents(rows.sample_modification[sample], rows.view[row - first_row]), row)
-        return found
+            _add(table, view_contents(rows.sample_modification[sample], rows.view[row - first_row]), row)
+        return table
 
     @cached_property
     def samples(self) -> set[Key]:
         """The keys of all samples."""
-        found: set[Key] = set()
-        for _, rows in self.plans:
-            data = rows.sample_key[rows.sample_modification != UNUSED].tobytes()
-            found.update(data[i : i + KEY_BYTES] for i in range(0, len(data), KEY_BYTES))
-        return found
+        used = (rows.sample_key[rows.sample_modification != UNUSED] for _, rows in self.plans)
+        return {key.tobytes() for keys in used for key in keys}
 
     def column(self, name: str) -> NDArray[Any]:
         """One input of all rows."""
@@ -177,9 +174,14 @@ class PlannedContent:
         return vectors
 
 
-def _add(found: dict[bytes, int], keys: Iterable[bytes], rows: NDArray[np.int64]) -> None:
+def _add(table: dict[bytes, int], keys: Iterable[bytes], rows: NDArray[np.int64]) -> None:
     for key, row in zip(keys, rows.tolist(), strict=True):
-        found.setdefault(key, row)
+        table.setdefault(key, row)
+
+
+def _look_up(table: dict[bytes, int], keys: Iterable[bytes]) -> NDArray[np.int64]:
+    """The row of each key, or UNUSED."""
+    return np.array([table.get(key, UNUSED) for key in keys], np.int64)
 
 
 def _own(references: NDArray[np.int64], first_row: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -210,13 +212,6 @@ class SamplesToPlan:
     modification_density: F32 | None = None  # (M,) as in `PlannedRows`; None: 1
     view_density: F32 | None = None  # (V,)
 
-    def extent(self) -> Extent:
-        """What is rendered for them."""
-        modifications, views = np.unique(self.sample_modification), np.unique(self.sample_view)
-        new_modifications = np.count_nonzero(self.modification_row[modifications] == UNUSED)
-        new_views = np.count_nonzero(self.view_row[views] == UNUSED)
-        return Extent(len(modifications), int(new_modifications), int(new_views))
-
 
 @dataclass(frozen=True, slots=True)
 class Expansion:
@@ -225,22 +220,14 @@ class Expansion:
     rows: PlannedRows | None
     new: int  # samples
     known: int  # samples named by the request and planned already
-    extent: Extent = Extent()  # of the new samples; empty for a top-up, which has no new views or modifications
+    extent: Extent  # of the new samples
 
 
 def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_job: int, shard_rows: int) -> Expansion:
     """The rows of a request's new samples, packed into jobs of `shard_rows` from number `first_job` on.
 
-    Samples are ordered by modification, view and pass. A new modification or view gets the next free row of its kind in
-    the job of its first sample; so everything that a job must render lies in its own rows.
+    Samples are ordered by modification, view and pass.
     """
-    candidates, named = _candidates(spec, request, known)
-    planned = named - len(candidates.sample_pass)
-    return expand_samples(candidates, first_job=first_job, shard_rows=shard_rows, known=planned)
-
-
-def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tuple[SamplesToPlan, int]:
-    """The new samples of a request, and the number that it names, new or planned already."""
     modifications, counts = _configurations(spec, request)
     of_view = np.repeat(np.arange(len(counts)), counts)
     index = np.arange(len(of_view)) - np.repeat(np.cumsum(counts) - counts, counts)
@@ -248,15 +235,15 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
     views = sample_views(
         spec, [keys[m] for m in of_view.tolist()], request.seed, index.tolist(), modifications[of_view]
     )
-    modification_row = np.array([known.modifications.get(c, UNUSED) for c in contents(modifications)], np.int64)
-    view_row = np.array([known.views.get(c, UNUSED) for c in view_contents(modification_row[of_view], views)], np.int64)
+    modification_row = _look_up(known.modifications, contents(modifications))
+    view_row = _look_up(known.views, view_contents(modification_row[of_view], views))
 
     view = np.repeat(np.arange(len(views)), request.passes)
     pass_ = np.tile(np.arange(request.passes, dtype=np.int32), len(views))
     keys = sample_keys(spec.radiance_id, modifications[of_view[view]], views[view], pass_)
     distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
     new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
-    found = SamplesToPlan(
+    candidates = SamplesToPlan(
         modifications,
         modification_row,
         views,
@@ -266,7 +253,8 @@ def _candidates(spec: SceneSpec, request: Request, known: PlannedContent) -> tup
         pass_[new],
         np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
     )
-    return found, len(distinct)
+    planned = len(distinct) - len(new)
+    return expand_samples(candidates, first_job=first_job, shard_rows=shard_rows, known=planned)
 
 
 def sample_keys(radiance_id: str, modifications: F32, views: F32, passes: Iterable[int]) -> list[Key]:
@@ -299,31 +287,30 @@ def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.
     return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)
 
 
-def pack(candidates: SamplesToPlan, *, first_row: int, shard_rows: int) -> PlannedRows | None:
-    """Samples as rows from `first_row` on, in their order; None if there are none."""
-    count = len(candidates.sample_pass)
-    if not count:
-        return None
-    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, candidates.modification.shape[1])
-    modification_row, new = _place(candidates.sample_modification, candidates.modification_row, first_row, shard_rows)
-    rows.modification[modification_row[new] - first_row] = candidates.modification[new]
-    density = candidates.modification_density
-    rows.modification_density[modification_row[new] - first_row] = 1 if density is None else density[new]
-    view_row, new = _place(candidates.sample_view, candidates.view_row, first_row, shard_rows)
-    rows.view[view_row[new] - first_row] = candidates.view[new]
-    density = candidates.view_density
-    rows.view_density[view_row[new] - first_row] = 1 if density is None else density[new]
-    rows.sample_modification[:count] = modification_row[candidates.sample_modification]
-    rows.sample_view[:count] = view_row[candidates.sample_view]
-    rows.sample_pass[:count] = candidates.sample_pass
-    rows.sample_key[:count] = candidates.sample_key
-    return rows
-
-
 def expand_samples(samples: SamplesToPlan, *, first_job: int, shard_rows: int, known: int = 0) -> Expansion:
-    """The rows of new samples in jobs from number `first_job` on; `known` others are planned already."""
-    rows = pack(samples, first_row=first_job * shard_rows, shard_rows=shard_rows)
-    return Expansion(rows, len(samples.sample_pass), known, samples.extent())
+    """The rows of new samples, in their order, in jobs from number `first_job` on; `known` others are planned already.
+
+    A new modification or view gets the next free row of its kind in the job of its first sample; so everything that a
+    job must render lies in its own rows.
+    """
+    count, first_row = len(samples.sample_pass), first_job * shard_rows
+    if not count:
+        return Expansion(None, 0, known, Extent())
+    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, samples.modification.shape[1])
+    modification_row, modified = _place(samples.sample_modification, samples.modification_row, first_row, shard_rows)
+    rows.modification[modification_row[modified] - first_row] = samples.modification[modified]
+    density = samples.modification_density
+    rows.modification_density[modification_row[modified] - first_row] = 1 if density is None else density[modified]
+    view_row, seen = _place(samples.sample_view, samples.view_row, first_row, shard_rows)
+    rows.view[view_row[seen] - first_row] = samples.view[seen]
+    density = samples.view_density
+    rows.view_density[view_row[seen] - first_row] = 1 if density is None else density[seen]
+    rows.sample_modification[:count] = modification_row[samples.sample_modification]
+    rows.sample_view[:count] = view_row[samples.sample_view]
+    rows.sample_pass[:count] = samples.sample_pass
+    rows.sample_key[:count] = samples.sample_key
+    configurations = len(np.unique(samples.sample_modification))
+    return Expansion(rows, count, known, Extent(configurations, len(modified), len(seen)))
 
 
 def _place(
@@ -342,3 +329,37 @@ def _place(
     rows = known_row.copy()
     rows[thing] = first_row + job * shard_rows + np.arange(len(thing)) - before
     return rows, thing
+
+
+class Joined(Frozen):
+    """What a plan of a join holds: samples that another store had. Its rows cannot be made from this alone."""
+
+    kind: Literal["join"] = "join"
+    store: str  # id of the other store
+    samples: Annotated[int, Field(ge=1)]
+
+
+def samples_to_join(other: PlannedContent, rows: NDArray[np.int64], known: PlannedContent) -> SamplesToPlan:
+    """The samples in some rows of another store's plans that are not `known` in this one, in the order of the rows.
+
+    Configurations and views that are known here keep the rows that they have here.
+    """
+    keys = other.column("sample_key")[rows]
+    new = np.array([key.tobytes() not in known.samples for key in keys], np.bool_)
+    rows, keys = rows[new], keys[new]
+    modification_row, of_modification = np.unique(other.column("sample_modification")[rows], return_inverse=True)
+    view_row, first, of_view = np.unique(other.column("sample_view")[rows], return_index=True, return_inverse=True)
+    modification, view = other.vectors("modification", modification_row), other.vectors("view", view_row)
+    here = _look_up(known.modifications, contents(modification))
+    return SamplesToPlan(
+        modification,
+        here,
+        view,
+        _look_up(known.views, view_contents(here[of_modification[first]], view)),
+        of_modification,
+        of_view,
+        other.column("sample_pass")[rows],
+        keys.reshape(-1, KEY_BYTES),
+        other.column("modification_density")[modification_row],
+        other.column("view_density")[view_row],
+    )

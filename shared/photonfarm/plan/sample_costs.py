@@ -6,13 +6,15 @@ Services without a renderer read it as JSON.
 from __future__ import annotations
 
 import json
-import math
-from dataclasses import asdict, dataclass
-from typing import Self
+from dataclasses import asdict
+from typing import Annotated, Self
 
 import numpy as np
+from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic.dataclasses import dataclass
 
 from photonfarm.core.errors import StoreError
+from photonfarm.core.models import sentences
 from photonfarm.core.records import F32
 
 BLOCK = 8
@@ -24,7 +26,10 @@ FLOOR = 0.1
 SECONDS = ("configuration_s", "view_s", "pass_s", "spp_s")
 
 
-@dataclass(frozen=True, slots=True)
+Cost = Annotated[float, Field(ge=0, allow_inf_nan=False, strict=True)]
+
+
+@dataclass(frozen=True, slots=True, config=ConfigDict(extra="forbid"))
 class SampleCosts:
     """Core-seconds on one machine, and noise: medians over some views, each of a configuration of its own.
 
@@ -33,18 +38,12 @@ class SampleCosts:
     """
 
     scene_id: str
-    configuration_s: float  # bringing the scene into a new configuration, with its photons traced
-    view_s: float  # a view's buffers and guides, and which points and photons it sees
-    pass_s: float  # a pass of a view, both halves, whatever its number of samples per pixel
-    spp_s: float  # each sample per pixel of the whole image, of both halves together
-    relative_variance: float  # as `relative_variance` estimates it; 0 if every view was black
-    guides_s: float = 0.0  # the guides' part of `view_s`
-
-    def __post_init__(self) -> None:
-        for name in (*SECONDS, "relative_variance", "guides_s"):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name} is {value}; finite numbers from 0 on are allowed")
+    configuration_s: Cost  # bringing the scene into a new configuration, with its photons traced
+    view_s: Cost  # a view's buffers and guides, and which points and photons it sees
+    pass_s: Cost  # a pass of a view, both halves, whatever its number of samples per pixel
+    spp_s: Cost  # each sample per pixel of the whole image, of both halves together
+    relative_variance: Cost  # as `relative_variance` estimates it; 0 if every view was black
+    guides_s: Cost = 0.0  # the guides' part of `view_s`
 
     def seconds(self, spp: float, *, configurations: float, views: float, samples: float) -> float:
         """Core-seconds of samples of `spp` samples per pixel, both halves together; each is a pass of a view.
@@ -68,17 +67,11 @@ class SampleCosts:
     def read(cls, text: str | bytes) -> Self:
         """The costs that `json` wrote; raises StoreError for anything else."""
         try:
-            stored = json.loads(text)
-            wrong = [
-                name for name, value in stored.items() if type(value) is not (str if name == "scene_id" else float)
-            ]
-            if wrong:
-                raise TypeError(f"{wrong[0]} has another type")
-            return cls(**stored)
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            return TypeAdapter(cls).validate_json(text)
+        except ValidationError as error:
             raise StoreError(
-                f"{text[:60]!r}: are no sample costs that `photonfarm scene cost --json` wrote ({error}); measure "
-                "again with `photonfarm scene cost SPEC --again`"
+                f"{text[:60]!r}: are no sample costs that `photonfarm scene cost --json` wrote "
+                f"({'; '.join(sentences(error))}); measure again with `photonfarm scene cost SPEC --again`"
             ) from error
 
 

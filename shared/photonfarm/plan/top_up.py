@@ -10,7 +10,7 @@ Shape letters: V views, S samples of all plans.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -28,7 +28,7 @@ from photonfarm.plan.request import (
     Expansion,
     PlannedContent,
     SamplesToPlan,
-    pack,
+    expand_samples,
     sample_keys,
 )
 from photonfarm.scene.modification import modification_keys
@@ -88,8 +88,7 @@ def expand_top_up(
     if count.sum() > MAX_SAMPLES:
         raise SpecError(f"the request names {count.sum()} new samples; at most {MAX_SAMPLES} fit one request")
     candidates = _candidates(planned, views, count)
-    rows = pack(candidates, first_row=first_job * shard_rows, shard_rows=shard_rows)
-    return Expansion(rows, int(count.sum()), int(have.sum()))
+    return expand_samples(candidates, first_job=first_job, shard_rows=shard_rows, known=int(have.sum()))
 
 
 def _candidates(planned: PlannedViews, views: Rows, count: Rows) -> SamplesToPlan:
@@ -160,74 +159,50 @@ class PlannedViews:
 def _select(planned: PlannedViews, where: Sequence[str]) -> Mask:
     """Which of the views meet every condition; `views=first:N` counts those that meet all the others."""
     selected = np.ones(len(planned.view_row), np.bool_)
-    parsed = [_parse_condition(condition) for condition in where]
-    for find, value in sorted(parsed, key=lambda condition: condition[0] is _first):  # that one last
-        selected &= find(planned, value, selected)
+    conditions = [_parse_condition(condition) for condition in where]
+    for kind, value in sorted(conditions, key=lambda condition: condition[0] == "views"):  # that one last
+        match kind:
+            case "views":
+                selected &= np.cumsum(selected) <= value
+            case "plan":
+                if value >= len(planned.known.plans):
+                    number = len(planned.known.plans)
+                    raise SpecError(f"where plan={value}: the scene has {number} plans, numbered from 0")
+                first, rows = planned.known.plans[value]
+                selected &= np.isin(planned.view_row, rows.sample_view[rows.sample_view >= first])
+            case "rows":
+                within = (planned.sample_row >= value[0]) & (planned.sample_row <= value[1])
+                selected &= np.isin(planned.view_row, planned.sample_view[within])
+            case "modification" | "view":
+                keys = planned.view_keys(selected) if kind == "view" else planned.modification_keys(selected)
+                selected[selected] = [key.hex().startswith(value) for key in keys]
+            case "held-out":
+                selected[selected] = rows_held_out(planned, selected, value)
     if not selected.any():
         raise SpecError(f"where {' and '.join(where)}: selects none of the {len(selected)} planned views")
     return selected
 
 
-def _first(planned: PlannedViews, count: int, selected: Mask) -> Mask:  # noqa: ARG001
-    return np.cumsum(selected) <= count
-
-
-def _select_plan(planned: PlannedViews, number: int, selected: Mask) -> Mask:  # noqa: ARG001
-    if number >= len(planned.known.plans):
-        raise SpecError(f"where plan={number}: the scene has {len(planned.known.plans)} plans, numbered from 0")
-    first, rows = planned.known.plans[number]
-    return np.isin(planned.view_row, rows.sample_view[rows.sample_view >= first])
-
-
-def _select_rows(planned: PlannedViews, ends: tuple[int, int], selected: Mask) -> Mask:  # noqa: ARG001
-    shown = planned.sample_view[(planned.sample_row >= ends[0]) & (planned.sample_row <= ends[1])]
-    return np.isin(planned.view_row, shown)
-
-
-def _select_modification(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
-    keys = planned.modification_keys(selected)
-    return _where(selected, [key.hex().startswith(begin) for key in keys])
-
-
-def _select_view(planned: PlannedViews, begin: str, selected: Mask) -> Mask:
-    return _where(selected, [key.hex().startswith(begin) for key in planned.view_keys(selected)])
-
-
-def _select_held_out(planned: PlannedViews, share: float, selected: Mask) -> Mask:
-    return _where(selected, rows_held_out(planned, selected, share))
-
-
-def _where(selected: Mask, found: list[bool]) -> Mask:
-    mask = np.zeros_like(selected)
-    mask[selected] = found
-    return mask
-
-
-Condition = tuple[Callable[[PlannedViews, Any, Mask], Mask], Any]
-
-
-def _parse_condition(condition: str) -> Condition:
-    """The function that selects the views of a condition, and its argument; raises SpecError for an unknown one."""
+def _parse_condition(condition: str) -> tuple[str, Any]:
+    """The kind of a condition, as before its "=", and its value; raises SpecError for an unknown one."""
     match condition.split("="):
-        case ["views", value] if re.fullmatch(r"first:[1-9]\d{0,8}", value):
-            return _first, int(value.removeprefix("first:"))
-        case ["plan", value] if re.fullmatch(r"\d{1,6}", value):
-            return _select_plan, int(value)
-        case ["rows", value] if ends := re.fullmatch(r"(\d{1,12})(?:-(\d{1,12}))?", value):
-            return _select_rows, (int(ends[1]), int(ends[2] or ends[1]))
-        case ["modification", value] if re.fullmatch(r"[0-9a-f]{1,32}", value):
-            return _select_modification, value
-        case ["view", value] if re.fullmatch(r"[0-9a-f]{1,32}", value):
-            return _select_view, value
+        case ["views" as kind, value] if re.fullmatch(r"first:[1-9]\d{0,8}", value):
+            return kind, int(value.removeprefix("first:"))
+        case ["plan" as kind, value] if re.fullmatch(r"\d{1,6}", value):
+            return kind, int(value)
+        case ["rows" as kind, value] if ends := re.fullmatch(r"(\d{1,12})(?:-(\d{1,12}))?", value):
+            return kind, (int(ends[1]), int(ends[2] or ends[1]))
         case ["modification" | "view" as kind, value]:
+            if re.fullmatch(r"[0-9a-f]{1,32}", value):
+                return kind, value
             raise SpecError(
                 f"where {condition!r}: {value!r} is no content key of a {kind}, nor how one begins: 1 to 32 "
                 "hexadecimal digits, a to f in lower case"
             )
-        case ["held-out"]:
-            return _select_held_out, HOLD_OUT
-        case ["held-out", value] if _A_SHARE.fullmatch(value) and 0 < float(value) < 1:
-            return _select_held_out, float(value)
+        case ["held-out" as kind]:
+            return kind, HOLD_OUT
+        case ["held-out" as kind, value] if _A_SHARE.fullmatch(value) and 0 < float(value) < 1:
+            return kind, float(value)
     raise SpecError(
         f"where {condition!r}: is no condition; allowed are views=first:N, view=KEY, modification=KEY, rows=A-B, "
         "plan=P, held-out and held-out=SHARE"

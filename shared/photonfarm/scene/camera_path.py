@@ -75,11 +75,11 @@ class CameraPath(Frozen):
         keys = np.array([[*view.origin, *view.look_at] for view in self.views])
         spans = len(keys) if self.closed else len(keys) - 1
         at = np.linspace(0, spans, self.frames, endpoint=not self.closed)
-        found = [View.from_vector(vector) for vector in _spline(keys, at, closed=self.closed).astype(np.float32)]
-        for i, view in enumerate(found):
+        views = [View.from_vector(vector) for vector in _spline(keys, at, closed=self.closed).astype(np.float32)]
+        for i, view in enumerate(views):
             if np.array_equal(view.origin, view.target):
                 raise SpecError(f"camera path: in frame {i} the camera stands where it looks at; move a view")
-        return found
+        return views
 
 
 def orbit(spec: SceneSpec, frames: int, modification: Modification | None = None) -> list[View]:

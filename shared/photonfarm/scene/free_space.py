@@ -47,8 +47,8 @@ class FreeSpace(Frozen):
         count = np.array(self.cells)
         cell = np.clip(np.floor(place * count), 0, count - 1).astype(np.int64)
         outside = ((points < np.float32(low)) | (points > np.float32(high))).any(axis=1)
-        found: Free = outside | _cells(self.free, self.cells)[cell[:, 0], cell[:, 1], cell[:, 2]]
-        return found
+        free: Free = outside | _cells(self.free, self.cells)[cell[:, 0], cell[:, 1], cell[:, 2]]
+        return free
 
 
 Free = NDArray[np.bool_]
@@ -69,6 +69,6 @@ def _cells(text: str, shape: tuple[int, int, int]) -> Free:
         raise ValueError(f"has cells that cannot be read ({error}); measure them again") from error
     if len(data) != -(-count // 8):
         raise ValueError(f"has other cells than {' × '.join(map(str, shape))}; measure them again")
-    found: Free = np.unpackbits(np.frombuffer(data, np.uint8), count=count).astype(np.bool_).reshape(shape)
-    found.setflags(write=False)
-    return found
+    cells: Free = np.unpackbits(np.frombuffer(data, np.uint8), count=count).astype(np.bool_).reshape(shape)
+    cells.setflags(write=False)
+    return cells

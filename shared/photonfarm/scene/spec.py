@@ -246,8 +246,8 @@ class SceneSpec(Frozen):
     def _groups_are_distinct(self) -> Self:
         names = [group.name for group in self.groups]
         shapes = [shape for group in self.groups for shape in shape_ids(group)]
-        for what, found in (("group name", names), ("shape id", shapes)):
-            twice = sorted({x for x in found if found.count(x) > 1})
+        for what, used in (("group name", names), ("shape id", shapes)):
+            twice = sorted({name for name in used if used.count(name) > 1})
             if twice:
                 raise ValueError(f"uses {what} {twice[0]!r} twice; each may belong to one movable group")
         return self

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -14,8 +16,8 @@ from pydantic import BaseModel, ValidationError
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import nearest, sentences
-from photonfarm.scene import files as scene_files
-from photonfarm.scene.spec import Light, SceneSpec
+from photonfarm.scene.files import BUILTIN, SceneFile
+from photonfarm.scene.spec import SceneSpec
 
 SCENES_VARIABLE = "PHOTONFARM_SCENES"
 SCENE_SUFFIXES = (".xml", ".gltf", ".glb", ".obj", ".blend", ".usd", ".usda", ".usdc", ".usdz", ".fbx")
@@ -65,33 +67,24 @@ def parse_with_lights(
     described: dict[str, Any], *, where: str, beside: Path | None = None
 ) -> tuple[SceneSpec, frozenset[str]]:
     """What `parse_spec` gives, and the ids of the scene's own lights; "" stands for those that have none."""
-    spec = _validate({**described, "content": ""}, where)
-    if spec.scene.file is None:
-        content = f"builtin {spec.scene.builtin} {scene_files.BUILTIN_REVISION}"
-        known = scene_files.BUILTIN_SHAPES[str(spec.scene.builtin)]
-        _check_shapes(spec, known, where)
-        lights = scene_files.BUILTIN_EMITTING[str(spec.scene.builtin)]
-        _check_emitters(spec, lights, known, where)
-    else:
-        scene = scene_files.SceneFile.read(find_scene(spec.scene.file, where, beside))
-        content, lights = scene.digest, scene.lights
-        _check_shapes(spec, scene.shape_ids, where)
-        _check_lights(spec, scene.emitting, where)
-        _check_emitters(spec, scene.emitting | scene.shapeless, scene.shape_ids, where)
-    spec = spec.model_copy(update={"content": content})
+    described = {**described, "content": ""}
+    try:
+        spec = SceneSpec.model_validate(described)
+    except ValidationError as error:
+        raise SpecError(f"{where}: {'; '.join(sentences(error, _keys(SceneSpec), described))}") from error
+    source = spec.scene
+    scene = (
+        BUILTIN[str(source.builtin)] if source.file is None else SceneFile.read(find_scene(source.file, where, beside))
+    )
+    _check_shapes(spec, scene, where)
+    _check_emitters(spec, scene, where)
+    spec = spec.model_copy(update={"content": scene.digest})
     if spec.view.free_space is not None and spec.view.free_space.of != spec.free_space_digest:
         raise SpecError(
             f"{where}: view.free_space: was measured for other geometry, groups or boxes of views; "
             f"take it out, or run `photonfarm scene free-space {where} --write` again"
         )
-    return spec, lights
-
-
-def _validate(described: dict[str, Any], where: str) -> SceneSpec:
-    try:
-        return SceneSpec.model_validate(described)
-    except ValidationError as error:
-        raise SpecError(f"{where}: {'; '.join(sentences(error, _keys(SceneSpec), described))}") from error
+    return spec, scene.lights
 
 
 def _keys(model: type[BaseModel]) -> set[str]:
@@ -100,37 +93,37 @@ def _keys(model: type[BaseModel]) -> set[str]:
     return {key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", ())}
 
 
-def _check_shapes(spec: SceneSpec, known: frozenset[str], where: str) -> None:
+def _check_shapes(spec: SceneSpec, scene: SceneFile, where: str) -> None:
+    """Raise SpecError for a group of shapes that the scene has not, and for a light of shapes that are none."""
     for group in spec.groups:
         for shape in group.shapes:
-            if shape not in known:
+            if shape not in scene.shape_ids:
                 fault = f"{where}: {group.name}.shapes: {shape!r} is not a shape id of the scene"
-                if not known:
+                if not scene.shape_ids:
                     raise SpecError(f"{fault}: its shapes have no ids; `photonfarm scene import` makes a copy with ids")
-                raise SpecError(f"{fault}; nearest: {nearest(shape, known)}")
-        if isinstance(group, Light) and group.rectangle and group.name in known:
-            raise SpecError(f"{where}: light {group.name!r} adds a rectangle under an id that the scene already has")
-
-
-def _check_lights(spec: SceneSpec, emitting: frozenset[str], where: str) -> None:
+                raise SpecError(f"{fault}; nearest: {nearest(shape, scene.shape_ids)}")
     for light in spec.lights:
-        if light.shapes and not emitting.intersection(light.shapes):
+        if light.rectangle and light.name in scene.shape_ids:
+            raise SpecError(f"{where}: light {light.name!r} adds a rectangle under an id that the scene already has")
+        if light.shapes and not scene.emitting.intersection(light.shapes):
             raise SpecError(
                 f"{where}: {light.name}.shapes: none of {', '.join(light.shapes)} emits light in the scene; what only "
                 "moves belongs under [[objects]]"
             )
 
 
-def _check_emitters(spec: SceneSpec, emitting: frozenset[str], shapes: frozenset[str], where: str) -> None:
+def _check_emitters(spec: SceneSpec, scene: SceneFile, where: str) -> None:
+    """Raise SpecError for a factor of what is no light of the scene's own."""
     moved = {shape: light for light in spec.lights for shape in light.shape_ids}
+    lights = scene.emitting | scene.shapeless
     for name in spec.emitters.by_id:
         if name in moved:
             remedy = "its rectangle has a radiance" if moved[name].rectangle else "to dim it, take it out of [[lights]]"
             fault = f"is of the movable light {moved[name].name!r}, and factors are of lights that no [[lights]] moves"
             raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; {remedy}")
-        if name not in emitting:
-            fault = "is a shape that emits no light" if name in shapes else "is no light of the scene"
-            own = emitting - set(moved)
+        if name not in lights:
+            fault = "is a shape that emits no light" if name in scene.shape_ids else "is no light of the scene"
+            own = lights - set(moved)
             near = ", ".join(sorted(own)) if 0 < len(own) <= FEW else nearest(name, own)
             raise SpecError(f"{where}: emitters.by_id: {name!r} {fault}; nearest light: {near}")
 
@@ -209,11 +202,7 @@ class NamedSpec:
 
 @dataclass(frozen=True, slots=True)
 class SpecLines:
-    """A spec's file, and the lines on which its keys stand, for messages: `view.origin`, `objects.1.box`, … → a line.
-
-    Python's TOML reader gives no lines, but a file's statements (a table's head, or a key with its value, which may go
-    over several lines) can each be read alone.
-    """
+    """A spec's file, and the lines on which its keys stand, for messages: `view.origin`, `objects.1.box` → a line."""
 
     file: Path
     lines: Mapping[str, int]  # from 1; empty for a spec in JSON
@@ -235,55 +224,26 @@ class SpecLines:
         return f"{self.file}" if line is None else f"{self.file} line {line}"
 
 
+_HEAD = re.compile(r"\s*(\[\[?)\s*([\w.-]+)\s*\]")
+_ENTRY = re.compile(r"\s*([\w.-]+)\s*=")
+
+
 def lines_of(text: str) -> dict[str, int]:
-    """The line of each key of a valid TOML document, from 1; elements of arrays of tables are numbered from 0."""
-    found: dict[str, int] = {}
-    counts: dict[str, int] = {}
+    """The lines of a valid TOML document, from 1, that begin with a table's head, or with a key and its value.
+
+    Elements of arrays of tables are numbered from 0. Python's TOML reader gives no lines.
+    """
+    lines: dict[str, int] = {}
+    counts = Counter[str]()
     table = ""
-    for line, statement, parsed in _statements(text):
-        if statement.startswith("["):
-            table = _entered(parsed, counts)
-            found.setdefault(table, line)
-        else:
-            for key in _keys_of_lines(parsed):
-                found.setdefault(f"{table}.{key}" if table else key, line)
-    return found
-
-
-def _statements(text: str) -> Iterator[tuple[int, str, dict[str, Any]]]:
-    """Each statement with its line, and what it says alone; comments and empty lines are left out."""
-    start, pending = 1, ""
     for number, line in enumerate(text.splitlines(), 1):
-        start = start if pending else number
-        pending += line + "\n"
-        try:
-            parsed = tomllib.loads(pending)
-        except tomllib.TOMLDecodeError:  # it goes on
-            continue
-        if parsed:
-            yield start, pending.strip(), parsed
-        pending = ""
-
-
-def _entered(head: dict[str, Any], counts: dict[str, int]) -> str:
-    """The table that a head opens; an element of an array is counted."""
-    path = ""
-    inner: Any = head
-    while inner:
-        ((key, inner),) = inner.items()
-        path = f"{path}.{key}" if path else key
-        if isinstance(inner, list):
-            counts[path] = counts.get(path, -1) + 1
-            inner = inner[0]
-        if path in counts:
-            path = f"{path}.{counts[path]}"
-    return path
-
-
-def _keys_of_lines(value: Any) -> Iterator[str]:
-    """All keys in a value, and in the tables in it."""
-    inner = value.items() if isinstance(value, dict) else enumerate(value)
-    for key, below in inner:
-        yield str(key)
-        if isinstance(below, dict) or (isinstance(below, list) and below and isinstance(below[0], dict)):
-            yield from (f"{key}.{name}" for name in _keys_of_lines(below))
+        if head := _HEAD.match(line):
+            counts[head[2]] += head[1] == "[["
+            path = table = ""
+            for part in head[2].split("."):
+                path, table = f"{path}.{part}".lstrip("."), f"{table}.{part}".lstrip(".")
+                table += f".{counts[path] - 1}" if counts[path] else ""
+            lines.setdefault(table, number)
+        elif entry := _ENTRY.match(line):
+            lines.setdefault(f"{table}.{entry[1]}".lstrip("."), number)
+    return lines

@@ -26,7 +26,7 @@ def test_the_cases_of_mitsuba_have_their_right_values(case: Callable[[str], Path
     assert np.array([made.bbox().min, made.bbox().max]).ravel() == pytest.approx([-2] * 3 + [2] * 3)
     _, made = loaded(case("mi-alias/scene.xml"))
     assert reflectance(made, 0, 0) == pytest.approx([0.8, 0.1, 0.1])
-    with pytest.raises(SpecError, match=r"scene\.xml.*line 6: entity 'header'.*<include"):
+    with pytest.raises(SpecError, match=r"scene\.xml.*line \d+: has a DOCTYPE.*<include"):
         loaded(case("mi06-entity/scene.xml"))
 
 
@@ -209,7 +209,7 @@ def test_the_camera_says_where_the_room_is_and_which_axis_is_up(write_xml: Calla
             "Mitsuba cannot load it: scene.xml: line 2: <bsdf> 'C': .*Foo",
         ),
         ('<include filename="scene.xml"/>', "line 2: .* includes itself"),
-        ("&gone;", "undefined entity: line 2.*gone"),
+        ("&gone;", "undefined entity: line 2"),
         (SPHERE * 2, "line 2: .* duplicate ID: .Ball"),
         (
             f'{SPHERE}<emitter type="point"><rgb name="intensity" value="1 nan 1"/></emitter>',
@@ -232,16 +232,6 @@ def test_the_camera_says_where_the_room_is_and_which_axis_is_up(write_xml: Calla
 def test_what_is_wrong_is_named(write_xml: Callable[..., Path], loaded: Loaded, content: str, named: str) -> None:
     with pytest.raises(SpecError, match=named):
         loaded(write_xml(content))
-
-
-@pytest.mark.parametrize("entity", ['<shape type="&s;"/>', '<shape type="sphere">&s;</shape>'])
-def test_entities_of_other_files_are_refused(tmp_path: Path, loaded: Loaded, entity: str) -> None:
-    path = tmp_path / "scene.xml"
-    path.write_text(f'<!DOCTYPE scene SYSTEM "s.dtd" [<!ENTITY t "cube">]><scene version="3.0.0">\n{entity}</scene>')
-    with pytest.raises(SpecError, match="line 2: entity 's'"):
-        loaded(path)
-    path.write_text(path.read_text().replace(entity, '<shape type="&t;" id="a&gt;b"/>'))
-    assert len(loaded(path)[1].shapes()) == 1
 
 
 @pytest.mark.parametrize("binary", [False, True])

@@ -13,7 +13,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.statistics import block_z_test
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.scene.files import BUILTIN_EMITTING
+from photonfarm.scene.files import BUILTIN
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec
@@ -209,7 +209,7 @@ def test_bdpt_agrees_with_path_tracing_where_lights_are_dimmed(file_scene: Loade
     assert test.passed, test
 
 
-@pytest.mark.parametrize("name", BUILTIN_EMITTING)
+@pytest.mark.parametrize("name", BUILTIN)
 def test_the_listed_lights_of_a_built_in_room_are_those_that_shine(name: str) -> None:
     scene = LoadedScene.load(load_spec(name)).scene
-    assert {shape.id() for shape in scene.shapes() if shape.is_emitter()} == BUILTIN_EMITTING[name]
+    assert {shape.id() for shape in scene.shapes() if shape.is_emitter()} == BUILTIN[name].emitting

@@ -8,7 +8,7 @@ import pytest
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.scene.files import BUILTIN_SHAPES
+from photonfarm.scene.files import BUILTIN
 from photonfarm.scene.spec import BUILTIN_ROOMS
 from photonfarm.scene.spec_loading import load_spec, parse_spec
 
@@ -25,7 +25,7 @@ def solid_faces(shape: Any) -> np.ndarray:
 
 
 def test_the_listed_shape_ids_are_those_of_the_room(room: LoadedScene) -> None:
-    listed = BUILTIN_SHAPES[str(room.spec.scene.builtin)]
+    listed = BUILTIN[str(room.spec.scene.builtin)].shape_ids
     assert {shape.id() for shape in room.scene.shapes()} == listed
     assert len(room.scene.shapes()) == len(listed)
 

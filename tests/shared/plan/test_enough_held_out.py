@@ -9,46 +9,16 @@ from photonfarm.plan.hold_out import HOLD_OUT, are_held_out, enough, places_of
 UNITS = [hashlib.sha256(bytes([i])).digest()[:16] for i in range(200)]
 
 
-HELD = [
-    3,
-    9,
-    14,
-    15,
-    29,
-    40,
-    44,
-    45,
-    47,
-    49,
-    57,
-    60,
-    66,
-    75,
-    81,
-    93,
-    102,
-    115,
-    118,
-    121,
-    134,
-    147,
-    157,
-    163,
-    166,
-    170,
-    173,
-    183,
-    188,
-]
+HELD = "3 9 14 15 29 40 44 45 47 49 57 60 66 75 81 93 102 115 118 121 134 147 157 163 166 170 173 183 188"
 """Of the units, by the share HOLD_OUT, since there are stores."""
 
 
 def test_what_is_held_out_is_a_contract() -> None:
     held = [i for i, out in enumerate(are_held_out(UNITS, HOLD_OUT)) if out]
-    assert held == HELD
+    assert " ".join(map(str, held)) == HELD
 
 
-@pytest.mark.parametrize("count", range(2, 60))
+@pytest.mark.parametrize("count", [2, 3, 5, 8, 30, 59])
 @pytest.mark.parametrize("least", [0.0, HOLD_OUT])
 def test_a_share_leaves_something_on_both_sides_of_any_plan(count: int, least: float) -> None:
     share = enough(UNITS[:count], least)

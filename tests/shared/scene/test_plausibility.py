@@ -84,7 +84,6 @@ def test_a_key_is_found_on_the_line_where_it_stands() -> None:
     )
     assert lines == {
         "name": 1,
-        "scene": 2,
         "scene.file": 2,
         "objects.0": 4,
         "objects.0.name": 5,
@@ -93,8 +92,6 @@ def test_a_key_is_found_on_the_line_where_it_stands() -> None:
         "lights.0": 11,
         "lights.1": 12,
         "lights.1.box": 13,
-        "lights.1.box.min": 13,
-        "lights.1.box.max": 13,
         "lights.1.rectangle": 14,
         "lights.1.rectangle.size": 15,
         "view": 16,

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, SpecError
-from photonfarm.plan.joined import Joined, samples_to_join
-from photonfarm.plan.request import PlannedRows, SamplesToPlan, expand_samples
+from photonfarm.plan.request import Joined, PlannedRows, SamplesToPlan, expand_samples, samples_to_join
 from photonfarm.store.check.plan_check import UNREADABLE, CheckedScene
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import crc_of

@@ -18,10 +18,10 @@ from pydantic import Field, TypeAdapter, ValidationError
 from photonfarm.core.errors import CorruptError, SpecError, store_errors
 from photonfarm.core.keys import Key
 from photonfarm.core.models import sentences
-from photonfarm.plan.joined import Joined
 from photonfarm.plan.request import (
     UNUSED,
     Expansion,
+    Joined,
     PlannedContent,
     PlannedRows,
     Request,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Sequence
 from itertools import count, islice
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +17,9 @@ from photonfarm.core.errors import IncompleteError
 from photonfarm.core.keys import Key, seed_of
 from photonfarm.core.records import F32, Photons, arrays_of
 from photonfarm.scene.view import View
+
+if TYPE_CHECKING:
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
 ATTEMPTS = 3
 """The seeds tried for one render; three non-finite renders in a row are a fault of the scene, not bad luck."""
@@ -26,23 +29,7 @@ PURPOSES = ("half A", "half B")
 log = logging.getLogger(__name__)
 
 
-class Estimator(Protocol):
-    """A scene in a configuration, as far as estimates go."""
-
-    samples_at_once: int
-    """The number of samples that `halves_of` should be given at once."""
-
-    def render_halves(self, view: View, seeds: Sequence[int]) -> F32:
-        """Independent noisy estimates of radiance, one for each seed, (K, H, W, 3) linear."""
-
-    def render_images(self, views: Sequence[View], seeds: Sequence[int]) -> F32:
-        """Such estimates of several views, one for each view and seed, rendered together."""
-
-    def photons(self, seed: int) -> Photons | None:
-        """Light sub-paths of the current configuration; None for a spec without photons."""
-
-
-def halves_of(scene: Estimator, samples: Sequence[tuple[Key, View]]) -> list[tuple[F32, int]]:
+def halves_of(scene: LoadedScene, samples: Sequence[tuple[Key, View]]) -> list[tuple[F32, int]]:
     """Two independent estimates of each view, (2, H, W, 3), by a sample's key, and the number of discarded renders.
 
     Samples given together are rendered together. Raises IncompleteError if estimates stay non-finite.
@@ -63,7 +50,7 @@ def first_seeds(key: Key) -> tuple[int, int]:
     return seed_a, next(_seeds(key, PURPOSES[1], (seed_a,)))
 
 
-def _finite(scene: Estimator, sample: tuple[Key, View], seeds: tuple[int, int], halves: F32) -> tuple[F32, int]:
+def _finite(scene: LoadedScene, sample: tuple[Key, View], seeds: tuple[int, int], halves: F32) -> tuple[F32, int]:
     """A sample's halves, those that are not finite drawn again, and the number of discarded renders."""
     thrown = 0
     for half, purpose in enumerate(PURPOSES):
@@ -73,7 +60,7 @@ def _finite(scene: Estimator, sample: tuple[Key, View], seeds: tuple[int, int], 
     return halves, thrown
 
 
-def _draw_again(scene: Estimator, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
+def _draw_again(scene: LoadedScene, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
     """Another estimate in place of a non-finite one, with seeds that are not `taken`, and how many were discarded."""
     _log_discarded(key, purpose)
     for attempt, seed in enumerate(islice(_seeds(key, purpose, taken), ATTEMPTS - 1), start=1):
@@ -84,7 +71,7 @@ def _draw_again(scene: Estimator, key: Key, purpose: str, view: View, taken: tup
     raise IncompleteError(f"{purpose} of sample {key.hex()} came out non-finite {ATTEMPTS} times")
 
 
-def photons_of(scene: Estimator, key: Key) -> tuple[Photons | None, int]:
+def photons_of(scene: LoadedScene, key: Key) -> tuple[Photons | None, int]:
     """The photons of the current configuration, by its key, and the number of attempts that were not finite.
 
     None for a spec without photons. Raises IncompleteError if they stay non-finite.

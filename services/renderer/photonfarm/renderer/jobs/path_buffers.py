@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from photonfarm.farm.configuration import find_configuration
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import (
     SceneLoader,
-    SceneRenderer,
     lit_points,
     load_scene,
     locate,
@@ -26,6 +26,9 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import Store
 from photonfarm.store.read.find import scene_named
+
+if TYPE_CHECKING:
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
 
 def render_path(store: str | Path, scene: str, modification: str | None, path: CameraPath | int) -> Frames:
@@ -76,7 +79,7 @@ def frames_of(
 
 
 def _guides(
-    scene: SceneRenderer, modification: Modification, views: Sequence[View], spec: SceneSpec, cloud: BasePointCloud
+    scene: LoadedScene, modification: Modification, views: Sequence[View], spec: SceneSpec, cloud: BasePointCloud
 ) -> Guides:
     """The guides of all views, stacked."""
     key, lit = modification.key(spec.radiance_id), lit_points(cloud, modification)

@@ -14,7 +14,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,21 +25,23 @@ from photonfarm.core.records import (
     F32,
     LIT_POINTS,
     BasePointCloud,
-    Geometry,
     Guides,
     Photons,
     ViewBuffers,
     Visibility,
     arrays_of,
 )
-from photonfarm.renderer.jobs.estimates import Estimator, halves_of, photons_of
+from photonfarm.renderer.jobs.estimates import halves_of, photons_of
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import Modification, rebuild
-from photonfarm.scene.spec import GuideSpec, SceneSpec
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
 from photonfarm.scene.view import View
 from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
 from photonfarm.store.model.lease import announce_work
+
+if TYPE_CHECKING:
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
 SCENES_KEPT = 2
 """The number of loaded scenes kept: jobs of two scenes may alternate in the queue."""
@@ -54,39 +56,13 @@ _PACKAGES = ("photonfarm", "mitsuba", "drjit", "numpy", "zarr")
 log = logging.getLogger(__name__)
 
 
-class SceneRenderer(Estimator, Protocol):
-    """A loaded scene that is edited in place: the part of `renderer.scene.loaded_scene.LoadedScene` that jobs use."""
-
-    def apply(self, modification: Modification) -> None:
-        """Put the scene into a configuration."""
-
-    def buffers(self, view: View) -> ViewBuffers:
-        """The image-space buffers of a view."""
-
-    def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
-        """The guides of a view, rendered as `wanted`; `key` is the view's.
-
-        `lit` are positions and normals (L, 3) of the points whose irradiance is required.
-        """
-
-    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
-        """Whether a view sees points (N, 3) of the current configuration, (N,)."""
-
-    def base(self) -> tuple[Geometry, BasePointCloud]:
-        """Geometry and base point cloud of the scene at rest."""
-
-
-SceneLoader = Callable[[SceneSpec], SceneRenderer]
+SceneLoader = Callable[[SceneSpec], "LoadedScene"]
 
 OnProgress = Callable[[str, int, int], object]
 """A callback with the phase of a job in words, how many of its parts are done, and how many there are; 0: no parts."""
 
 
-def _ignore_progress(phase: str, done: int, total: int) -> None:
-    """No progress is asked for."""
-
-
-def load_scene(spec: SceneSpec) -> SceneRenderer:
+def load_scene(spec: SceneSpec) -> LoadedScene:
     """The scene of a spec, loaded into Mitsuba on this process's device, with a thread pool of one."""
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
@@ -99,7 +75,7 @@ class _Loaded:
     """A loaded scene, and its place in the store."""
 
     stored: SceneStore
-    scene: SceneRenderer
+    scene: LoadedScene
     strategy: dict[str, Any]  # that it was loaded with
     compiled: bool = False  # its first image compiles the kernels
     _cloud: BasePointCloud | None = None
@@ -118,7 +94,12 @@ class ShardRenderer:
     """Renders jobs of a store, keeping the most recently used scenes loaded."""
 
     def __init__(
-        self, store: Store, *, worker: str, load: SceneLoader = load_scene, on_progress: OnProgress = _ignore_progress
+        self,
+        store: Store,
+        *,
+        worker: str,
+        load: SceneLoader = load_scene,
+        on_progress: OnProgress = lambda *_: None,
     ) -> None:
         """Take a store; `worker` is the name written into markers."""
         self._store = store
@@ -148,7 +129,7 @@ class ShardRenderer:
             return self._render(self._scene(stored), stored.job_rows(job))
 
     def _render(self, loaded: _Loaded, rows: JobRows) -> bool:
-        stored, began = loaded.stored, self._now()
+        stored, wall_s, core_s = loaded.stored, time.monotonic(), time.process_time()
         cloud = loaded.cloud()
         with JobWriter(stored, rows) as out:
             report = self._on_progress if loaded.compiled else self._compiles_first
@@ -157,7 +138,18 @@ class ShardRenderer:
             rendering.run(rows)
             loaded.compiled = True
             self._on_progress(COMMITS, len(rows.samples), len(rows.samples))
-            committed = out.commit(self._figures(began, rendering, stored.spec))
+            figures = Figures(
+                core_s=time.process_time() - core_s,
+                wall_s=time.monotonic() - wall_s,
+                redrawn=rendering.redrawn,
+                worker=self._worker,
+                versions=versions(),
+                device=backend.device().name,
+                driver=backend.device().driver,
+                strategy=stored.spec.strategy(),
+                taken_over=rendering.taken_over,
+            )
+            committed = out.commit(figures)
         if not committed:
             what = "was committed by another worker while it was rendered here; that one stays"
             log.warning("scene %s, job %d: %s", stored.scene_id, rows.job, what)
@@ -167,9 +159,6 @@ class ShardRenderer:
         """Report progress of a scene's first job, whose first sample takes longest."""
         self._on_progress(phase if done else COMPILES, done, total)
 
-    def _now(self) -> tuple[float, float]:
-        return time.monotonic(), time.process_time()
-
     def _other_halves(self, other: str | None) -> OtherHalves | None:
         if other is None:
             return None
@@ -177,21 +166,6 @@ class ShardRenderer:
             self._others[other] = OtherHalves(self._store.root, other)
         self._others[other].refresh()
         return self._others[other]
-
-    def _figures(self, began: tuple[float, float], rendering: _Rendering, spec: SceneSpec) -> Figures:
-        """The cost of the work since `began`, for a marker."""
-        wall, core = self._now()
-        return Figures(
-            core_s=core - began[1],
-            wall_s=wall - began[0],
-            redrawn=rendering.redrawn,
-            worker=self._worker,
-            versions=versions(),
-            device=backend.device().name,
-            driver=backend.device().driver,
-            strategy=spec.strategy(),
-            taken_over=rendering.taken_over,
-        )
 
     def _scene(self, stored: SceneStore) -> _Loaded:
         """The scene, loaded; anew if it is to be rendered by another strategy than before."""
@@ -248,7 +222,7 @@ def lit_points(cloud: BasePointCloud, modification: Modification) -> tuple[F32, 
 
 
 def visibility_of(
-    scene: SceneRenderer, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
+    scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
 ) -> Visibility:
     """Which points a view sees in the current configuration: of its cloud, as `rebuild` returns it, and its photons."""
     position, present = points
@@ -263,7 +237,7 @@ class _Rendering:
 
     def __init__(
         self,
-        scene: SceneRenderer,
+        scene: LoadedScene,
         cloud: BasePointCloud,
         spec: SceneSpec,
         out: JobWriter,

@@ -55,11 +55,6 @@ class Comparison:
         return self.different == 0
 
     @property
-    def repeats_bytes(self) -> bool:
-        """Whether equal seeds can give equal bytes: on processors alone, as cards add up in an order of their own."""
-        return self.devices == (markers.CPU, markers.CPU)
-
-    @property
     def exit_code(self) -> int:
         """0: equal to the bit, 1: differs by no more than chance, 4: by more."""
         return 0 if self.is_equal else 1 if self.z < self.z_limit else StoreError.exit_code
@@ -69,16 +64,16 @@ class Comparison:
         if self.is_equal:
             return f"equal to the bit, {self.values} values"
         verdict = "within what chance allows" if self.z < self.z_limit else "more than chance allows"
-        others = [f"{name} {there} there, {here} here" for name, (there, here) in self.other_versions.items()]
         size = f"by at most {self.largest:.2g}, by {self.relative:.2g} of the image (RMS)"
         test = f"block z-test {self.z:.2g} of {self.z_limit:.2g}: {verdict}"
-        versions_differ = f"; other versions: {', '.join(others)}" if others else ""
-        return f"{self.different} of {self.values} values differ, {size}; {test}{versions_differ}{self._name_cards()}"
-
-    def _name_cards(self) -> str:
-        """Why bytes need not be equal, where a card rendered."""
-        there, here = self.devices
-        return "" if self.repeats_bytes else f"; rendered on {there}, here on {here}: equal in distribution alone"
+        line = f"{self.different} of {self.values} values differ, {size}; {test}"
+        if self.other_versions:
+            others = [f"{name} {there} there, {here} here" for name, (there, here) in self.other_versions.items()]
+            line += f"; other versions: {', '.join(others)}"
+        if self.devices != (markers.CPU, markers.CPU):  # equal seeds give equal bytes on processors alone
+            there, here = self.devices
+            line += f"; rendered on {there}, here on {here}: equal in distribution alone"
+        return line
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -151,7 +146,11 @@ def repeat(
     number = planned_pass if pass_number is None else pass_number
     key = sample_key(stored.spec.radiance_id, modification, view.vector, number)
     at = _row_of(stored, key)
-    spec = locate(_use_scene_file_beside(scene, _spec_as_rendered(opened, stored, key)))
+    spec = _spec_as_rendered(opened, stored, key)
+    if is_spec_file(scene) and (folder := scene_folder(scene, spec)) is not None:
+        source = spec.scene.model_copy(update={"file": str(folder / str(spec.scene.file))})
+        spec = spec.model_copy(update={"scene": source})
+    spec = locate(spec)
     with tell_waiting(log, f"loading scene {spec.name}"):
         loaded = load(spec)
         loaded.apply(modification)
@@ -182,15 +181,6 @@ def _spec_as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
     return stored.spec.model_copy(update={"transport": stored.spec.transport.model_copy(update=strategy)})
 
 
-def _use_scene_file_beside(named: str, spec: SceneSpec) -> SceneSpec:
-    """The spec with the scene file that lies beside the spec's file, if a user has named that."""
-    folder = scene_folder(named, spec) if is_spec_file(named) else None
-    if folder is None:
-        return spec
-    source = spec.scene.model_copy(update={"file": str(folder / str(spec.scene.file))})
-    return spec.model_copy(update={"scene": source})
-
-
 def _read_plan(stored: SceneStore, row: int) -> tuple[Modification, View, int]:
     """The configuration, the view and the pass in a row; raises StoreError if no plan has a sample there."""
     plans = stored.plans()
@@ -210,9 +200,7 @@ def _compare(stored: SceneStore, there: F32, row: int, halves: F32) -> Compariso
     test = block_z_test(_interleave(here), _interleave(there), blocks=4)
     root = float(np.sqrt(np.mean(there.astype(np.float64) ** 2)))
     figures = stored.marker(row // stored.plans()[0].shard_rows)["figures"]
-    others = {
-        name: (said, here_) for name, said in figures["versions"].items() if (here_ := versions().get(name)) != said
-    }
+    installed = {name: (there_, versions().get(name, "not installed")) for name, there_ in figures["versions"].items()}
     return Comparison(
         different=int(np.count_nonzero(here.view(np.uint32) != there.view(np.uint32))),
         values=here.size,
@@ -220,7 +208,7 @@ def _compare(stored: SceneStore, there: F32, row: int, halves: F32) -> Compariso
         relative=float(np.sqrt(np.mean(difference**2))) / root if root else 0.0,
         z=test.z_max,
         z_limit=test.z_limit,
-        other_versions={name: (said, here_ or "not installed") for name, (said, here_) in others.items()},
+        other_versions={name: pair for name, pair in installed.items() if pair[0] != pair[1]},
         devices=(figures.get("device", markers.CPU), backend.device().name),
     )
 

@@ -101,16 +101,16 @@ def _load_builtin(spec: SceneSpec) -> Any:
 
 
 def _load_file(spec: SceneSpec, beside: Path | None) -> Any:
-    file = SceneFile.read(find_scene(str(spec.scene.file), spec.name, beside))
-    if file.digest != spec.content:
+    file = find_scene(str(spec.scene.file), spec.name, beside)
+    if SceneFile.read(file).digest != spec.content:
         raise SpecError(
-            f"{spec.name}: {file.path} or a file it names is not what the spec was made from; load the spec anew"
+            f"{spec.name}: {file} or a file it names is not what the spec was made from; load the spec anew"
         )
     try:
         with threads_to_read_with():
-            scene = mi.load_file(str(file.path), optimize=False, **spec.scene.parameters)
+            scene = mi.load_file(str(file), optimize=False, **spec.scene.parameters)
     except (RuntimeError, ValueError) as error:
-        raise SpecError(f"{file.path}: Mitsuba cannot load it: {' '.join(str(error).split())}") from error
+        raise SpecError(f"{file}: Mitsuba cannot load it: {' '.join(str(error).split())}") from error
     dim(scene, spec)
     free = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
     shining = [emitter for emitter in free if factor_of(emitter, spec) > 0]

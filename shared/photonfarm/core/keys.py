@@ -69,10 +69,6 @@ class Stream:
         raw = self._bits.random_raw(int(np.prod(shape)))
         return (raw >> np.uint64(11)).astype(np.float64).reshape(shape) * 2.0**-53
 
-    def uniform_in(self, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
-        """One point uniform in the axis-aligned box [low, high]; a flat axis gives its one value exactly."""
-        return low + self.uniform(*low.shape) * (high - low)
-
 
 AT_ONCE = 512
 """The number of streams that are drawn from at a time, so that intermediate results stay in the processor's cache."""

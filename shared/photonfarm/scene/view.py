@@ -89,8 +89,6 @@ def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
     return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
 
 
-_ENDS = ("low", "high")
-
 MOST_DRAWS = 1000
 """The draws of a camera's position after which it is given up: then fewer than one in a hundred is free, or so."""
 
@@ -106,7 +104,8 @@ def sample_views(
     the configuration. Raises SpecError where almost nothing is free.
     """
     keys = [make_key("view", key, seed, index) for key, index in zip(modification_keys, indices, strict=True)]
-    low, high = (np.concatenate([getattr(box, end) for box in (spec.view.origin, spec.view.look_at)]) for end in _ENDS)
+    low = np.concatenate([spec.view.origin.low, spec.view.look_at.low])
+    high = np.concatenate([spec.view.origin.high, spec.view.look_at.high])
     corners = np.concatenate([low, high]).reshape(-1, 3)
     least = 1e-4 * np.linalg.norm(np.ptp(corners, axis=0))
     vectors, left = np.empty((len(keys), 6), np.float32), np.arange(len(keys))
@@ -117,7 +116,10 @@ def sample_views(
         origin, target = vectors[left, :3], vectors[left, 3:].astype(np.float64)
         is_kept = np.linalg.norm(target - origin, axis=1) >= least
         left = left[~(is_kept & are_in_free_space(spec, origin, modifications[left]))]
-    raise nowhere(spec)
+    raise SpecError(
+        f"{spec.name}: view.origin: of {MOST_DRAWS} cameras none stood in the open, by view.free_space; make the box "
+        "larger, or let groups leave room in it"
+    )
 
 
 def sample_view(
@@ -131,14 +133,6 @@ def sample_view(
 def view_keys(modification_keys: Iterable[Key], vectors: F32) -> list[Key]:
     """The content keys of views (N, 6) of configurations with these keys."""
     return [view_key(key, vector) for key, vector in zip(modification_keys, vectors, strict=True)]
-
-
-def nowhere(spec: SceneSpec) -> SpecError:
-    """The error for a configuration without a place for a camera."""
-    return SpecError(
-        f"{spec.name}: view.origin: of {MOST_DRAWS} cameras none stood in the open, by view.free_space; make the box "
-        "larger, or let groups leave room in it"
-    )
 
 
 def are_in_free_space(spec: SceneSpec, origins: F32, modifications: F32) -> NDArray[np.bool_]:

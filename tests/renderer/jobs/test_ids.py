@@ -68,15 +68,6 @@ def test_no_sample_is_lost_to_a_change_that_leaves_its_mean(
         np.testing.assert_array_equal(reader.read(row).radiance, halves)
 
 
-def test_radiance_is_stored_by_the_first_plans_power_of_two_even_if_the_spec_was_lost(
-    tmp_path: Path, spec: SceneSpec, analytic: ModuleType
-) -> None:
-    store = Store(tmp_path / "store", create=True)
-    (rendered(store, spec, analytic).folder / "spec.json").unlink()
-    store.plan(analytic.small_spec(exposure=64.0), Request(modifications=4, views_per_modification=2))
-    assert store.scene(spec.scene_id).spec.radiance_exponent == 0
-
-
 def test_each_jobs_marker_records_the_strategy_of_the_submission_before_it(
     tmp_path: Path, spec: SceneSpec, analytic: ModuleType
 ) -> None:
@@ -178,22 +169,6 @@ def test_halves_that_are_damaged_there_are_rendered_and_the_healthy_scene_is_pla
     (scene.folder / "plans/000000/zarr.json").write_text("{")
     assert find_same_radiance(Store(tmp_path / "store"), other) is None
     assert find_same_radiance(Store(tmp_path / "store"), analytic.small_spec(points=48)) == other.scene_id
-
-
-def test_two_scenes_that_take_halves_from_each_other_are_repeated(
-    tmp_path: Path, spec: SceneSpec, analytic: ModuleType
-) -> None:
-    store = Store(tmp_path / "store", create=True)
-    other = analytic.small_spec(points=32)
-    for each, halves_from in ((spec, None), (other, spec.scene_id), (spec, other.scene_id)):
-        request = REQUEST if halves_from is None else Request(modifications=4, views_per_modification=2)
-        store.plan(each, request, shard_rows=None if store.has_scene(each.scene_id) else 2, halves_from=halves_from)
-    for each in (spec, other):
-        analytic.render_missing(store, each.scene_id)
-    for each in (spec, other):
-        again = repeat(store.root, each.scene_id, 6, None, print, load=analytic.AnalyticScene)
-        assert again.comparison is not None
-        assert again.comparison.is_equal
 
 
 def test_a_submission_says_what_it_has_replaced_of_the_stored_spec(tmp_path: Path, analytic: ModuleType) -> None:

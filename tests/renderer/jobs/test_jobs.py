@@ -93,17 +93,6 @@ def test_each_modification_is_applied_once_a_job_and_each_view_seen_once_in_all(
     assert recorded.loads == 1
 
 
-def test_passes_added_later_render_neither_buffers_nor_guides_nor_photons_again(
-    scene: SceneStore, store: Store, recorded: type
-) -> None:
-    render_all(scene, store, recorded)
-    scene.plan(Request(modifications=3, views_per_modification=2, passes=3))
-    recorded.calls.clear()
-    render_all(scene, store, recorded)
-    assert len(asked(recorded, "half")) == 12
-    assert asked(recorded, "buffers") == asked(recorded, "guides") == asked(recorded, "photons") == []
-
-
 @pytest.mark.parametrize("shard_rows", [1, 3])
 def test_photons_that_another_job_stores_are_traced_again_and_seen_the_same(
     analytic: ModuleType, scene: SceneStore, store: Store, recorded: type, tmp_path: Path, shard_rows: int
@@ -207,17 +196,6 @@ def test_a_half_never_takes_the_seed_of_the_other() -> None:
     assert taken not in tried
 
 
-def test_a_render_that_is_not_finite_is_drawn_again_and_counted(
-    scene: SceneStore, store: Store, recorded: type
-) -> None:
-    recorded.bad = 2
-    render_all(scene, store, recorded)
-    assert [scene.marker(job)["figures"]["redrawn"] for job in range(2)] == [2, 0]
-    reader = SceneReader(store.root, scene.scene_id)
-    assert all(np.isfinite(reader.read(int(row)).radiance).all() for row in reader.refresh())
-    assert len(set(asked(recorded, "half")[:3])) == 3
-
-
 def test_after_three_renders_that_are_not_finite_the_job_fails_and_nothing_is_stored(
     scene: SceneStore, store: Store, recorded: type
 ) -> None:
@@ -244,14 +222,6 @@ def test_buffers_and_guides_that_are_not_finite_fail_the_job_and_name_view_and_s
     assert scene.missing_jobs() == [0, 1]
 
 
-def test_a_committed_job_is_not_rendered_again(scene: SceneStore, store: Store, recorded: type) -> None:
-    render_all(scene, store, recorded)
-    recorded.calls.clear()
-    assert not ShardRenderer(store, worker="late", load=recorded.load).render(scene.scene_id, 0)
-    assert recorded.calls == []
-    assert scene.marker(0)["figures"]["worker"] == "test"
-
-
 def test_a_job_that_is_not_committed_says_who_came_between(
     scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -268,16 +238,6 @@ def test_a_job_that_is_not_committed_says_who_came_between(
     (said,) = [record.getMessage() for record in caplog.records]
     assert scene.is_committed(0)
     assert "was committed by another worker" in said
-
-
-def test_the_marker_tells_what_the_job_cost_and_which_versions_rendered_it(
-    scene: SceneStore, store: Store, recorded: type
-) -> None:
-    render_all(scene, store, recorded)
-    figures = scene.marker(0)["figures"]
-    assert figures["core_s"] > 0
-    assert figures["wall_s"] > 0
-    assert {"mitsuba", "drjit", "numpy", "zarr"} <= figures["versions"].keys()
 
 
 def test_a_job_tells_its_phases_and_each_sample_and_only_the_first_compiles(

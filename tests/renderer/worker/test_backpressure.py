@@ -130,13 +130,13 @@ def test_a_worker_waits_for_space_says_so_once_and_goes_on(
 def test_a_commit_that_finds_the_disk_full_fails_no_job_and_ends_no_worker(
     analytic: ModuleType, store: Store, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
-    """The first two commits find no space, whatever the reserve."""
+    """The first commit finds no space, whatever the reserve."""
     code = """
 import errno, runpy, sys
 from photonfarm.renderer.worker import backpressure
 from photonfarm.store.io.local import LocalStorage
-backpressure.FULL_S = 0.5
-plain, refusals = LocalStorage.adopt, [2]
+backpressure.FULL_S = 0.2
+plain, refusals = LocalStorage.adopt, [1]
 def adopt(self, part, name, *, replace=False):
     if "radiance" in name and refusals[0]:
         refusals[0] -= 1

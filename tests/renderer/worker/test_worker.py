@@ -52,36 +52,20 @@ def test_a_worker_fills_an_empty_queue_from_the_store_and_stops_when_nothing_is_
     assert not list(connect(redis_server.url).scan_iter(f"*{scene.scene_id}*")), "a done job leaves nothing in Redis"
 
 
-@pytest.mark.parametrize("quiet", [False, True])
-def test_a_worker_says_at_its_end_what_all_its_children_have_done(
-    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, quiet: bool
+@pytest.mark.parametrize(("limit", "quiet"), [("max_jobs", False), ("max_rss_bytes", True)])
+def test_a_child_is_replaced_after_so_many_jobs_or_bytes_and_what_all_have_done_is_said_at_the_end(
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, limit: str, quiet: bool
 ) -> None:
     said: list[str] = []
-    run_worker(
-        tmp_path / "store",
-        redis_server.url,
-        name="ada",
-        child=analytic.command(),
-        report=said.append,
-        max_jobs=1,
-        quiet=quiet,
-        **QUICK,
-    )
-    summary = "worker ada: ended: 2 jobs done"
-    assert said == ([] if quiet else [summary])
-
-
-@pytest.mark.parametrize("limit", [{"max_jobs": 1}, {"max_rss_bytes": 1}])
-def test_a_child_is_replaced_after_so_many_jobs_or_bytes(
-    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, limit: dict[str, int]
-) -> None:
     starts = tmp_path / "starts"
     code = "import sys, runpy; open(sys.argv[1], 'a').write('x'); sys.argv = sys.argv[2:]; "
     code += "runpy.run_path(sys.argv[0], run_name='__main__')"
     child = (sys.executable, "-c", code, str(starts), *analytic.command()[1:])
-    run_worker(tmp_path / "store", redis_server.url, child=child, **QUICK, **limit)
+    how = {**QUICK, "name": "ada", "report": said.append, "quiet": quiet, limit: 1}
+    run_worker(tmp_path / "store", redis_server.url, child=child, **how)
     assert scene.missing_jobs() == []
     assert len(starts.read_text()) == 3
+    assert said == ([] if quiet else ["worker ada: ended: 2 jobs done"])
 
 
 def test_a_scene_that_never_renders_ends_a_complete_run_is_set_aside_at_last_and_can_be_repeated(
@@ -185,20 +169,6 @@ def test_a_scene_whose_files_are_not_here_is_left_to_others_and_keeps_nothing_el
     assert queue_status(connection).left == {}, "said while it works only"
 
 
-def test_status_tells_what_is_left_to_others_and_who_takes_no_jobs(
-    scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    left = {scene.scene_id: "gone.xml is not there", "ab" * 16: "another store's"}
-    queue_samples.told(connect(redis_server.url), "ada", WorkerReport(paused="the disk is full", left=left))
-    status.callback(tmp_path / "store", redis_server.url, as_json=False)
-    said = capsys.readouterr().out
-    assert "gone.xml is not there" in said
-    assert "the disk is full" in said
-    assert "another store's" not in said
-    status.callback(tmp_path / "store", redis_server.url, as_json=True)
-    assert json.loads(capsys.readouterr().out)["queue"]["paused"] == {"ada": "the disk is full"}
-
-
 def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
     scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -226,16 +196,6 @@ def _once(look: Callable[[], bool], seconds: float = 10.0) -> bool:
     while not (found := look()) and time.monotonic() < end:
         time.sleep(0.02)
     return found
-
-
-@pytest.mark.parametrize("named", ["analytic", "beginning"])
-def test_a_scene_goes_by_its_name_and_by_how_its_id_begins(
-    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, named: str
-) -> None:
-    text = scene.scene_id[:6] if named == "beginning" else named
-    run_worker(tmp_path / "store", redis_server.url, child=analytic.command(), scene_id=text, **QUICK)
-    assert scene.missing_jobs() == []
-    assert not render_job(tmp_path / "store", text, 0, load=analytic.AnalyticScene.load)[0]
 
 
 def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_alone(
@@ -283,12 +243,6 @@ def test_a_redis_that_refuses_for_good_ends_a_worker_with_a_sentence(
     worker.join(60)
     assert "docker/redis.sh" in str(ended[0])
     assert "secret" not in str(ended[0])
-
-
-def test_a_store_that_cannot_be_opened_is_told_before_anything_is_started(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError):
-        run_worker(tmp_path / "file/store", "redis://127.0.0.1:1/0")
 
 
 def test_a_store_that_refuses_a_commit_ends_the_worker_and_fails_no_job(

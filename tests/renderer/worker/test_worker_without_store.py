@@ -85,9 +85,10 @@ def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
     analytic: ModuleType, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     log, connection = tmp_path / "log", connect(redis_server.url)
-    with analytic.start_worker(tmp_path / "later", redis_server.url, analytic.command(), log, name="ada") as running:
+    how = {"name": "ada", "heartbeat_ttl_s": 1.5}
+    with analytic.start_worker(tmp_path / "later", redis_server.url, analytic.command(), log, **how) as running:
         analytic.wait_for(lambda: read_workers(connection), 60)
-        time.sleep(3)  # longer than its heartbeat lasts
+        time.sleep(1.6)  # longer than its heartbeat lasts
         check(redis_server.url)
         assert not (tmp_path / "later").exists()
         store = Store(tmp_path / "later", create=True)
@@ -101,10 +102,11 @@ def test_a_store_is_waited_for_while_the_worker_counts_as_alive(
     assert re.match(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} ", log.read_text()), "a supervisor tells the time as well"
 
 
+@pytest.mark.parametrize("times", [1, pytest.param(5, marks=pytest.mark.slow)])
 def test_a_worker_ends_when_told_while_its_child_is_talking(
-    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
+    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, times: int
 ) -> None:
-    """Three times, as a signal is only lost if it comes between two things that the child says."""
+    """Several times, as a signal is only lost if it comes between two things that the child says."""
     code = """
 import os, sys, time
 sys.stdin.readline()
@@ -114,7 +116,7 @@ while time.monotonic() < until:
 time.sleep(60)
 """
     child, log = (sys.executable, "-c", code), tmp_path / "log"
-    for _ in range(3):
+    for _ in range(times):
         with analytic.start_worker(tmp_path / "store", redis_server.url, child, log) as running:
             analytic.wait_for(lambda: analytic.child_of(running) is not None, 60)
             time.sleep(0.5)

@@ -55,26 +55,6 @@ def test_the_range_of_a_time_leaves_a_tenth_out_at_either_end() -> None:
     assert costs.parts()["edit_s"] == Seconds(2, pytest.approx(1.2), pytest.approx(2.8))
 
 
-def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
-    costs = made()
-    costs.write(tmp_path / "whole.npz")
-    whole = (tmp_path / "whole.npz").read_bytes()
-    (tmp_path / "text.npz").write_text("no archive")
-    (tmp_path / "cut.npz").write_bytes(whole[:-40])
-    number = whole.index(costs.render_s.tobytes())
-    (tmp_path / "changed.npz").write_bytes(whole[:number] + b"~" + whole[number + 1 :])
-    with np.load(tmp_path / "whole.npz") as stored:
-        arrays = dict(stored)
-    np.savez(tmp_path / "lacking.npz", **{name: arrays[name] for name in arrays if name != "kept"})
-    for name in ("text", "cut", "changed", "lacking"):
-        with pytest.raises(StoreError, match=rf"{name}\.npz: holds"):
-            FrameCosts.read(tmp_path / f"{name}.npz")
-    with pytest.raises(StoreError):
-        FrameCosts.read(tmp_path / "missing.npz")
-    with pytest.raises(StoreError):
-        costs.write(tmp_path / "text.npz" / "below.npz")
-
-
 def test_no_damaged_byte_gives_another_error_or_other_numbers(tmp_path: Path) -> None:
     """Bytes that tell nothing, such as dates, may change."""
     costs = made()

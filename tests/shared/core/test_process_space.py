@@ -13,7 +13,6 @@ import redis
 from photonfarm.core.processes import process_space
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.queue.connection import connect
-from photonfarm.queue.rq_adapter import queue_status
 from photonfarm.queue.workers import WorkerReport, bury, read_workers, take_name
 
 
@@ -40,16 +39,6 @@ def test_a_worker_in_another_container_of_the_same_host_name_keeps_its_name(
         assert take_name(connection, "ada", ttl_s=60) == "ada-2"
         assert list(read_workers(connection)) == ["ada", "ada-2"]
         bury(connection, "ada-2")
-
-
-def test_a_worker_that_was_killed_here_is_not_counted_while_its_heartbeat_lasts_and_leaves_its_name_at_once(
-    connection: redis.Redis,
-) -> None:
-    queue_samples.told(connection, "killed", WorkerReport(process=gone()))
-    queue_samples.told(connection, "alive", WorkerReport(process=os.getppid()))
-    queue_samples.told(connection, "elsewhere", WorkerReport(host="another-machine", process=gone()))
-    assert queue_status(connection).workers == 2
-    assert take_name(connection, "killed", ttl_s=60) == "killed"
 
 
 def test_a_process_space_is_the_same_for_every_process_in_it_and_begins_with_the_hosts_name() -> None:

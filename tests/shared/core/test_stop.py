@@ -24,7 +24,7 @@ sys.exit(0 if stop.is_set() else 1)
 """
 
 
-@pytest.mark.parametrize("storm", range(4))
+@pytest.mark.parametrize("storm", [0, *(pytest.param(storm, marks=pytest.mark.slow) for storm in range(1, 6))])
 def test_a_storm_of_signals_ends_a_process_as_one_does(storm: int) -> None:
     """About every sixth of these storms left a process with a lock waiting for itself."""
     process = subprocess.Popen([sys.executable, "-c", WAITING], stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -40,13 +40,6 @@ def test_why_a_document_is_not_stored_is_told_though_its_part_cannot_be_removed(
 
 
 @pytest.mark.usefixtures("unremovable")
-def test_a_name_that_is_taken_is_no_error_though_the_part_cannot_be_removed(tmp_path: Path) -> None:
-    (tmp_path / "document").write_text("first")
-    assert not put_json(LocalStorage(tmp_path), {}, "document")
-    assert (tmp_path / "document").read_text() == "first"
-
-
-@pytest.mark.usefixtures("unremovable")
 def test_why_an_object_is_not_copied_is_told_though_its_part_cannot_be_removed(tmp_path: Path) -> None:
     cache = object_cache.ObjectCache(tmp_path, 1000)
     with pytest.raises(ZeroDivisionError), cache.filling(cache.path("name", "v")) as file:

@@ -7,7 +7,6 @@ import time
 
 import pytest
 
-from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import Steps, WorkLog, pause_after_look
 
 
@@ -79,14 +78,6 @@ def test_ctrl_c_ends_native_code_at_once() -> None:
         time.sleep(0.2)
         child.send_signal(signal.SIGINT)
         assert child.wait(2) == -signal.SIGINT
-
-
-@pytest.mark.usefixtures("hears_ctrl_c")
-def test_afterwards_ctrl_c_is_what_it_was() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with end_on_ctrl_c():
-        assert signal.getsignal(signal.SIGINT) is signal.SIG_DFL
-    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_slow_looks_take_a_twentieth_of_the_time_and_pauses_end() -> None:

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Stream, make_key
-from photonfarm.plan.request import UNUSED, PlannedContent, PlannedRows, Request, expand
+from photonfarm.plan.request import PlannedContent, PlannedRows, Request, expand
 from photonfarm.scene.modification import Modification, rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import sample_view, sample_views
@@ -39,77 +39,11 @@ def planned(scene: SceneStore) -> list[Triple]:
     ]
 
 
-def test_a_request_is_every_combination_of_modification_view_and_pass(store: Store) -> None:
-    result = store.plan(samples.small_spec(), Request(modifications=5, views_per_modification=3, passes=2))
-    scene = store.scene(result.scene_id)
-    found = planned(scene)
-    assert (result.plan, result.new, result.known, result.jobs) == (0, 30, 0, 1)
-    assert len(set(found)) == 30
-    assert {pass_ for *_, pass_ in found} == {0, 1}
-
-
-def test_what_a_job_renders_is_ordered_so_that_the_scene_is_edited_least(store: Store) -> None:
-    result = store.plan(
-        samples.small_spec(), Request(modifications=4, views_per_modification=3, passes=2), shard_rows=5
-    )
-    scene = store.scene(result.scene_id)
-    for job in range(scene.jobs()):
-        order = [(s.modification_row, s.view_row, s.pass_) for s in scene.job_rows(job).samples]
-        assert order == sorted(order)
-
-
-def test_every_view_and_modification_is_rendered_by_exactly_one_job_which_is_the_first_to_need_it(store: Store) -> None:
-    result = store.plan(
-        samples.small_spec(), Request(modifications=7, views_per_modification=3, passes=2), shard_rows=4
-    )
-    scene = store.scene(result.scene_id)
-    rows = [scene.job_rows(job) for job in range(scene.jobs())]
-    for new, used in (("new_views", "views"), ("new_modifications", "modifications")):
-        made = [row for r in rows for row in getattr(r, new)]
-        assert len(made) == len(set(made))
-        for row in {row for r in rows for row in getattr(r, used)}:
-            first = min(r.job for r in rows if row in getattr(r, used))
-            assert row // 4 == first
-            assert row in getattr(rows[first], new)
-
-
-@pytest.mark.parametrize(
-    "larger",
-    [
-        Request(modifications=9, views_per_modification=2, passes=2),
-        Request(modifications=6, views_per_modification=5, passes=2),
-        Request(modifications=6, views_per_modification=2, passes=4),
-    ],
-)
-def test_a_grown_request_plans_only_what_is_new_and_refers_to_the_rest(store: Store, larger: Request) -> None:
-    spec = samples.small_spec()
-    scene = store.scene(store.plan(spec, Request(modifications=6, views_per_modification=2, passes=2)).scene_id)
-    before = planned(scene)
-    result = store.plan(spec, larger)
-    after = planned(scene)
-    assert (result.new, result.known) == (larger.samples - 24, 24)
-    assert after[:24] == before
-    assert len(set(after)) == larger.samples
-    rows = [scene.job_rows(job) for job in range(scene.jobs())]
-    views = {
-        (r.modifications[s.modification_row].vector.tobytes(), r.views[s.view_row].vector.tobytes()): s.view_row
-        for r in rows
-        for s in r.samples
-    }
-    assert sum(len(r.new_views) for r in rows) == len(views)
-    assert set(views.values()) == {row for r in rows for row in r.new_views}
-
-
 def test_the_same_request_again_plans_nothing(store: Store) -> None:
     request = Request(modifications=3, views_per_modification=2)
     store.plan(samples.small_spec(), request)
     again = store.plan(samples.small_spec(), request)
     assert (again.plan, again.new, again.known) == (None, 0, 6)
-
-
-def test_another_seed_plans_other_samples(store: Store) -> None:
-    store.plan(samples.small_spec(), Request(modifications=3, seed=0))
-    assert store.plan(samples.small_spec(), Request(modifications=3, seed=1)).new >= 2
 
 
 def test_a_static_scene_has_one_modification_and_as_many_views_as_were_asked_for(store: Store) -> None:
@@ -143,14 +77,6 @@ def test_the_rows_per_job_are_fixed_by_the_first_plan(store: Store) -> None:
         store.plan(spec, Request(modifications=13), shard_rows=16)
 
 
-def test_unused_rows_of_a_last_job_are_marked_and_never_asked_for(store: Store) -> None:
-    scene = store.scene(store.plan(samples.small_spec(), Request(modifications=5), shard_rows=4).scene_id)
-    (plan,) = scene.plans()
-    assert plan.samples == 5
-    assert (plan.rows.sample_modification[5:] == UNUSED).all()
-    assert len(scene.job_rows(1).samples) == 1
-
-
 def test_a_dry_run_counts_and_writes_nothing(store: Store) -> None:
     result = store.plan(samples.small_spec(), Request(modifications=5), dry_run=True)
     assert (result.plan, result.new) == (None, 5)
@@ -162,11 +88,6 @@ def test_a_request_out_of_its_limits_is_refused_in_a_sentence_with_key_and_value
     ((key, value),) = wrong.items()
     with pytest.raises(SpecError, match=f"{key} = {value}"):
         Request.of(**wrong)
-
-
-def test_a_request_larger_than_memory_should_hold_is_refused() -> None:
-    with pytest.raises(SpecError):
-        Request.of(modifications=10_000, views_per_modification=10_000)
 
 
 def test_racing_submitters_plan_every_sample_exactly_once(store: Store) -> None:
@@ -312,12 +233,6 @@ def test_plans_equal_those_made_sample_by_sample_to_the_bit(name: str, wanted: l
             assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), about.name
         known.append((first_row, found.rows))
         first_row = oracle.end_row
-
-
-def test_a_fixed_camera_has_one_view_of_each_configuration_and_no_sample_twice(store: Store) -> None:
-    scene = store.scene(store.plan(SPECS["fixed camera"], Request(modifications=6, views_per_modification=4)).scene_id)
-    found = planned(scene)
-    assert len(found) == len(set(found)) == len({modification for modification, *_ in found})
 
 
 def test_views_that_are_drawn_again_are_drawn_again_among_many() -> None:

@@ -1,6 +1,5 @@
 """Jobs that failed: what they have in common, in Redis and in the store."""
 
-import json
 import time
 
 import pytest
@@ -85,17 +84,3 @@ def test_a_failure_is_kept_in_the_store_until_it_is_retried_and_the_last_one_cou
     assert read_kept_failures(store) == count_failures(store) == {}
     keep_failure(store, name, "ValueError: third", worker="ada")
     assert count_failures(store) == {name: 1}
-
-
-def test_files_that_are_no_failures_do_no_harm(store: Store, scene: SceneStore) -> None:
-    name = job_name(scene.scene_id, 0)
-    keep_retry(store)
-    folder = scene.folder.parent.parent / "failures"
-    assert not folder.exists() or not list(folder.iterdir()), "nothing is to be forgotten"
-    keep_failure(store, name, "ValueError", worker="ada")
-    (folder / f"{scene.scene_id}-007.1.json").write_text("{}")  # no name of a job
-    (folder / "notes.txt").write_text("mine")
-    (kept,) = folder.glob("*-0.*.json")
-    assert json.loads(kept.read_text())["job"] == name
-    kept.write_text("[" * 100_000)
-    assert list(read_kept_failures(store)) == [name]

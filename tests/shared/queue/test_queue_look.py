@@ -60,17 +60,6 @@ def test_any_number_of_waiting_workers_list_the_markers_once_in_a_while(
     assert listed() == 1
 
 
-@pytest.mark.usefixtures("waiting")
-def test_a_waiting_worker_sends_few_commands(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
-    def commands_of_a_look() -> int:
-        before = sum(about["calls"] for about in connection.info("commandstats").values())
-        assert fill_seldom(store, connection, every_s=60) == "waits"
-        return sum(about["calls"] for about in connection.info("commandstats").values()) - before
-
-    fill_seldom(store, connection, every_s=60)
-    assert commands_of_a_look() < 10
-
-
 def test_a_job_that_is_free_again_is_queued_once_the_while_is_over(
     connection: redis.Redis, store: Store, waiting: str
 ) -> None:

@@ -46,12 +46,6 @@ def test_a_job_that_is_started_or_set_aside_is_left_alone_and_one_whose_worker_d
     assert len(queued(connection)) == 9
 
 
-def test_one_scene_alone_can_be_queued(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
-    store.plan(samples.small_spec(points=17), Request())
-    assert reconcile(store, connection, scene_id=scene.scene_id) == 10
-    assert reconcile(store, connection) == 1
-
-
 def test_no_more_is_queued_of_a_scene_than_the_limit(
     connection: redis.Redis, store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,12 +56,6 @@ def test_no_more_is_queued_of_a_scene_than_the_limit(
     assert reconcile(store, connection) == 1
     store.plan(samples.small_spec(points=17), Request(modifications=10), shard_rows=1)
     assert reconcile(store, connection) == 4, "a scene whose jobs nobody takes is in no other's way"
-
-
-def test_a_redis_that_lost_everything_is_filled_again(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
-    reconcile(store, connection)
-    connection.flushall()
-    assert reconcile(store, connection) == 10
 
 
 def test_a_job_that_was_lost_on_the_way_is_queued_again(

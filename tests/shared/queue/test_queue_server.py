@@ -8,7 +8,6 @@ import subprocess
 import time
 import traceback
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,7 @@ from photonfarm.farm import submission
 from photonfarm.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.plan.request import Request
 from photonfarm.queue import rq_adapter
-from photonfarm.queue.connection import RefusedError, add_password, connect
+from photonfarm.queue.connection import add_password, connect
 from photonfarm.queue.reconciliation import fill_seldom, reconcile
 from photonfarm.queue.rq_adapter import open_queue, queue_status
 from photonfarm.queue.workers import bury, release, report_consumed, take_name
@@ -145,26 +144,6 @@ def test_rq_and_all_of_ours_work_with_the_permissions_of_the_compose_file(
         for command in forbidden:
             with pytest.raises(redis.exceptions.NoPermissionError):
                 limited.execute_command(*command)
-
-
-def test_a_cluster_is_refused_with_a_sentence(store: Store, scene: SceneStore, tmp_path: Path) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        port = free.getsockname()[1]
-    command = [server_binary(), "--port", str(port), "--cluster-enabled", "yes", "--dir", tmp_path, "--save", ""]
-    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
-        try:
-            deadline = time.monotonic() + 60
-            while True:
-                with suppress(QueueError), connect(f"redis://127.0.0.1:{port}/0") as connection:
-                    break
-                assert time.monotonic() < deadline
-            connection.execute_command("CLUSTER", "ADDSLOTSRANGE", "0", "16383")
-            while b"cluster_state:ok" not in connection.execute_command("CLUSTER", "INFO"):
-                assert time.monotonic() < deadline
-            with pytest.raises(RefusedError, match="without cluster mode"):
-                reconcile(store, connection)
-        finally:
-            process.terminate()
 
 
 LENGTH = """

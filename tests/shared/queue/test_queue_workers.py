@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -55,6 +56,11 @@ def test_a_redis_serves_one_store_at_a_time(connection: redis.Redis, store: Stor
     release(connection, store)
     check_served(connection, other)
     serve(connection, other)
+    connection.pexpire(SERVED, 600)  # its owner was killed
+    with pytest.raises(OtherStoreError, match=r"free by itself in 1 s$"):
+        serve(connection, store)
+    time.sleep(0.7)
+    serve(connection, store)
 
 
 # --------------------------------------------------------------------------------------------- names, and what holds up

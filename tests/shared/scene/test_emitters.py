@@ -84,12 +84,6 @@ def test_a_factor_of_what_does_not_emit_is_refused(beside: Path) -> None:
         parse_spec({**described, "emitters": {"by_id": {"lamp-stand": 0}}}, where="room")
 
 
-def test_the_environment_is_no_light_of_a_scene_that_has_none(beside: Path) -> None:
-    (beside / "scene.xml").write_text(SCENE.replace('<emitter type="envmap" id="Sky"/>', ""))
-    with pytest.raises(SpecError):
-        spec(beside, {"by_id": {"environment": 0}})
-
-
 # ---------------------------------------------------------------------------------------------------------- the id
 
 CONTENT = {

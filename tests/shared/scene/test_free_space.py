@@ -9,14 +9,12 @@ from scipy import stats
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import make_key
-from photonfarm.plan.request import PlannedContent, Request, expand
 from photonfarm.scene.camera_path import CameraPath, check_clear, orbit
 from photonfarm.scene.free_space import FreeSpace, pack
 from photonfarm.scene.modification import (
     Modification,
     modification_keys,
     rest,
-    sample_modification,
     sample_modifications,
 )
 from photonfarm.scene.spec import SceneSpec
@@ -93,17 +91,6 @@ def test_many_views_at_once_are_those_that_are_drawn_one_by_one() -> None:
 def with_all_free(spec: SceneSpec) -> SceneSpec:
     """The same scene where cameras may stand everywhere; its id is another one, and keys are given."""
     return spec.model_copy(update={"view": spec.view.model_copy(update={"free_space": None})})
-
-
-def test_a_plan_has_each_view_in_free_space_of_its_configuration() -> None:
-    spec = with_space()
-    request = Request(modifications=40, views_per_modification=5)
-    rows = expand(spec, request, PlannedContent(), first_job=0, shard_rows=32).rows
-    used = rows.sample_view >= 0
-    views, configurations = rows.view[rows.sample_view[used]], rows.modification[rows.sample_modification[used]]
-    assert len(views) == request.samples
-    assert are_in_free_space(spec, views[:, :3], configurations).all()
-    assert configurations[0].tobytes() == sample_modification(spec, 0, 0).vector.tobytes()
 
 
 def test_a_spec_without_free_space_has_the_id_and_the_views_that_it_always_had() -> None:

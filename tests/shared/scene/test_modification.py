@@ -56,12 +56,6 @@ def test_a_static_scene_has_only_its_rest_state(static_spec: SceneSpec) -> None:
     assert modification.key("id") == rest(static_spec).key("id")
 
 
-def test_the_vector_holds_all_of_a_modification(sampled: list[Modification]) -> None:
-    for modification in sampled[:20]:
-        again = Modification.from_vector(modification.vector)
-        assert again.key("id") == modification.key("id")
-
-
 def test_two_configurations_that_differ_only_in_where_a_removed_object_would_be_are_one(
     sampled: list[Modification],
 ) -> None:

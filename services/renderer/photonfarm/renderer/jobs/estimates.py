@@ -34,30 +34,28 @@ def halves_of(scene: LoadedScene, samples: Sequence[tuple[Key, View]]) -> list[t
 
     Samples given together are rendered together. Raises IncompleteError if estimates stay non-finite.
     """
-    seeds = [first_seeds(key) for key, _ in samples]
+    if not samples:
+        return []
+    seeds = []
+    for key, _ in samples:
+        seed_a = next(_seeds(key, PURPOSES[0], ()))
+        seeds.append((seed_a, next(_seeds(key, PURPOSES[1], (seed_a,)))))
     if len(samples) == 1:
         images = scene.render_halves(samples[0][1], seeds[0])
     else:
         views = [view for _, view in samples for _ in PURPOSES]
         images = scene.render_images(views, [seed for pair in seeds for seed in pair])
-    pairs = images.reshape(len(samples), len(PURPOSES), *images.shape[1:])
-    return [_finite(scene, *each) for each in zip(samples, seeds, pairs, strict=True)]
-
-
-def first_seeds(key: Key) -> tuple[int, int]:
-    """The seeds of halves A and B of a sample, unless renders are discarded."""
-    seed_a = next(_seeds(key, PURPOSES[0], ()))
-    return seed_a, next(_seeds(key, PURPOSES[1], (seed_a,)))
-
-
-def _finite(scene: LoadedScene, sample: tuple[Key, View], seeds: tuple[int, int], halves: F32) -> tuple[F32, int]:
-    """A sample's halves, those that are not finite drawn again, and the number of discarded renders."""
-    thrown = 0
-    for half, purpose in enumerate(PURPOSES):
-        if not np.isfinite(halves[half]).all():
-            halves[half], more = _draw_again(scene, sample[0], purpose, sample[1], seeds)
-            thrown += more
-    return halves, thrown
+    estimates = []
+    for (key, view), taken, halves in zip(
+        samples, seeds, images.reshape(len(samples), 2, *images.shape[1:]), strict=True
+    ):
+        thrown = 0
+        for half, purpose in enumerate(PURPOSES):
+            if not np.isfinite(halves[half]).all():
+                halves[half], more = _draw_again(scene, key, purpose, view, taken)
+                thrown += more
+        estimates.append((halves, thrown))
+    return estimates
 
 
 def _draw_again(scene: LoadedScene, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import gc
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -132,9 +132,9 @@ class ShardRenderer:
         stored, wall_s, core_s = loaded.stored, time.monotonic(), time.process_time()
         cloud = loaded.cloud()
         with JobWriter(stored, rows) as out:
-            report = self._on_progress if loaded.compiled else self._compiles_first
-            others = self._other_halves(rows.plan.halves_from)
-            rendering = _Rendering(loaded.scene, cloud, stored.spec, out, report, others)
+            if (other := rows.plan.halves_from) is not None and other not in self._others:
+                self._others[other] = OtherHalves(self._store.root, other)
+            rendering = _Rendering(loaded, cloud, out, self._on_progress, self._others.get(other or ""))
             rendering.run(rows)
             loaded.compiled = True
             self._on_progress(COMMITS, len(rows.samples), len(rows.samples))
@@ -154,18 +154,6 @@ class ShardRenderer:
             what = "was committed by another worker while it was rendered here; that one stays"
             log.warning("scene %s, job %d: %s", stored.scene_id, rows.job, what)
         return committed
-
-    def _compiles_first(self, phase: str, done: int, total: int) -> None:
-        """Report progress of a scene's first job, whose first sample takes longest."""
-        self._on_progress(phase if done else COMPILES, done, total)
-
-    def _other_halves(self, other: str | None) -> OtherHalves | None:
-        if other is None:
-            return None
-        if other not in self._others:
-            self._others[other] = OtherHalves(self._store.root, other)
-        self._others[other].refresh()
-        return self._others[other]
 
     def _scene(self, stored: SceneStore) -> _Loaded:
         """The scene, loaded; anew if it is to be rendered by another strategy than before."""
@@ -237,18 +225,16 @@ class _Rendering:
 
     def __init__(
         self,
-        scene: LoadedScene,
+        loaded: _Loaded,
         cloud: BasePointCloud,
-        spec: SceneSpec,
         out: JobWriter,
         on_progress: OnProgress,
         others: OtherHalves | None,
     ) -> None:
-        self._scene = scene
-        self._on_progress = on_progress
+        self._scene, self._spec, self._compiled = loaded.scene, loaded.stored.spec, loaded.compiled
         self._cloud = cloud
-        self._radiance_id, self._wanted = spec.radiance_id, spec.guides
         self._out = out
+        self._on_progress = on_progress
         self._others = others
         self.redrawn = 0  # renders that were discarded
         self.taken_over = 0  # samples whose halves another scene has
@@ -260,21 +246,25 @@ class _Rendering:
         follows from the modification's key, so that they are equal. That job counts the renders discarded for them.
         """
         new_views, done = set(rows.new_views), 0
+        if self._others is not None:
+            self._others.refresh()
         for modification_row, group in groupby(rows.samples, key=lambda sample: sample.modification_row):
             modification, samples = rows.modifications[modification_row], list(group)
             self._scene.apply(modification)
             is_new = modification_row in rows.new_modifications
             wants_photons = is_new or any(sample.view_row in new_views for sample in samples)
             photons, thrown = (
-                photons_of(self._scene, modification.key(self._radiance_id)) if wants_photons else (None, 0)
+                photons_of(self._scene, modification.key(self._spec.radiance_id)) if wants_photons else (None, 0)
             )
             if is_new:
                 self.redrawn += thrown
                 if photons is not None:
                     self._out.photons(modification_row, photons)
             points = rebuild(self._cloud, modification)
-            for together in _parts(samples, self._scene.samples_at_once):
-                self._on_progress(RENDERS_SAMPLES, done, len(rows.samples))
+            for first in range(0, len(samples), self._scene.samples_at_once):
+                together = samples[first : first + self._scene.samples_at_once]
+                phase = RENDERS_SAMPLES if self._compiled or done else COMPILES
+                self._on_progress(phase, done, len(rows.samples))
                 done += len(together)
                 for sample in together:
                     if sample.view_row in new_views:
@@ -287,21 +277,18 @@ class _Rendering:
 
     def _render_halves(self, samples: Sequence[SampleRow], rows: JobRows) -> None:
         """Render the halves of samples together, or take them over."""
-        if self._others is not None:
-            samples = [sample for sample in samples if not self._takes_over(sample, self._others)]
-        if not samples:
-            return
-        estimates = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in samples])
-        for sample, (halves, thrown) in zip(samples, estimates, strict=True):
+        left = []
+        for sample in samples:
+            halves = None if self._others is None else self._others.find(sample.key)
+            if halves is None:
+                left.append(sample)
+            else:
+                self._out.radiance(sample.row, halves)
+                self.taken_over += 1
+        estimates = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in left])
+        for sample, (halves, thrown) in zip(left, estimates, strict=True):
             self.redrawn += thrown
             self._out.radiance(sample.row, halves)
-
-    def _takes_over(self, sample: SampleRow, others: OtherHalves) -> bool:
-        halves = others.find(sample.key)
-        if halves is not None:
-            self._out.radiance(sample.row, halves)
-            self.taken_over += 1
-        return halves is not None
 
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
         """Render the buffers of a view, without a second attempt: they depend on no seed."""
@@ -311,15 +298,10 @@ class _Rendering:
 
     def _guides(self, sample: SampleRow, view: View, modification: Modification) -> Guides:
         """Render the guides of a view, without a second attempt."""
-        key = view_key(modification.key(self._radiance_id), view.vector)
-        guides = self._scene.guides(view, key, self._wanted, lit_points(self._cloud, modification))
+        key = view_key(modification.key(self._spec.radiance_id), view.vector)
+        guides = self._scene.guides(view, key, self._spec.guides, lit_points(self._cloud, modification))
         _check_finite(arrays_of(guides), sample)
         return guides
-
-
-def _parts(samples: Sequence[SampleRow], most: int) -> Iterator[Sequence[SampleRow]]:
-    """The samples in parts of so many at most, in their order."""
-    return (samples[first : first + most] for first in range(0, len(samples), most))
 
 
 def _check_finite(arrays: Mapping[str, NDArray[np.generic]], sample: SampleRow) -> None:

@@ -62,7 +62,8 @@ def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None)
         elif fault["type"] == "extra_forbidden":
             yield f"{key}: unknown key; nearest: {nearest(str(fault['loc'][-1]), known)}"
         else:
-            yield f"{key} = {_shorten(repr(fault['input']))}: {rule}"
+            value = repr(fault["input"])
+            yield f"{key} = {value if len(value) <= INPUT_SHOWN else f'{value[:INPUT_SHOWN]}…'}: {rule}"
 
 
 _RULES = {
@@ -100,10 +101,6 @@ def _key(place: tuple[int | str, ...], document: Any) -> str:
         name = document.get("name") if isinstance(part, int) and isinstance(document, Mapping) else None
         words += f' "{name}"' if isinstance(name, str) else f".{part}"
     return words.removeprefix(".")
-
-
-def _shorten(text: str) -> str:
-    return text if len(text) <= INPUT_SHOWN else f"{text[:INPUT_SHOWN]}…"
 
 
 Changes = dict[str, tuple[Any, Any]]

@@ -72,11 +72,11 @@ def repeat(every_s: float, do: Callable[[], object]) -> Iterator[None]:
     """Do something every few seconds, in a thread of its own, until the block ends."""
     ended = threading.Event()
 
-    def repeat() -> None:
+    def keep_doing() -> None:
         while not ended.wait(every_s):
             do()
 
-    thread = threading.Thread(target=repeat, daemon=True)
+    thread = threading.Thread(target=keep_doing, daemon=True)
     thread.start()
     try:
         yield

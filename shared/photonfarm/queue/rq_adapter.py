@@ -7,8 +7,9 @@ keeps scenes loaded, and beats during a job, as RQ's SimpleWorker does not.
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 
 from redis import Redis
 from redis.client import Pipeline
@@ -61,7 +62,8 @@ def take(
     Jobs of other scenes than `scene_id`, and of the scenes in `leave`, stay in the queue for other workers. A job lost
     between the queue and its execution is queued again by `reconcile`.
     """
-    for name in _read_queued(queue):
+    pages = (queue.get_job_ids(first, AT_ONCE) for first in range(0, len(queue), AT_ONCE))
+    for name in chain.from_iterable(pages):
         scene = name.rpartition("-")[0]
         if scene in leave or scene_id not in (None, scene):
             continue
@@ -75,14 +77,6 @@ def take(
             pipeline.execute()
         return execution
     return None
-
-
-def _read_queued(queue: Queue) -> Iterator[str]:
-    """The queued names in order, as many at once as one request should read."""
-    start = 0
-    while names := queue.get_job_ids(start, AT_ONCE):
-        yield from names
-        start += len(names)
 
 
 def _job(queue: Queue, name: str) -> Job | None:

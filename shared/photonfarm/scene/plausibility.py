@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,23 +22,19 @@ TOO_LARGE = 5.0
 """A box is too large at so many times the size of the box around all cameras and look-at points."""
 
 
-@dataclass(frozen=True, slots=True)
-class Doubt:
-    """One thing that can hardly be meant."""
-
-    key: str  # what to change: `view.fov_deg`, `objects.1.box`
-    sentence: str  # what is said there, and what follows from it
+Doubt = tuple[str, str]
+"""One thing that can hardly be meant: its key, as `objects.1.box`, and what is said there and what follows from it."""
 
 
 def warnings(named: NamedSpec) -> list[str]:
     """The doubts about a spec, each as one sentence after the line of its file."""
     lines = SpecLines.of(named.file)
-    return [f"{lines.place(doubt.key)}: {doubt.sentence}" for doubt in doubts(named.spec, named.lights)]
+    return [f"{lines.place(key)}: {sentence}" for key, sentence in doubts(named.spec, named.lights)]
 
 
 def doubts(spec: SceneSpec, lights: frozenset[str]) -> list[Doubt]:
     """What a spec says that can hardly be meant; `lights` are the ids of the scene's own lights."""
-    return [*_check_view(spec), *_check_transport(spec), *_check_lights(spec, lights), *_check_groups(spec)]
+    return [*_check_view(spec), *_check_light(spec, lights), *_check_groups(spec)]
 
 
 def group_key(spec: SceneSpec, index: int) -> str:
@@ -50,75 +45,56 @@ def group_key(spec: SceneSpec, index: int) -> str:
 
 def _check_view(spec: SceneSpec) -> Iterator[Doubt]:
     view, (narrow, wide) = spec.view, USUAL_FOV
+    usual = "40 to 90 degrees are usual in rooms"
     if view.fov_deg < narrow:
-        yield Doubt(
-            "view.fov_deg",
-            f"fov_deg = {view.fov_deg:g} shows as little as a telescope does; 40 to 90 degrees are usual in rooms",
-        )
+        yield "view.fov_deg", f"fov_deg = {view.fov_deg:g} shows as little as a telescope does; {usual}"
     if view.fov_deg > wide:
-        yield Doubt(
-            "view.fov_deg",
-            f"fov_deg = {view.fov_deg:g} stretches what is near the image's edges; 40 to 90 degrees are usual in rooms",
-        )
+        yield "view.fov_deg", f"fov_deg = {view.fov_deg:g} stretches what is near the image's edges; {usual}"
     gap = _gap(view.origin, view.look_at)
     spread = float(np.linalg.norm(np.ptp([group.at for group in spec.groups], axis=0))) if spec.groups else 0.0
     scale = max(_size(view.origin), _size(view.look_at), spread)
     if gap >= view.far:
-        yield Doubt(
-            "view.far",
-            f"far = {view.far:g} ends before look_at, which is {gap:.3g} away from origin: nothing there is seen",
-        )
+        away = f"which is {gap:.3g} away from origin: nothing there is seen"
+        yield "view.far", f"far = {view.far:g} ends before look_at, {away}"
     elif scale and gap > FAR_OFF * scale:
-        yield Doubt(
-            "view.origin",
-            f"origin is {gap:.3g} away from look_at, {gap / scale:.0f} times the size of all that is looked at",
-        )
+        times = f"{gap / scale:.0f} times the size of all that is looked at"
+        yield "view.origin", f"origin is {gap:.3g} away from look_at, {times}"
     if view.near > 0.1 * max(_size(_join(view.origin, view.look_at)), gap):
-        yield Doubt("view.near", f"near = {view.near:g} hides everything nearer than that, which is much of the view")
+        yield "view.near", f"near = {view.near:g} hides everything nearer than that, which is much of the view"
 
 
-def _check_transport(spec: SceneSpec) -> Iterator[Doubt]:
+def _check_light(spec: SceneSpec, lights: frozenset[str]) -> Iterator[Doubt]:
     follows = {
         0: "renders black images, as every path of light has at least one edge",
         1: "shows lights that are seen directly, and nothing that they light",
     }
     depth = spec.transport.max_depth
     if depth in follows:
-        yield Doubt("transport.max_depth", f"max_depth = {depth} {follows[depth]}; 8 is usual")
-
-
-def _check_lights(spec: SceneSpec, lights: frozenset[str]) -> Iterator[Doubt]:
-    movable = [light for light in spec.lights if light.removal_probability < 1]
-    moved = {shape for light in spec.lights for shape in light.shape_ids}
-    own = lights - moved
-    if movable or any(spec.emitters.factor(name) > 0 for name in own):
-        return
-    if own:
-        yield Doubt("emitters", "emitters switches off every light of the scene, and nothing else shines: it is black")
-    else:
-        yield Doubt("scene", "the scene has no light at all, so that every image is black; add one under [[lights]]")
+        yield "transport.max_depth", f"max_depth = {depth} {follows[depth]}; 8 is usual"
+    own = lights - {shape for light in spec.lights for shape in light.shape_ids}
+    if all(light.removal_probability == 1 for light in spec.lights) and not any(map(spec.emitters.factor, own)):
+        if own:
+            yield "emitters", "emitters switches off every light of the scene, and nothing else shines: it is black"
+        else:
+            yield "scene", "the scene has no light at all, so that every image is black; add one under [[lights]]"
 
 
 def _check_groups(spec: SceneSpec) -> Iterator[Doubt]:
-    around = _join(spec.view.origin, spec.view.look_at)
+    seen = _size(_join(spec.view.origin, spec.view.look_at))
     for index, group in enumerate(spec.groups):
         key = group_key(spec, index)
-        size, seen = _size(group.box), _size(around)
-        off = _gap(Box(min=group.at, max=group.at), group.box)
+        size, off = _size(group.box), _gap(Box(min=group.at, max=group.at), group.box)
         if size > TOO_LARGE * seen:
-            yield Doubt(
-                f"{key}.box",
-                f"box of {group.name!r} is {size:.3g} across, {size / seen:.0f} times as much as all cameras and "
-                f"look-at points ({seen:.3g})",
-            )
+            times = f"{size / seen:.0f} times as much as all cameras and look-at points ({seen:.3g})"
+            yield f"{key}.box", f"box of {group.name!r} is {size:.3g} across, {times}"
         elif off > seen:
-            yield Doubt(
+            yield (
                 f"{key}.at",
                 f"at of {group.name!r} is {off:.3g} away from its box, farther than the cameras' and look-at points' "
                 f"box is across ({seen:.3g}): each placement moves it by that much",
             )
         if group.removal_probability == 1:
-            yield Doubt(f"{key}.removal_probability", f"removal_probability = 1: {group.name!r} is never there")
+            yield f"{key}.removal_probability", f"removal_probability = 1: {group.name!r} is never there"
 
 
 def _join(one: Box, other: Box) -> Box:

@@ -17,8 +17,7 @@ from photonfarm.core.errors import QueueError
 from photonfarm.farm.submission import submit
 from photonfarm.plan.request import Request
 from photonfarm.queue.failures import read_kept_failures
-from photonfarm.queue.job import TRIES
-from photonfarm.queue.share import Share
+from photonfarm.queue.job import TRIES, Share
 from photonfarm.renderer.worker.child import RenderWorker
 from photonfarm.renderer.worker.settings import WorkerSettings
 from photonfarm.renderer.worker.worker import run_worker

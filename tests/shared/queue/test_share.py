@@ -6,7 +6,7 @@ from itertools import pairwise
 import pytest
 
 from photonfarm.core.errors import SpecError
-from photonfarm.queue.share import Share
+from photonfarm.queue.job import Share
 
 
 @pytest.mark.parametrize("text", ["4/4", "1", "/3", "-1/3", "1/0", "a/b", "1/2/3", "١/٢"])

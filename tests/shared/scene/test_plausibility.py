@@ -24,7 +24,7 @@ TABLE = {"name": "table", "shapes": ["table-wood"], "at": [0, 0, 0], "box": {"mi
 def keys(**changes: Any) -> list[str]:
     """The keys that are doubted in a spec of the built-in room."""
     changes["view"] = ROOM["view"] | changes.get("view", {})
-    return [doubt.key for doubt in doubts(*parse_with_lights(ROOM | changes, where="test"))]
+    return [key for key, _ in doubts(*parse_with_lights(ROOM | changes, where="test"))]
 
 
 def origin(*at: float) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def test_a_scene_file_without_any_light_is_doubted(tmp_path: Path, lights: str, 
     (tmp_path / "scene.xml").write_text(f'<scene version="3.0.0"><shape type="cube"/>{lights}</scene>')
     described = ROOM | {"scene": {"file": "scene.xml"}}
     found = doubts(*parse_with_lights(described, where="test", beside=tmp_path))
-    assert [doubt.key for doubt in found] == (["scene"] if is_dark else [])
+    assert [key for key, _ in found] == (["scene"] if is_dark else [])
 
 
 def test_a_key_is_found_on_the_line_where_it_stands() -> None:

@@ -47,7 +47,7 @@ def _bytes(ctx: click.Context, param: click.Parameter, size: str) -> int:  # noq
 
 def _share(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:  # noqa: ARG001
     from photonfarm.core.errors import SpecError
-    from photonfarm.queue.share import Share
+    from photonfarm.queue.job import Share
 
     try:
         return None if text is None else Share.parse(text)

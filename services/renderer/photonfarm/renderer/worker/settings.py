@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field
 
 from photonfarm.core.errors import QueueError
 from photonfarm.core.models import Count, Frozen, Positive
-from photonfarm.queue.share import Share
+from photonfarm.queue.job import Share
 
 GRACE_S = 5.0
 """The seconds that a job in hand has to end after its worker was asked to stop.

@@ -28,9 +28,8 @@ from photonfarm.core.waiting import pause_after_look
 from photonfarm.queue import rq_adapter
 from photonfarm.queue.connection import connect
 from photonfarm.queue.failures import count_failures, keep_failure, read_kept_failures
-from photonfarm.queue.job import TRIES, RenderArguments, job_name
+from photonfarm.queue.job import TRIES, RenderArguments, Share, job_name
 from photonfarm.queue.reconciliation import fill_seldom
-from photonfarm.queue.share import Share
 from photonfarm.queue.workers import Activity, WorkerReport, beat, serve
 from photonfarm.renderer.worker.backpressure import TrainerPace
 from photonfarm.renderer.worker.settings import WorkerSettings

@@ -31,8 +31,8 @@ from photonfarm.core.formatting import format_count
 from photonfarm.core.processes import Stop, process_space
 from photonfarm.queue.connection import connect, redis_errors
 from photonfarm.queue.failures import keep_failure
+from photonfarm.queue.job import Share
 from photonfarm.queue.rq_adapter import fail_of_worker
-from photonfarm.queue.share import Share
 from photonfarm.queue.workers import WorkerReport, beat, bury, read_workers, release, serve, take_name
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.scene import backend

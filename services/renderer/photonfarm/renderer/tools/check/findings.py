@@ -78,7 +78,7 @@ def collect_findings(spec: SceneSpec, lights: frozenset[str], measured: Measured
     by_key: dict[str, Finding] = {}
     cameras = measured.samples.cameras
     _add(by_key, _check_place(spec, measured))
-    _add(by_key, (Finding(doubt.key, doubt.sentence) for doubt in doubts(spec, lights)))
+    _add(by_key, (Finding(*doubt) for doubt in doubts(spec, lights)))
     if not _VIEWS & by_key.keys():
         _add(by_key, _check_cameras(spec, cameras))
         if not _DARKNESS & by_key.keys() and cameras.placed_well.mean() >= PLACED_WELL:

@@ -26,7 +26,7 @@ from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
 from photonfarm.renderer.worker.source import QueueSource
 from photonfarm.renderer.worker.worker import ChildOutput, check, ending, render_job, run_worker
 from photonfarm.scene.spec import Source
-from photonfarm.store import SceneStore, Store, store_status
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture
@@ -37,19 +37,6 @@ def scene(analytic: ModuleType, tmp_path: Path) -> SceneStore:
 
 
 QUICK = {"until_complete": True, "idle_s": 1, "heartbeat_ttl_s": 2.0, "reserve_bytes": 0}
-
-
-def test_a_worker_fills_an_empty_queue_from_the_store_and_stops_when_nothing_is_missing(
-    analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
-) -> None:
-    run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), **QUICK)
-    assert scene.missing_jobs() == []
-    assert scene.has_base()
-    assert {scene.marker(job)["figures"]["worker"] for job in range(2)} == {"ada"}
-    status = queue_status(connect(redis_server.url))
-    assert (status.queued, status.running, status.failed, status.workers) == (0, 0, {}, 0)
-    assert store_status(Store(tmp_path / "store"))[0].core_s > 0
-    assert not list(connect(redis_server.url).scan_iter(f"*{scene.scene_id}*")), "a done job leaves nothing in Redis"
 
 
 @pytest.mark.parametrize(("limit", "quiet"), [("max_jobs", False), ("max_rss_bytes", True)])
@@ -198,17 +185,21 @@ def _once(look: Callable[[], bool], seconds: float = 10.0) -> bool:
     return found
 
 
-def test_a_worker_whose_name_is_taken_says_so_and_leaves_the_others_heartbeat_alone(
+def test_a_worker_fills_an_empty_queue_from_the_store_and_goes_by_another_name_where_its_own_is_taken(
     analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
 ) -> None:
     connection, said = connect(redis_server.url), []
     queue_samples.told(connection, "ada", WorkerReport(host="another-machine", process=7))
     run_worker(tmp_path / "store", redis_server.url, name="ada", child=analytic.command(), report=said.append, **QUICK)
     assert scene.missing_jobs() == []
-    assert scene.marker(0)["figures"]["worker"] == "ada-2"
+    assert scene.has_base()
+    assert {scene.marker(job)["figures"]["worker"] for job in range(2)} == {"ada-2"}
     assert "ada-2" in said[0]
     assert said[1] == "worker ada-2: ended: 2 jobs done"
     assert list(read_workers(connection)) == ["ada"]
+    status = queue_status(connection)
+    assert (status.queued, status.running, status.failed, status.workers) == (0, 0, {}, 1)
+    assert not list(connection.scan_iter(f"*{scene.scene_id}*")), "a done job leaves nothing in Redis"
 
 
 def test_no_redis_is_told_before_anything_is_started(analytic: ModuleType, scene: SceneStore, tmp_path: Path) -> None:

@@ -43,7 +43,10 @@ def test_a_worker_for_another_store_is_refused_and_the_queue_keeps_its_jobs(
     assert queue_status(connection).workers == 0
 
 
-@pytest.mark.parametrize("in_its_place", ["nothing", "an empty folder", "another store"])
+SLOWLY = [pytest.param(each, marks=pytest.mark.slow) for each in ("nothing", "another store")]
+
+
+@pytest.mark.parametrize("in_its_place", ["an empty folder", *SLOWLY])
 def test_a_store_that_vanishes_under_a_worker_ends_it_and_the_queue_keeps_its_jobs(
     analytic: ModuleType, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path, in_its_place: str
 ) -> None:

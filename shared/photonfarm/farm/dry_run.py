@@ -10,9 +10,8 @@ from pathlib import Path
 from photonfarm.core.errors import BackendError, StoreError
 from photonfarm.core.processes import can_render, command, usable_cores
 from photonfarm.farm.submission import Submission
-from photonfarm.plan.allocation import Allocation, CostModel
 from photonfarm.plan.request import Extent, Request
-from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.plan.sample_costs import Allocation, CostModel, SampleCosts
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store

@@ -17,9 +17,8 @@ from photonfarm.cli.show import bytes_per_sample
 from photonfarm.core.errors import SpecError
 from photonfarm.farm import dry_run
 from photonfarm.farm.dry_run import DryRun, rehearse
-from photonfarm.plan.allocation import KAPPA, Allocation, excess, seconds
 from photonfarm.plan.request import Extent, Request
-from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.plan.sample_costs import KAPPA, Allocation, CostModel, SampleCosts
 from photonfarm.scene.spec_loading import NamedSpec, load_spec
 from photonfarm.store import Store
 from photonfarm.store.format.schema import bytes_of_rows
@@ -140,8 +139,8 @@ def test_the_suggestion_costs_no_more_and_saves_what_is_said(tmp_path: Path, ver
     assert better is not None
     assert better.samples == better.modifications * better.views
     new = Allocation(better.modifications, better.views, 1, 2 * better.half_spp)
-    assert seconds(COSTS, new) <= found.core_s
-    after, before = (excess(COSTS.relative_variance, of) for of in (new, Allocation(100, 2, 1, 8)))
+    assert CostModel(COSTS).seconds(new) <= found.core_s
+    after, before = (CostModel(COSTS).excess(of) for of in (new, Allocation(100, 2, 1, 8)))
     assert found.reduction == pytest.approx(1 - after / before)
     assert found.reduction >= 0.05
 
@@ -170,7 +169,7 @@ def test_of_a_static_scene_only_samples_per_pixel_are_suggested_and_its_configur
     assert better is not None
     assert (better.modifications, better.views) == (None, None)
     assert (better.half_spp, better.samples) == (32, 20)
-    new, old = (excess(STATIC_NOISE, of, rho=0) for of in (Allocation(20, 1, 1, 64), Allocation(100, 1, 1, 8)))
+    new, old = (CostModel(costs, rho=0).excess(of) for of in (Allocation(20, 1, 1, 64), Allocation(100, 1, 1, 8)))
     assert found.reduction == pytest.approx(1 - new / old)
 
 

@@ -154,7 +154,6 @@ class ShareSource:
         self._look_due = self._taken_look_due = 0.0
         self.pause_s: float = settings.idle_s  # between looks that find nothing
         self._unreadable: Mapping[str, StoreError] = {}
-        self._not_kept: dict[str, str] = {}  # reasons of failures that the store refused to keep, by the jobs' names
         self._in_hand: RenderArguments | None = None
 
     def open(self) -> contextlib.nullcontext[None]:
@@ -190,7 +189,7 @@ class ShareSource:
             log.warning("scene %s is passed over, and the others go on: %s", scene_id, unreadable[scene_id])
         self._unreadable = unreadable
         with store_errors("look for failures", self._store.storage.where):
-            times = count_failures(self._store) | dict.fromkeys(self._not_kept, TRIES)
+            times = count_failures(self._store)
         candidates = [
             (times.get(job_name(scene_id, job), 0), not self._share.owns(job), RenderArguments(scene_id, job))
             for scene_id, jobs in missing.items()
@@ -209,16 +208,13 @@ class ShareSource:
             raise TakenError
 
     def end(self, name: str, ending: Ending, reason: str) -> bool:
-        """Keep a failure; one that the store does not keep counts as the last, as the job would be tried for ever."""
+        """Keep a failure; StoreError if the store refuses it, as the job would be tried for ever."""
         self._in_hand = None
         if ending != "failed":
             return False
-        try:
+        with store_errors("keep why a job failed", self._store.storage.where):
             keep_failure(self._store, name, reason, worker=self._settings.name)
             return count_failures(self._store)[name] >= TRIES
-        except OSError:
-            self._not_kept[name] = reason
-            return True
 
     def has_more(self, *, may_leave: bool) -> bool:  # noqa: ARG002
         """Nothing: what others have in hand is missing until it is committed."""
@@ -228,7 +224,7 @@ class ShareSource:
         """Why jobs failed too often, by their names."""
         with store_errors("look for failures", self._store.storage.where):
             kept = read_kept_failures(self._store)
-        return {name: failure.reason for name, failure in kept.items() if failure.set_aside} | self._not_kept
+        return {name: failure.reason for name, failure in kept.items() if failure.set_aside}
 
 
 def missing_jobs(

@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from photonfarm.plan.allocation import MOST_SPP, MOST_VIEWS, Allocation, CostModel
-from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.plan.sample_costs import MOST_SPP, MOST_VIEWS, Allocation, CostModel, SampleCosts
 
 ROOM = SampleCosts("room", 0.04, 0.035, 0.005, 0.032, 0.3)
 FIT = 30.0, 1.0  # κ and ρ

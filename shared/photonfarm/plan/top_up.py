@@ -130,11 +130,8 @@ class PlannedViews:
         """Count the passes of every view; raises SpecError if there is none."""
         if not known.plans:
             raise SpecError("nothing is planned that could be topped up; `photonfarm submit` plans the first samples")
-        every = [
-            (np.arange(len(rows.sample_view)) + first, rows.sample_view, rows.sample_modification, rows.sample_pass)
-            for first, rows in known.plans
-        ]
-        row, view, modification, pass_ = (np.concatenate(columns) for columns in zip(*every, strict=True))
+        row = np.concatenate([first + np.arange(len(rows.sample_view)) for first, rows in known.plans])
+        view, modification, pass_ = (known.column(f"sample_{what}") for what in ("view", "modification", "pass"))
         used = view != UNUSED
         view_row, first, of_sample = np.unique(view[used], return_index=True, return_inverse=True)
         next_pass = np.zeros(len(view_row), np.int64)

@@ -133,7 +133,7 @@ DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
         (NOTHING, "top-up den.toml --spp +8 --where color=red --no-queue", 3, ["where 'color=red'"]),
         (NOTHING, "submit den.toml --shard-rows 3 --modifications 40 --no-queue", 3, ["shard_rows = 3"]),
         (NOTHING, "submit den.toml --store . --no-queue", 4, [".: is neither empty nor a store"]),
-        (NOTHING, "preview den.toml --out den.toml/a.html", 4, ["den.toml/a.html: cannot write the sheet"]),
+        (NOTHING, "preview den.toml --out den.toml/a.html", 4, ["den.toml/a.html: cannot write the page"]),
         (lambda f: edit(f / "store/photonfarm.json", version=2), "status", 4, ["version 2", "version 5"]),
         (lambda f: (f / "store/photonfarm.json").write_text("{"), "status", 4, ["is not the document of a store"]),
         (lambda f: (f / "store/photonfarm.json").unlink(), "status", 4, ["is missing, and scenes are there"]),

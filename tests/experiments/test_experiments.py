@@ -11,7 +11,7 @@ from typing import Any, get_args
 
 import pytest
 
-from experiments import experiment, run
+from experiments import experiment
 from experiments.dry_run import Need
 from experiments.experiment import Experiment, Size, SizeName, list_names, merge
 from experiments.paper_tables import format_errors
@@ -54,16 +54,6 @@ def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
     assert bool(spec.objects) != name.startswith("static")
     size = 128 if name == "static-ablation" else 256
     assert (paper.film.width, paper.film.height) == (size, size)
-
-
-def test_tables_are_merged_as_deep_as_they_go_and_lists_are_replaced() -> None:
-    below: dict[str, Any] = {"a": {"b": 1, "c": {"d": 2}}, "lights": [1, 2], "e": 3}
-    assert merge(below, {"a": {"c": {"f": 4}}, "lights": []}) == {
-        "a": {"b": 1, "c": {"d": 2, "f": 4}},
-        "lights": [],
-        "e": 3,
-    }
-    assert below["a"]["c"] == {"d": 2}
 
 
 TINY = """
@@ -281,10 +271,3 @@ def test_a_run_keeps_every_commit_that_it_was_trained_at_and_the_report_tells_th
     stages._tell_commits(report)
     told = json.loads(report.read_text())
     assert told == {"edit_seconds": 0.1, "trained_at": {first.name: ["1234567", "89abcde"], again.name: []}}
-
-
-@pytest.mark.parametrize("workers", ["0", "two"])
-def test_a_number_of_workers_that_cannot_be_is_wrong_usage(workers: str) -> None:
-    with pytest.raises(SystemExit) as ended:
-        run.make_parser().parse_args([f"--workers={workers}"])
-    assert ended.value.code == 2

@@ -19,6 +19,7 @@ from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.pictures import data_uri
 
 HERE = Path(__file__).parent
+STYLES = HERE / "page.css"  # of these pages, and of those that are served
 
 EMPTY = ("", "–")
 """The cells that say nothing."""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 from photonfarm.core.errors import PhotonfarmError
+from photonfarm.core.page import STYLES
 
 if TYPE_CHECKING:
     from photonfarm.farm.progress import FarmProgress
@@ -46,7 +47,7 @@ def make_page_routes(pages: FarmPages) -> Routes:
 
     table: list[tuple[str, bool, Callable[..., Answer]]] = [
         ("/", False, file(STATIC / "index.html")),
-        *((f"/{path.name}", False, file(path)) for path in sorted(STATIC.iterdir()) if path.suffix in KINDS),
+        *((f"/{path.name}", False, file(path)) for path in [STYLES, *STATIC.iterdir()] if path.suffix in KINDS),
         ("/api/state", False, document(pages.state)),
         ("/api/curves", False, document(pages.curves)),
         (f"/api/wall/{_SCENE}", False, document(pages.wall)),

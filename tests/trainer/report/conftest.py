@@ -84,10 +84,19 @@ def measured(filled: SceneStore, trained) -> Measured:
 
 
 @pytest.fixture(scope="session")
-def reported(measured: Measured, tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, Any], Path]:
-    """A report of both runs and a denoiser against references, without times: its figures and its folder."""
-    out, asked = tmp_path_factory.mktemp("report"), {"references": measured.references, "timed": False}
-    return write_report(measured.store, measured.runs, out, denoisers=[("fill-in", 4)], **asked), out
+def compared(measured: Measured) -> ReportContents:
+    """Of both runs and a denoiser against references, without times."""
+    runs, asked = [TrainedRun.load(run) for run in measured.runs], {"references": measured.references}
+    return gather_contents(measured.store, runs, timed=False, denoisers=[("fill-in", 4)], **asked)
+
+
+@pytest.fixture(scope="session")
+def reported(measured: Measured, compared: ReportContents, tmp_path_factory) -> tuple[dict[str, Any], Path]:
+    """The report of `compared`: its figures and its folder."""
+    out = tmp_path_factory.mktemp("report")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("photonfarm.trainer.report.gather_contents", lambda *_, **__: compared)
+        return write_report(measured.store, measured.runs, out), out
 
 
 @pytest.fixture(scope="session")

@@ -29,7 +29,6 @@ from photonfarm.trainer.compare.evaluation_page import (
     list_notes,
 )
 from photonfarm.trainer.compare.evaluation_samples import References
-from photonfarm.trainer.data.batch import choose_kept_pixels, count_kept
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics.features import find_weights
 from photonfarm.trainer.metrics.image_metrics import metric_space, mse
@@ -73,6 +72,7 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(measured, 
     assert reader.spec.exposure == 1
     assert found.rows[1].name == "none 1/1"
     assert found.rows[1].metrics.mse.values == pytest.approx(expected.tolist(), rel=1e-5)
+    assert found.rows[1].metrics.fid is found.rows[1].metrics.feature_l1 is None, "without Inception"
 
 
 def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured, trained, tmp_path: Path) -> None:
@@ -111,15 +111,6 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured,
     assert documents[0]["rows"][2]["linear_mse"]["mean"] < documents[0]["rows"][0]["linear_mse"]["mean"]
     pictures = [np.asarray(Image.open(run.folder / COMPARISON)) for run in runs]
     assert np.array_equal(*pictures)
-
-
-def test_without_inception_all_else_is_measured(measured, trained) -> None:
-    full, quick = (
-        compare(measured.store, [trained()], references=measured.references, most=5, **how).rows[0].metrics
-        for how in ({}, QUICK)
-    )
-    assert quick.fid is quick.kid is quick.feature_l1 is None
-    assert (full.mse, full.mssim) == (quick.mse, quick.mssim)
 
 
 def test_the_foot_says_what_the_figures_cannot(measured) -> None:
@@ -172,26 +163,11 @@ def test_a_chosen_row_is_shown_once_and_the_document_says_which_row_each_picture
     assert draw_comparison(found).shape[0] == fewer.shape[0] + 256 + 18 + 8
 
 
-def test_of_too_few_pixels_none_can_be_kept(make_source) -> None:
-    """One of 256 is one pixel of 256, and one of 257 is none."""
-    source = make_source(3)
-    assert choose_kept_pixels(source.read(0).key, source.spec, 256).sum() == count_kept(source.spec, 256) == 1
-    with pytest.raises(SpecError):
-        choose_kept_pixels(source.read(0).key, source.spec, 257)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--kept", "4"], "--kept"),
-        (["--inception", "file"], "--inception"),
-        (["room"], "room"),
-    ],
-)
-def test_options_that_would_do_nothing_are_refused(arguments: list[str], said: str) -> None:
+@pytest.mark.parametrize("arguments", [["--kept", "4"], ["--inception", "file"], ["room"]])
+def test_options_that_would_do_nothing_are_refused(arguments: list[str]) -> None:
     result = CliRunner().invoke(umbrella, ["evaluate", *arguments])
     assert result.exit_code == 2
-    assert said in result.stderr
+    assert arguments[0] in result.stderr
 
 
 def test_predictors_are_timed_by_turns_after_rounds_that_do_not_count(make_source, tiny) -> None:
@@ -236,17 +212,6 @@ def test_how_far_a_row_is_behind_the_first_is_taken_in_pairs(measured, trained) 
     assert (same.behind(first).mean, same.behind(first).standard_error) == (0, 0)
     assert other.behind(first).mean == pytest.approx(other.held_out.error.mean - first.held_out.error.mean)
     assert other.behind(first).count == first.held_out.error.count
-
-
-def test_a_configuration_file_may_name_one_run_or_several(measured, trained, tmp_path: Path) -> None:
-    runs = [str(trained(**changes).folder) for changes in ({}, {"seed": 1})]
-    file = tmp_path / "photonfarm.toml"
-    for value, wanted in ((json.dumps(runs[0]), 1), (json.dumps(runs), 2)):
-        file.write_text(f'run = {value}\n[evaluate]\nkept = 4\ndenoiser = "none"\n')
-        arguments = ["--config", str(file), "evaluate", "--store", str(measured.store), "--json"]
-        result = CliRunner().invoke(umbrella, arguments, catch_exceptions=False)
-        names = [row["predictor"].split(" (")[0] for row in json.loads(result.stdout)["rows"]]
-        assert names == [*["light_transport"] * wanted, "none 1/4"]
 
 
 def test_runs_with_different_shares_are_measured_on_what_none_has_seen(measured, trained) -> None:

@@ -15,7 +15,6 @@ from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, encode_half_floats, encode_light
-from photonfarm.trainer.report.tables import list_facts
 from photonfarm.trainer.report.views import Layer, ShownView, choose_views, make_light_layer
 
 
@@ -37,12 +36,6 @@ def judged(
             baselines=replace(contents.baselines, mean_colour=colour, mean_shown_colour=shown or colour),
         )
     )
-
-
-def test_a_report_on_joined_samples_names_the_store_that_they_are_from(contents) -> None:
-    joined = {"kind": "join", "store": "5f3a"}
-    of_both = replace(contents, card=replace(contents.card, requests=[*contents.card.requests, joined]))
-    assert dict(list_facts(of_both))["plan 1"] == "kind join, store 5f3a"
 
 
 def test_the_verdict_follows_from_the_numbers(contents) -> None:

@@ -10,7 +10,6 @@ from photonfarm.core.records import ViewBuffers
 from photonfarm.trainer.report.views import write_caption as caption_of
 from photonfarm.trainer.report.worst_cases import (
     ALL,
-    KINDS,
     MIRRORS,
     NEAR,
     HeldOutView,
@@ -19,8 +18,6 @@ from photonfarm.trainer.report.worst_cases import (
     find_shadow_edges,
     find_thin_objects,
     find_worst_cases,
-    list_kinds,
-    name_kinds,
 )
 
 SIZE = 16
@@ -65,14 +62,7 @@ def test_one_view_may_be_the_worst_of_several_kinds_and_a_kind_that_no_view_show
     found = find_worst_cases(views)
     assert [(case.kind, case.row) for case in found] == [("mirrors and clear glass", 1), ("all pixels", 1)]
     assert find_worst_cases([]) == []
-
-
-def test_a_caption_names_all_kinds_that_a_view_is_the_worst_of() -> None:
-    assert name_kinds(["near surfaces"]) == "worst view of near surfaces"
-    assert name_kinds(KINDS) == (
-        "worst view of mirrors and clear glass, specular surfaces, near surfaces, fine shadows, thin objects "
-        "and all pixels"
-    )
+    assert [case.kind for case in find_worst_cases([view(1, 0.3, surface=None)])] == ["all pixels"], "no renderer"
 
 
 def test_the_view_of_median_error_is_not_called_the_worst_of_all_pixels() -> None:
@@ -82,19 +72,6 @@ def test_the_view_of_median_error_is_not_called_the_worst_of_all_pixels() -> Non
     assert caption_of(worst[1:], 3, is_median=True) == "View of median error; row 3"
     assert caption_of(worst, 3) == "Worst view of mirrors and clear glass and all pixels; row 3"
     assert (caption_of(worst, 5), caption_of(worst, 7)) == ("Worst view of near surfaces; row 5", "Row 7")
-
-
-def test_without_the_renderer_s_surfaces_the_other_kinds_are_found() -> None:
-    assert "mirrors and clear glass" not in dict(list_kinds(view(1, surface=None), close=1.0))
-    assert [case.kind for case in find_worst_cases([view(1, 0.3, surface=None)])] == ["all pixels"]
-
-
-def test_what_is_nearer_than_most_that_is_seen_is_close_to_the_camera() -> None:
-    near = view(1).buffers.depth.copy()
-    near[:2] = 0.5
-    near[15] = 0  # nothing is there
-    masks = dict(list_kinds(view(1, buffers=replace(view(1).buffers, depth=near)), close=1.0))
-    assert masks["near surfaces"].sum() == 2 * SIZE
 
 
 def test_the_noise_of_the_reference_is_no_error_on_average() -> None:

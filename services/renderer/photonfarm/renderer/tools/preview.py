@@ -9,8 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from photonfarm.core import pictures
-from photonfarm.core.errors import store_errors
-from photonfarm.core.page import render_page
+from photonfarm.core.page import render_page, write_page
 from photonfarm.core.pictures import Picture
 from photonfarm.core.records import Geometry, Photons
 from photonfarm.renderer.tools.plan_view import PlanView, Standing, hue, said
@@ -61,9 +60,7 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
 
 def write_contact_sheet(reader: SceneReader, count: int, out: Path) -> None:
     """Write the page to a file."""
-    with store_errors("write the sheet", out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(contact_sheet(reader, count))
+    write_page(out, contact_sheet(reader, count))
 
 
 def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:

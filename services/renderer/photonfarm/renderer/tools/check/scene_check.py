@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
-from photonfarm.core.errors import store_errors
-from photonfarm.core.page import render_page
+from photonfarm.core.page import render_page, write_page
 from photonfarm.core.pictures import Picture
 from photonfarm.core.records import F32, Geometry
 from photonfarm.core.waiting import Log, WorkLog
@@ -120,9 +119,7 @@ class Fact:
 
 def write(check: SceneCheck, lines: SpecLines, out: Path) -> None:
     """Write the page of a check to a file; raises StoreError where that cannot be."""
-    with store_errors("write the page", out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        out.write_text(page(check, lines), encoding="utf-8")
+    write_page(out, page(check, lines))
 
 
 def page(check: SceneCheck, lines: SpecLines) -> str:

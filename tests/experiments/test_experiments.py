@@ -15,7 +15,7 @@ from experiments import experiment
 from experiments.dry_run import Need
 from experiments.experiment import Experiment, Size, SizeName, list_names, merge
 from experiments.paper_tables import format_errors
-from experiments.rooms import Room, format_rooms
+from experiments.rooms import Room
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
 from photonfarm.core.errors import SpecError
 from photonfarm.plan.sample_costs import SampleCosts
@@ -131,26 +131,17 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     report = json.loads((out / "report.json").read_text())
     rows = report["evaluation"]["rows"]
     assert [row["name"] for row in rows] == ["light_transport", "denoise_4", "fill-in 1/4"]
-    assert report["evaluation"]["references"]["views"] == 2
-    assert report["evaluation"]["references"]["spp"] == 4
+    references = report["evaluation"]["references"]
+    assert (references["views"], references["spp"]) == (2, 4)
     assert rows[1]["frame_seconds"]["render"] > 0
-    assert rows[0]["frame_seconds"]["render"] == 0
     assert [run["steps"] for run in report["runs"]] == [3, 3]
-    assert report["evaluation"]["shown"]
     assert list(report["trained_at"]) == ["light_transport", "denoise_4", "light_transport-seed-1"]
-    assert all(len(commits) == 1 for commits in report["trained_at"].values())
 
     room = Room.read(tiny, out / "report.json", "1234567")
     assert room.commits() == report["trained_at"]["light_transport"]
     assert (room.spent("samples")["rows"], room.spent("top-up")["rows"]) == (12, 2)
     assert "| denoise_4 |" in format_errors([room], MOVABLE_LIGHTS)
-    assert format_rooms([room]).splitlines()[-1].startswith("| tiny | ")
-    assert room.document["rows"]["light_transport"]["network_seconds_range"][0] > 0
-    assert {name: len(errors) for name in room.rows if (errors := room.errors(name)) is not None} == {
-        "light_transport": 2,
-        "denoise_4": 1,
-        "fill-in 1/4": 1,
-    }
+    assert [len(room.errors(name)) for name in room.rows] == [2, 1, 1]
 
     before = reports(stages)
     assert stages.run() == out
@@ -199,17 +190,16 @@ def test_a_stage_that_fails_says_which_and_where_its_output_is(tiny: Experiment,
         stages.train()
 
 
-@pytest.mark.parametrize(("untrained", "kept"), [(("oidn",), True), ((), False)])
 def test_kept_pixels_are_asked_for_with_denoisers_that_come_ready_alone(
-    tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, untrained: tuple[str, ...], kept: bool
+    tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`photonfarm report` refuses --kept without --denoiser."""
-    asked: list[str] = []
-    monkeypatch.setattr(Stages, "_verb", lambda _, __, arguments, **___: asked.extend(map(str, arguments)))
     monkeypatch.setattr(Stages, "_tell_commits", lambda *_: None)
-    Stages(with_size(tiny, untrained=untrained), tmp_path / "work", workers=1).report()
-    assert asked[0] == "report"
-    assert ("--kept" in asked) is ("--denoiser" in asked) is kept
+    for untrained in (("oidn",), ()):
+        asked: list[str] = []
+        monkeypatch.setattr(Stages, "_verb", lambda _, __, given, asked=asked, **___: asked.extend(map(str, given)))
+        Stages(with_size(tiny, untrained=untrained), tmp_path / "work", workers=1).report()
+        assert ("--kept" in asked) is ("--denoiser" in asked) is bool(untrained)
 
 
 def test_training_that_ends_early_without_an_error_is_not_taken_for_done(

@@ -9,7 +9,6 @@ import pytest
 
 from bench.farm import farm, pairs
 from bench.farm.account import WRITER, Account, Ledger, accounted
-from bench.farm.pairs import ConcurrentWork
 
 # of three jobs after the first, in seconds: 10 of rendering, 1 of the store's, 0.5 of the rest, 0.1 of the queue
 JOB = {"loop": 11.6, "render": 11.5, "scene": 10.0, "rows": 0.4, "commit": 0.6}
@@ -63,18 +62,6 @@ def test_the_steady_state_is_while_every_worker_has_whole_jobs_to_do() -> None:
 def test_a_run_without_a_steady_state_ends_the_program(count: int) -> None:
     with pytest.raises(SystemExit, match="take more"):
         pairs.steady_ends([ends(1.0, 9.0), ends(8.0, 9.5)], count)
-
-
-def test_ratios_are_of_neighbouring_runs() -> None:
-    runs = [
-        (ConcurrentWork(1.0, {0: 3.0}), ConcurrentWork(1.8, {0: 4.0})),
-        (ConcurrentWork(2.0, {0: 3.0}), ConcurrentWork(3.8, {0: 3.0})),
-    ]
-    runs.append((ConcurrentWork(4.0, {0: 3.0}), ConcurrentWork(6.0, {0: 6.0})))
-    found = pairs.pair_of("jobs", runs)
-    assert (found.one, found.two) == (2.0, 3.8)
-    assert (found.ratio, found.ratio_from, found.ratio_to) == pytest.approx((1.8, 1.5, 1.9))
-    assert found.cpu_ratio == pytest.approx(1.5)
 
 
 def test_the_page_has_the_figures_and_their_targets() -> None:

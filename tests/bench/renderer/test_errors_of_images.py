@@ -14,7 +14,6 @@ from bench.renderer.peers.errors import (
     mean_ratio,
     reference_of,
     relative_errors,
-    trimmed_error,
 )
 
 TRUTH = np.random.default_rng(5).uniform(0.5, 2.0, (32, 32, 3))
@@ -45,14 +44,6 @@ def test_bias_counts_in_full() -> None:
     reference = reference_of([renders(rng, 8, 0.01)])
     error = full_error(relative_errors(renders(rng, 4, 1e-4, scale=1.1), reference))
     assert error == pytest.approx(0.01 * float((TRUTH**2 / (TRUTH**2 + 1e-2 * TRUTH.mean() ** 2)).mean()), rel=0.02)
-
-
-def test_a_few_bad_pixels_are_trimmed_and_no_more_than_one_percent() -> None:
-    errors = np.ones((4, 1000))
-    errors[:, :10] = 1e6
-    assert trimmed_error(errors) == pytest.approx(1.0)
-    errors[:, 10] = 1e6
-    assert trimmed_error(errors) > 1000
 
 
 # Errors 4 : 1 and times 1 : 2 make an efficiency of 2.

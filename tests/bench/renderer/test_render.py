@@ -100,14 +100,6 @@ def test_half_the_noise_at_equal_time_is_four_times_as_efficient() -> None:
     assert rows["path"]["efficiency_full"]["value"] == pytest.approx(1.0)
 
 
-def test_the_curve_ends_with_averages_of_two_and_four_images() -> None:
-    points = result_of()["curves"]["path"]
-    assert [point["averaged"] for point in points] == [1, 1, 1, 2, 4]
-    errors = [point["full"] for point in points]
-    assert errors == sorted(errors, reverse=True)
-    assert points[-1]["seconds"] == pytest.approx(4 * points[2]["seconds"])
-
-
 def test_the_page_has_a_figure_in_every_cell() -> None:
     assert "nan" not in page.page([result_of()], KEY, "a machine")
 

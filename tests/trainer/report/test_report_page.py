@@ -3,19 +3,18 @@
 import base64
 import json
 import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from chromium import chromium, needs_chromium
 
-from photonfarm.core.records import Guides
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, encode_half_floats, encode_light
-from photonfarm.trainer.report.views import Layer, ShownView, choose_views, make_light_layer
+from photonfarm.trainer.report.views import Layer, ShownView, make_light_layer
 
 
 def errors(*per_sample: float) -> HeldOutErrors:
@@ -77,22 +76,6 @@ def test_the_page_holds_the_verdict_and_the_light_of_the_store_to_the_bit(measur
         sample = source.read(row)
         shown = np.frombuffer(base64.b64decode(layers["noisy half"]), "<f2").reshape(sample.radiance[0].shape)
         np.testing.assert_array_equal(shown.astype(np.float64), sample.radiance[0])
-
-
-def test_the_inputs_are_shown_with_guides_where_the_network_reads_them_and_these_show_something(contents) -> None:
-    assert [layer.name for layer in choose_views(contents)[0].inputs] == ["albedo", "normal", "depth"]
-    film = contents.card.spec.film
-    ramp = np.linspace(0, 1, film.height * film.width, dtype=np.float32).reshape(film.height, film.width, 1)
-    shapes = {field.name: (film.height, film.width, 3) for field in fields(Guides)}
-    black = {name: np.zeros(shape, np.float32) for name, shape in shapes.items()}
-    guides = Guides(**{**black, "direct": ramp.repeat(3, axis=2), "roughness": ramp[..., 0]})
-    inputs = {row: (buffers, guides) for row, (buffers, _) in contents.inputs.items()}
-    spec = contents.card.spec.model_copy(update={"exposure": 4.0})
-    given = replace(contents, inputs=inputs, card=replace(contents.card, spec=spec))
-    layers = {layer.name: layer for layer in choose_views(given)[0].inputs}
-    assert list(layers) == ["albedo", "normal", "depth", "direct light", "roughness"]
-    np.testing.assert_array_equal(layers["direct light"].light, 4 * guides.direct)
-    assert layers["roughness"].light is None
 
 
 def test_large_films_are_reduced_and_light_that_does_not_fit_is_left_out() -> None:

@@ -70,45 +70,27 @@ OnProgress = Callable[[str, int, int], None]
 def show_progress() -> Iterator[OnProgress]:
     """Yield a callback with what is done, how many of its samples are done, and of how many; 0: it has no parts."""
     console = Console(stderr=True)
-    with _show_bars(console) if console.is_terminal else _print_lines() as show:
-        yield show
-
-
-@contextmanager
-def _show_bars(console: Console) -> Iterator[OnProgress]:
     columns = TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn()
-    with Progress(*columns, console=console, transient=True) as bars:
-        tasks: dict[str, Any] = {}
-        measured: set[str] = set()
+    name, since_s, samples, bar = "starts", time.monotonic(), Steps(0), None
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
 
-        def show(name: str, done: int, total: int) -> None:
-            if name not in tasks:
-                for part in [each for each in tasks if each not in measured]:
-                    bars.remove_task(tasks.pop(part))
-                tasks[name] = bars.add_task(markup.escape(name), total=total or None)
-            if total:
-                measured.add(name)
-            bars.update(tasks[name], completed=done)
+        def show(what: str, done: int, total: int) -> None:
+            nonlocal name, since_s, samples, bar
+            if what != name:
+                if bar is not None and not samples.total:
+                    bars.remove_task(bar)  # the bars of predictors stay
+                name, since_s, samples = what, time.monotonic(), Steps(total)
+                bar = bars.add_task(markup.escape(name), total=total or None)
+            samples.reach(done)
+            if bar is not None:
+                bars.update(bar, completed=done)
+            if total and done == total and not console.is_terminal:
+                click.echo(f"{name}: {total} samples", err=True)
 
-        yield show
+        def print_line() -> None:
+            if not console.is_terminal:
+                so_far = f": sample {samples.words()}" if samples.total else f", for {time.monotonic() - since_s:.0f} s"
+                click.echo(f"{name}{so_far}", err=True)
 
-
-@contextmanager
-def _print_lines() -> Iterator[OnProgress]:
-    name, since_s, samples = "starts", time.monotonic(), Steps(0)
-
-    def show(what: str, done: int, total: int) -> None:
-        nonlocal name, since_s, samples
-        if what != name:
-            name, since_s, samples = what, time.monotonic(), Steps(total)
-        samples.reach(done)
-        if total and done == total:
-            click.echo(f"{name}: {total} samples", err=True)
-
-    def line() -> str:
-        if not samples.total:
-            return f"{name}, for {time.monotonic() - since_s:.0f} s"
-        return f"{name}: sample {samples.words()}"
-
-    with repeat(SILENCE_S, lambda: click.echo(line(), err=True)):
-        yield show
+        with repeat(SILENCE_S, print_line):
+            yield show

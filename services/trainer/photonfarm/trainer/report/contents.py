@@ -14,7 +14,7 @@ from typing import Any, Unpack
 
 from photonfarm.core.archives import FrameCosts
 from photonfarm.core.errors import BackendError
-from photonfarm.core.records import F32, Guides, ViewBuffers
+from photonfarm.core.records import F32, ViewBuffers
 from photonfarm.core.statistics import Estimate
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureOptions, PredictorRow, compare
@@ -107,7 +107,7 @@ class ReportContents:
     machine: Machine  # on which times were taken
     worst: tuple[WorstCase, ...]
     published: str | None  # the name of the paper's table beside ours
-    inputs: Mapping[int, tuple[ViewBuffers, Guides | None]]  # of the shown rows, as far as the first run is given them
+    buffers: Mapping[int, ViewBuffers]  # of the shown rows
 
     @property
     def measure(self) -> ReportEntry:
@@ -160,11 +160,11 @@ def gather_contents(
         machine = Machine.here()
         tell("the worst cases are looked for", 0, 0)
         surfaces = {} if costs is None else dict(zip(costs.rows.tolist(), costs.surface, strict=True))
-        buffers = _read_inputs(store, first, sorted(references.keys() & images.keys()), guides=False)
+        buffers = _read_buffers(store, first, sorted(references.keys() & images.keys()))
         worst = find_worst_cases(
             [
                 HeldOutView(row, images[row], references[row].half_a, references[row].half_b, of, surfaces.get(row))
-                for row, (of, _) in buffers.items()
+                for row, of in buffers.items()
             ]
         )
         return [case.row for case in worst]
@@ -192,15 +192,11 @@ def gather_contents(
         machine=machine,
         worst=tuple(worst),
         published=title if any(entry.published for entry in entries) else None,
-        inputs=_read_inputs(store, first, [target.row for target in evaluation.shown], guides=first.needs.guides),
+        buffers=_read_buffers(store, first, [target.row for target in evaluation.shown]),
     )
 
 
-def _read_inputs(
-    store: str | Path, run: TrainedRun, rows: list[int], *, guides: bool
-) -> dict[int, tuple[ViewBuffers, Guides | None]]:
-    """The buffers of some rows, and their guides if asked for."""
+def _read_buffers(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, ViewBuffers]:
     source = run.source(store)
     source.refresh()
-    samples = {row: source.read(row, guides=guides) for row in rows}
-    return {row: (sample.buffers, sample.guides) for row, sample in samples.items()}
+    return {row: source.read(row).buffers for row in rows}

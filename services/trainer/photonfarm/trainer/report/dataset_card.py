@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from photonfarm.plan.request import UNUSED
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store import SceneStatus, SceneStore, Store
+from photonfarm.store import SceneStatus, Store
 from photonfarm.store.model.status import scene_status
 
 SAMPLES = "samples"
@@ -39,25 +40,29 @@ class DatasetCard:
     def of(cls, store: str | Path, scene_id: str, exposure: float) -> DatasetCard:
         """The card of one scene, exposed as its runs are; raises StoreError for one that the store does not hold."""
         scene = Store(store).scene(scene_id)
-        status = scene_status(scene)
-        versions: dict[str, set[str]] = {}
-        workers = set()
-        core_s: dict[int, float] = {}
-        for job in sorted(scene.committed_jobs()):
-            figures = scene.marker(job)["figures"]
-            core_s[job] = figures["core_s"]
-            workers.add(figures["worker"])
-            for package, version in figures["versions"].items():
-                versions.setdefault(package, set()).add(version)
-        requests = tuple(plan.request.model_dump(mode="json") for plan in scene.plans())
-        known = {package: sorted(numbers) for package, numbers in sorted(versions.items())}
+        status, plans, committed = scene_status(scene), scene.plans(), set(scene.committed_jobs())
+        versions: dict[str, set[str]] = defaultdict(set)
+        workers: set[str] = set()
+        spent: dict[str, PlanTotals] = defaultdict(lambda: PlanTotals(0, 0, 0.0))
+        for plan in plans:
+            used = (plan.rows.sample_modification != UNUSED).reshape(plan.jobs, plan.shard_rows).sum(axis=1)
+            totals = spent[plan.request.kind]
+            planned, rows, core_seconds = totals.planned + plan.samples, totals.rows, totals.core_seconds
+            for job in sorted(committed.intersection(range(plan.first_job, plan.end_job))):
+                figures = scene.marker(job)["figures"]
+                rows += int(used[job - plan.first_job])
+                core_seconds += figures["core_s"]
+                workers.add(figures["worker"])
+                for package, version in figures["versions"].items():
+                    versions[package].add(version)
+            spent[plan.request.kind] = PlanTotals(planned, rows, core_seconds)
         return cls(
             scene.spec.model_copy(update={"exposure": exposure}),
             status,
-            requests,
-            known,
+            tuple(plan.request.model_dump(mode="json") for plan in plans),
+            {package: sorted(numbers) for package, numbers in sorted(versions.items())},
             len(workers),
-            _sum_by_kind(scene, core_s),
+            {kind: totals for kind, totals in spent.items() if totals.rows},
         )
 
     @property
@@ -116,18 +121,3 @@ class DatasetCard:
             "workers": self.workers,
             "versions": self.versions,
         }
-
-
-def _sum_by_kind(scene: SceneStore, core_s: dict[int, float]) -> dict[str, PlanTotals]:
-    """The totals by kind of request, given the seconds of the committed jobs."""
-    totals: dict[str, PlanTotals] = {}
-    for plan in scene.plans():
-        used = (plan.rows.sample_modification != UNUSED).reshape(plan.jobs, plan.shard_rows).sum(axis=1)
-        done = [job for job in range(plan.first_job, plan.end_job) if job in core_s]
-        before = totals.get(plan.request.kind, PlanTotals(0, 0, 0.0))
-        totals[plan.request.kind] = PlanTotals(
-            before.planned + plan.samples,
-            before.rows + sum(int(used[job - plan.first_job]) for job in done),
-            before.core_seconds + sum(core_s[job] for job in done),
-        )
-    return {kind: spent for kind, spent in totals.items() if spent.rows}

@@ -22,7 +22,6 @@ from photonfarm.core.pictures import reduce_image
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page
-from photonfarm.trainer.metrics.image_metrics import confidence_interval
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.plots import PlotGroup
@@ -103,21 +102,6 @@ def _describe_references(contents: ReportContents) -> str:
     )
 
 
-def list_headline(contents: ReportContents) -> list[tuple[str, str]]:
-    """Figures of the data and of the first entry, each with what it is."""
-    card, error = contents.card, contents.entries[0].row.held_out.error
-    reach = confidence_interval(error)
-    spread = "" if reach is None else f" (95 %: {reach[0]:.2g} … {reach[1]:.2g})"
-    rate = f"{1 / card.core_s_per_sample:.1f}" if card.core_s_per_sample else "–"
-    return [
-        (f"{error.mean:.3g}", f"held-out error{spread}"),
-        (f"{contents.baselines.mean_colour.error.mean:.3g}", "error of the mean colour"),
-        (f"{contents.evaluation.noise_floor:.3g}", "noise of the targets, which is not in these errors"),
-        (f"{card.samples.rows}", f"samples of {card.samples.planned} planned, held-out ones among them"),
-        (rate, "samples rendered per core-second"),
-    ]
-
-
 TEMPLATE = Path(__file__).with_name("report.html.j2")
 VIEWER = Path(__file__).with_name("viewer.js")
 
@@ -137,7 +121,6 @@ def format_page(
         TEMPLATE,
         title=f"photonfarm: {contents.card.spec.name}",
         verdict=verdict,
-        headline=list_headline(contents),
         measured=evaluation_page.count_views(contents.evaluation),
         views=views,
         largest=LARGEST,

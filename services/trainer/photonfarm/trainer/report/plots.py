@@ -29,7 +29,7 @@ STYLE: dict[Any, Any] = {  # names of matplotlib
     "axes.grid": True,
     "grid.alpha": 0.3,
 }
-COLOURS = (
+COLOURS = [
     "#1f5fa8",
     "#c2571a",
     "#3b8f4d",
@@ -42,7 +42,7 @@ COLOURS = (
     "#a6a61a",
     "#111111",
     "#8fbcff",
-)
+]
 """The colours of the predictors, by their places in the tables, in all plots; they repeat beyond twelve."""
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photonfarm.core.pictures import Picture, display, display_values, draw_albedo, draw_depth, draw_normal
-from photonfarm.core.records import F32, Guides
+from photonfarm.core.records import F32, ViewBuffers
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.worst_cases import ALL, WorstCase, name_kinds
@@ -19,21 +19,6 @@ from photonfarm.trainer.report.worst_cases import ALL, WorstCase, name_kinds
 LARGEST = 0.25  # difference in the metric space that is drawn brightest
 
 PREDICTION, NOISY, DIFFERENCE = "prediction", "noisy half", "difference"
-
-OF_GUIDES = {
-    "direct": "direct light",
-    "gloss": "direct light in gloss",
-    "emission": "emitted light",
-    "specular": "specular albedo",
-    "roughness": "roughness",
-    "throughput": "mirrors and glass",
-    "beyond_albedo": "albedo beyond them",
-}
-"""The guides that are shown where they vary over the view."""
-
-RADIANCE = ("direct", "gloss", "emission")
-
-VARIED = 8.0  # standard deviation of a picture's bytes, above which there is something to see in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,7 +69,7 @@ def _make_view(contents: ReportContents, target: Target) -> ShownView:
     ]
     for name, image in others:
         images += _compare_layers(name, image, target.image, of=f" of {name}")[:2]
-    inputs = tuple(_list_inputs(contents, target.row))
+    inputs = tuple(_list_inputs(contents.buffers[target.row]))
     return ShownView(target.row, write_caption(contents.worst, target.row), against, tuple(images), inputs, mse)
 
 
@@ -112,24 +97,11 @@ def make_light_layer(name: str, caption: str, exposed: F32) -> Layer:
     return Layer(name, caption, display(exposed, 1.0), exposed)
 
 
-def _list_inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
-    buffers, guides = contents.inputs[row]
+def _list_inputs(buffers: ViewBuffers) -> Iterator[Layer]:
+    """The buffers that every network is given; guides, which some are given too, are in the store."""
     yield Layer("albedo", "albedo", draw_albedo(buffers.albedo))
     yield Layer("normal", "normal", draw_normal(buffers.normal))
     yield Layer("depth", "depth", draw_depth(buffers.depth))
-    if guides is not None:
-        yield from _list_guides(guides, np.float32(contents.card.spec.exposure))
-
-
-def _list_guides(guides: Guides, exposure: np.float32) -> Iterator[Layer]:
-    for field, name in OF_GUIDES.items():
-        values: F32 = getattr(guides, field)
-        if field in RADIANCE:
-            layer = make_light_layer(name, name, exposure * values)
-        else:
-            layer = Layer(name, name, draw_albedo(np.broadcast_to(np.atleast_3d(values), (*values.shape[:2], 3))))
-        if layer.picture.std() > VARIED:
-            yield layer
 
 
 def write_legend(contents: ReportContents) -> str:

@@ -10,8 +10,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.tools.importing.imported import ImportedScene
-from photonfarm.renderer.tools.importing.meshes import Mesh, read_mesh, write_ply
+from photonfarm.renderer.tools.importing.imported import ImportedScene, Mesh, read_mesh, write_ply
 
 Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.renderer.tools.importing import images
-from photonfarm.renderer.tools.importing.meshes import Floats
 from photonfarm.scene.files import Located, line_of
 
 
@@ -117,7 +117,7 @@ def write(root: Element, file: Path) -> None:
     file.write_text(text(root), encoding="utf-8")
 
 
-Profile = Callable[[Floats, Floats], Floats]
+Profile = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """The share of a spot's intensity at tangents (x, y) off its axis."""
 
 WIDEST = math.radians(89.5)

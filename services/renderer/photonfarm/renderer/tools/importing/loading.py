@@ -20,8 +20,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.changes import name_some
-from photonfarm.renderer.tools.importing.imported import Ids, ImportedScene
-from photonfarm.renderer.tools.importing.meshes import Floats, Mesh, read_mesh
+from photonfarm.renderer.tools.importing.imported import Floats, Ids, ImportedScene, Mesh, read_mesh
 from photonfarm.renderer.tools.importing.readers.mitsuba_parts import effect_of
 
 FAR = 10.0

@@ -25,8 +25,7 @@ from photonfarm.core.errors import BackendError, SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.elements import WIDEST, Profile, put_cones
-from photonfarm.renderer.tools.importing.imported import ImportedScene
-from photonfarm.renderer.tools.importing.meshes import Floats, unit
+from photonfarm.renderer.tools.importing.imported import Floats, ImportedScene, unit
 from photonfarm.renderer.tools.importing.readers import gltf
 
 VARIABLE = "PHOTONFARM_BLENDER"

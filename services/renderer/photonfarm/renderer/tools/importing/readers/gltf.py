@@ -18,8 +18,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.elements import WIDEST, put_cones
-from photonfarm.renderer.tools.importing.imported import ImportedScene
-from photonfarm.renderer.tools.importing.meshes import Floats, Mesh
+from photonfarm.renderer.tools.importing.imported import Floats, ImportedScene, Mesh
 from photonfarm.renderer.tools.importing.readers.gltf_file import GltfFile, Node, extension, normalise, numbers
 from photonfarm.renderer.tools.importing.readers.gltf_materials import Look, Materials
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
-from photonfarm.renderer.tools.importing.meshes import Floats
+from photonfarm.renderer.tools.importing.imported import Floats
 
 Node = Mapping[str, Any]
 

@@ -16,8 +16,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from photonfarm.renderer.tools.importing import images
-from photonfarm.renderer.tools.importing.imported import ImportedScene
-from photonfarm.renderer.tools.importing.meshes import Floats
+from photonfarm.renderer.tools.importing.imported import Floats, ImportedScene
 from photonfarm.renderer.tools.importing.readers.gltf_file import GltfFile, Node, extension, numbers
 from photonfarm.renderer.tools.importing.surfaces import Lie, Map, Writer, constant
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
-from photonfarm.renderer.tools.importing.imported import Ids
-from photonfarm.renderer.tools.importing.meshes import Floats
+from photonfarm.renderer.tools.importing.imported import Floats, Ids
 from photonfarm.scene.files import POLARISED, SHAPES
 
 _KINDS = {"bsdf": "BSDF", "emitter": "Emitter", "texture": "Texture"}

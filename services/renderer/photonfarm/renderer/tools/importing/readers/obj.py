@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
 from photonfarm.renderer.tools.importing.changes import Changes
-from photonfarm.renderer.tools.importing.imported import ImportedScene
-from photonfarm.renderer.tools.importing.meshes import Floats, Mesh, unit
+from photonfarm.renderer.tools.importing.imported import Floats, ImportedScene, Mesh, unit
 from photonfarm.renderer.tools.importing.readers.mtl import Material, read_libraries, statements
 
 _WIDTHS = {"v": 3, "vt": 2, "vn": 3}
@@ -33,8 +32,6 @@ _LOST = {
     "s": "faces of smoothing groups are flat without vn; export normals",
     "v": "colours of vertices are not read of OBJ; export as glTF",
 }
-
-_ROUNDING = 1e-6  # the error of a polygon's area, as a share of it, from which its triangles do not fill it
 
 _Ints = NDArray[np.int64]
 
@@ -164,10 +161,7 @@ def _triangles(file: _File) -> tuple[_Ints, _Ints, _Tables]:
     line, part, sizes = marks[:, :3].T
     points, uv, normals = (np.array(file.tables[word]).reshape(-1, width) for word, width in _WIDTHS.items())
     corner = file.find_corners(np.repeat(marks, sizes, axis=0))
-    triangle, face, crossing = _cut(points[corner[:, 0]], sizes)
-    for each in line[crossing]:
-        meaning = "faces cross themselves or have no area, and are filled as well as can be"
-        file.changes.note(meaning, f"line {each}", name="f")
+    triangle, face = _cut(points[corner[:, 0]], sizes)
     for each in line[sizes < 3]:
         file.changes.note("faces have fewer than three corners, and so no surface", f"line {each}", name="f")
     normals = unit(np.concatenate([np.where(np.isfinite(normals), normals, np.nan), np.full((1, 3), np.nan)]))
@@ -175,11 +169,11 @@ def _triangles(file: _File) -> tuple[_Ints, _Ints, _Tables]:
     return corner[triangle], part[face], (points, uv, normals)
 
 
-def _cut(points: Floats, sizes: _Ints) -> tuple[_Ints, _Ints, _Ints]:
+def _cut(points: Floats, sizes: _Ints) -> tuple[_Ints, _Ints]:
     """Polygons of `sizes` corners each (N,), whose points (K, 3) follow one another, as triangles.
 
-    Returns their corners (T, 3), the polygon of each (T,), and the polygons that cross themselves. Those of fewer than
-    three corners have no triangles.
+    Returns their corners (T, 3) and the polygon of each (T,). Those of fewer than three corners have no triangles, and
+    those that cross themselves are filled as well as can be.
     """
     starts, counts = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
     owner = np.repeat(np.arange(len(sizes)), counts)
@@ -196,8 +190,7 @@ def _cut(points: Floats, sizes: _Ints) -> tuple[_Ints, _Ints, _Ints]:
     a, b, c = points[corner].swapaxes(0, 1)
     areas = (np.cross(b - a, c - a) * across[owner]).sum(axis=1)
     corner[areas < 0] = corner[areas < 0, ::-1]
-    filled, whole = np.bincount(owner, np.abs(areas), len(sizes)), (across * across).sum(axis=1)
-    return corner, owner, np.flatnonzero((np.abs(filled - whole) >= _ROUNDING * whole) & (sizes > 3))
+    return corner, owner
 
 
 def _ears(points: Floats, across: Floats) -> _Ints:

@@ -142,7 +142,7 @@ class Stages:
         """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""
         from photonfarm.trainer.runs.settings import PRESETS
 
-        preset = PRESETS[run.train["preset"]]().model_dump(mode="json", exclude_unset=True)
+        preset = dict(PRESETS[run.train["preset"]])
         return {**preset.pop("network"), **preset, **self._settings(run)}
 
     def _settings(self, run: Run) -> dict[str, Any]:

@@ -96,9 +96,9 @@ def test_a_full_disk_is_told_from_other_refusals(number: int, full: bool) -> Non
 
 
 def test_the_trainers_first_samples_are_never_held_back() -> None:
-    from photonfarm.trainer.runs.settings import TrainSettings, small
+    from photonfarm.trainer.runs.settings import TrainSettings, make_preset
 
-    for settings in (TrainSettings(), small()):
+    for settings in (TrainSettings(), make_preset("small")):
         assert settings.minimum_samples + settings.validation_samples < backpressure.AHEAD_MINIMUM
 
 

@@ -16,7 +16,7 @@ from photonfarm.cli.main import file_defaults, options_by_command, umbrella
 from photonfarm.core import errors
 from photonfarm.scene import spec as scene_spec
 from photonfarm.scene.free_space import FreeSpace
-from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Occlusion, TrainSettings
+from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Occlusion, TrainSettings, make_preset
 
 ROOT = Path(__file__).parents[3]
 DOCS = ROOT / "docs"
@@ -132,7 +132,7 @@ def format_setting(value: object) -> str:
 def test_the_page_of_the_settings_of_training_lists_every_key_with_its_values_in_two_presets() -> None:
     listed = {cells[0].strip("`"): cells[1:3] for cells in read_rows("training-settings.md", 4)}
     assert set(listed) == set(KEYS)
-    presets = [PRESETS["small"](), PRESETS["paper-dynamic"]()]
+    presets = [make_preset("small"), make_preset("paper-dynamic")]
     for key in KEYS:
         assert listed[key] == [format_setting(get_setting(preset, key)) for preset in presets], key
 
@@ -140,8 +140,10 @@ def test_the_page_of_the_settings_of_training_lists_every_key_with_its_values_in
 def test_the_page_of_the_settings_of_training_says_in_what_the_other_presets_differ() -> None:
     listed = {cells[0].strip("`"): cells[1] for cells in read_rows("training-settings.md", 3)}
     for name in PRESETS.keys() - {"small", "paper-dynamic"}:
-        pairs = {key: format_setting(get_setting(PRESETS[name](), key)) for key in KEYS}
-        differing = {key for key in KEYS if pairs[key] != format_setting(get_setting(PRESETS["paper-dynamic"](), key))}
+        pairs = {key: format_setting(get_setting(make_preset(name), key)) for key in KEYS}
+        differing = {
+            key for key in KEYS if pairs[key] != format_setting(get_setting(make_preset("paper-dynamic"), key))
+        }
         assert {*listed[name].split(", ")} == {f"`{key} = {pairs[key]}`" for key in differing}
 
 

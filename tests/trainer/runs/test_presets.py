@@ -12,7 +12,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer import service
 from photonfarm.trainer.cli.train_verb import train
-from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, make_preset, make_settings, small
+from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, make_preset, make_settings
 from photonfarm.trainer.training.losses import paired_loss
 
 
@@ -81,7 +81,7 @@ def test_the_command_line_chooses_preset_architecture_and_precision(chosen: list
     asked, plain = chosen
     assert (asked.network.architecture, asked.network.precision) == ("denoise_16", "bfloat16")
     assert (asked.network.points, asked.batch) == (16384, 7)
-    assert plain == small()
+    assert plain == make_preset("small")
 
 
 def test_the_configuration_file_chooses_them_as_well(chosen: list[TrainSettings], tmp_path: Path) -> None:

@@ -5,14 +5,14 @@ import pytest
 import torch
 
 from photonfarm.renderer.strategy.noise import LOSS_EPSILON, pair_errors, training_weights
-from photonfarm.trainer.runs.settings import PRESETS
+from photonfarm.trainer.runs.settings import make_preset
 from photonfarm.trainer.training.losses import RELATIVE_EPSILON, relative_loss
 
 SIDE, EXPOSURE, HALVES = 64, 2.5, 16
 
 
 def test_the_renderer_knows_the_default_loss() -> None:
-    assert PRESETS["small"]().loss == "relative"
+    assert make_preset("small").loss == "relative"
     assert LOSS_EPSILON == RELATIVE_EPSILON
 
 

@@ -13,7 +13,7 @@ from photonfarm.trainer.predictors.evaluation import read_batches
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
-from photonfarm.trainer.runs.settings import PRESETS, TrainSettings
+from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, make_preset
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import compute_rate
 from photonfarm.trainer.training.loop import train
@@ -32,7 +32,7 @@ def same(one: Weights, other: Weights) -> bool:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets_have_the_supplements_schedule_and_no_average(name: str) -> None:
-    settings = PRESETS[name]()
+    settings = make_preset(name)
     wanted = ("cosine", 0.99, True) if name == "small" else ("epochs", 0.0, name != "paper")
     assert (settings.schedule, settings.average, settings.recover) == wanted
 

@@ -77,8 +77,7 @@ def load(path: Path, *, without: str = "") -> dict[str, Any]:
         raise StoreError(
             f"{path}: has format {stored!r}, but this version reads format {FORMAT}; train anew in another folder"
         )
-    state: dict[str, Any] = _put_together(document, tensors)
-    return state
+    return dict(_put_together(document, tensors))
 
 
 class _DamagedError(Exception):
@@ -90,46 +89,42 @@ def _find_remedy(path: Path) -> str:
     good = path.with_name(GOOD)
     try:
         document, _ = _read(good)
-        step = document["step"] if document["format"] == FORMAT and "store" in document else None
-    except (_DamagedError, StoreError, KeyError):
-        step = None
-    if step is None or good == path:
+    except (_DamagedError, StoreError):
+        document = {}
+    if document.get("format") != FORMAT or "store" not in document or good == path:
         return ANEW
-    return f"{GOOD} beside it is whole, of step {step}: `mv {good} {path}`, and the run goes on from there"
+    return f"{GOOD} beside it is whole, of step {document['step']}: `mv {good} {path}`, and the run goes on from there"
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """What `_read_once` gives, of one file, also while a trainer replaces it by the next."""
+    """The JSON document, and the tensors by their names, of one file, also while a trainer replaces it by the next.
+
+    Raises _DamagedError for bytes that were not written so.
+    """
     before = _identify(path)
-    try:
-        return _read_once(path)
-    except _DamagedError:
-        if _identify(path) == before:
-            raise
-        return _read(path)
-
-
-def _identify(path: Path) -> tuple[int, int] | None:
-    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
-
-
-def _read_once(path: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """The JSON document, and the tensors by their names; _DamagedError for bytes that were not written so."""
     try:
         with safe_open(path, framework="pt") as file:
             document = dict(json.loads((file.metadata() or {}).get(METADATA, "{}")))
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        if document.get("format") == FORMAT and document.get("sha256") != _hash_tensors(tensors):
+            raise _DamagedError("is damaged, as its numbers do not match its checksum")
     except FileNotFoundError as error:
         raise StoreError(
             f"{path}: there is no checkpoint yet; a run leaves one every 500 steps (--set checkpoint_every=N), and at "
             "its end"
         ) from error
-    except UNREADABLE as error:
+    except (*UNREADABLE, _DamagedError) as error:
+        if _identify(path) != before:
+            return _read(path)
+        if isinstance(error, _DamagedError):
+            raise
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise _DamagedError(f"is not a readable checkpoint: {reason}") from error
-    if document.get("format") == FORMAT and document.get("sha256") != _hash_tensors(tensors):
-        raise _DamagedError("is damaged, as its numbers do not match its checksum")
     return document, tensors
+
+
+def _identify(path: Path) -> tuple[int, int] | None:
+    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
 
 
 def _hash_tensors(tensors: Mapping[str, Tensor]) -> str:
@@ -162,19 +157,10 @@ def _put_together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
     return [_put_together(member, tensors) for member in value] if isinstance(value, list) else value
 
 
-def describe_store(scene_id: str, plans: Sequence[Mapping[str, Any]], samples: int) -> dict[str, Any]:
-    """The state of the store at a checkpoint: scene, plans, and how many samples had arrived; `following` has which."""
-    return {"scene_id": scene_id, "plans": list(plans), "samples": samples}
-
-
 def list_versions() -> dict[str, str]:
     """The versions of the packages that a run's arithmetic depends on."""
-    return {
-        "photonfarm": version("photonfarm"),
-        "python": platform.python_version(),
-        "torch": torch.__version__,
-        "numpy": np.__version__,
-    }
+    others = {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__}
+    return {"photonfarm": version("photonfarm"), **others}
 
 
 def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str, Any]) -> Changes:

@@ -7,8 +7,7 @@ linear in the target: then its mean is the gradient with the mean target [supple
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, Self, get_args
 
@@ -24,37 +23,28 @@ PAGE = "docs/results/networks.md"
 """The source of the figures below: a pixel of mean 0.90 with rare bright samples."""
 
 
-@dataclass(frozen=True, slots=True)
-class BiasReason:
-    """The reason why a setting is refused."""
-
-    why: str
-    ends_at: tuple[float, float, float] | None = None  # of PAGE's pixel, at 4, 16 and 256 samples a target
-
-    def rule(self, instead: str) -> str:
-        """The second half of a message: the measurement, and what is allowed instead."""
-        measured = ""
-        if self.ends_at is not None:
-            values = ", ".join(f"{value:.2f}" for value in self.ends_at)
-            measured = f"; a pixel of mean 0.90 ends at {values} with targets of 4, 16, 256 samples ({PAGE})"
-        return f"is refused because noisy targets bias it: {self.why}{measured}; {instead}"
+def _explain(why: str, *ends_at: float) -> str:
+    """The reason why a setting is refused, and where PAGE's pixel ends with it, at 4, 16 and 256 samples a target."""
+    values = ", ".join(f"{value:.2f}" for value in ends_at)
+    measured = f"; a pixel of mean 0.90 ends at {values} with targets of 4, 16, 256 samples ({PAGE})" if ends_at else ""
+    return f"is refused because noisy targets bias it: {why}{measured}; "
 
 
-L1 = BiasReason("its minimum is at the targets' median and not at their mean", (0.28, 0.31, 0.79))
-HUBER = BiasReason("its minimum is between the targets' median and their mean", (0.32, 0.39, 0.88))
-LOG = BiasReason("the mean of a logarithm is not the logarithm of the mean", (0.43, 0.60, 0.86))
-DISPLAY = BiasReason("clipping and gamma come before the mean over targets is taken", (0.30, 0.37, 0.77))
-TARGET_WEIGHT = BiasReason("the weight depends on the target's own noise", (0.20, 0.27, 0.59))
-UNDETACHED = BiasReason(
-    "the gradient passes through the weight, which rewards bright predictions of noisy pixels", (10.73, 3.36, 1.05)
+L1 = _explain("its minimum is at the targets' median and not at their mean", 0.28, 0.31, 0.79)
+HUBER = _explain("its minimum is between the targets' median and their mean", 0.32, 0.39, 0.88)
+LOG = _explain("the mean of a logarithm is not the logarithm of the mean", 0.43, 0.60, 0.86)
+DISPLAY = _explain("clipping and gamma come before the mean over targets is taken", 0.30, 0.37, 0.77)
+TARGET_WEIGHT = _explain("the weight depends on the target's own noise", 0.20, 0.27, 0.59)
+UNDETACHED = _explain(
+    "the gradient passes through the weight, which rewards bright predictions of noisy pixels", 10.73, 3.36, 1.05
 )
-STRUCTURE = BiasReason("it compares contrasts and features, which noise adds to and averaging takes away")
-CLIPPED_GRADIENT = BiasReason(
-    "it shortens most the steps in which a rare bright target would make up for the others", HUBER.ends_at
+STRUCTURE = _explain("it compares contrasts and features, which noise adds to and averaging takes away")
+CLIPPED_GRADIENT = _explain(
+    "it shortens most the steps in which a rare bright target would make up for the others", 0.32, 0.39, 0.88
 )
-CLAMPED = BiasReason("clamped targets have a smaller mean than the clean image", (0.33, 0.40, 0.79))
+CLAMPED = _explain("clamped targets have a smaller mean than the clean image", 0.33, 0.40, 0.79)
 
-BIASING_LOSSES: Mapping[str, BiasReason] = {
+BIASING_LOSSES: Mapping[str, str] = {
     **dict.fromkeys(("l1", "mae", "absolute"), L1),
     **dict.fromkeys(("huber", "smooth_l1", "charbonnier"), HUBER),
     **dict.fromkeys(("log", "log1p", "log_mse", "msle"), LOG),
@@ -65,7 +55,7 @@ BIASING_LOSSES: Mapping[str, BiasReason] = {
 }
 """The values of `loss` that users of other trainers know."""
 
-BIASING_KEYS: Mapping[str, BiasReason] = {
+BIASING_KEYS: Mapping[str, str] = {
     **dict.fromkeys(("gradient_clip", "gradient_clipping", "gradient_clip_val", "grad_clip"), CLIPPED_GRADIENT),
     **dict.fromkeys(("clip_gradient", "clip_gradients", "clip_grad_norm", "max_grad_norm"), CLIPPED_GRADIENT),
     **dict.fromkeys(("clamp", "clamp_targets", "clip_targets", "firefly_clamp", "max_radiance"), CLAMPED),
@@ -78,17 +68,14 @@ def refuse_biasing(settings: Any) -> Any:
     """Return the settings unchanged; ValidationError, which names key, value and reason, if one of them biases."""
     if not isinstance(settings, Mapping):
         return settings
-    rules = {key: BIASING_KEYS[key].rule("leave the key out") for key in settings if key in BIASING_KEYS}
-    loss = settings.get("loss")
-    if isinstance(loss, str) and loss.lower() in BIASING_LOSSES:
-        rules["loss"] = BIASING_LOSSES[loss.lower()].rule(
-            "use 'linear', or 'relative' or 'paired', whose weights are detached"
-        )
-    if rules:
-        faults = [
-            InitErrorDetails(type=PydanticCustomError("biased", rule), loc=(key,), input=settings[key])
-            for key, rule in rules.items()
-        ]
+    rules = {key: f"{BIASING_KEYS[key]}leave the key out" for key in settings if key in BIASING_KEYS}
+    if reason := BIASING_LOSSES.get(str(settings.get("loss")).lower()):
+        rules["loss"] = f"{reason}use 'linear', or 'relative' or 'paired', whose weights are detached"
+    faults = [
+        InitErrorDetails(type=PydanticCustomError("biased", rule), loc=(key,), input=settings[key])
+        for key, rule in rules.items()
+    ]
+    if faults:
         raise ValidationError.from_exception_data("TrainSettings", faults)
     return settings
 
@@ -236,65 +223,48 @@ KEYS = tuple(key for key in (*TrainSettings.model_fields, *NetworkSettings.model
 """Every key that can be set, including those of the network."""
 
 
-def paper_static(**changes: object) -> TrainSettings:
-    """The supplement's settings for a static scene: batches of 128; the image has the size of the scene's film."""
-    return paper_dynamic(**{"batch": 128, **changes})
+PAPER = {"network": {"points": 16384}}
 
-
-def paper_dynamic(**changes: object) -> TrainSettings:
-    """The supplement's settings for movable objects and lights: width 64, 16 384 points (ours), batches of 32 [S 3.1].
-
-    Images are 256² there, and 128² in the static ablation [S Fig. 2]; here they have the size of the scene's film.
-    """
-    return TrainSettings.model_validate({"network": NetworkSettings(points=16384), **changes})
-
-
-def paper(**changes: object) -> TrainSettings:
-    """The supplement to the letter, as far as it goes: `paper_dynamic` without our changes to the network.
-
-    Positions have no octaves, projection uses the rule on the depth buffer [S 1.2], maxima are absolute [S Fig. 1], the
-    loss is linear [S 3.2], and a run never goes back. docs/training-settings.md lists the remaining choices of ours,
-    with reasons.
-    """
-    network = NetworkSettings(points=16384, octaves=0, occlusion="window", maxima="absolute")
-    return TrainSettings.model_validate({"network": network, "recover": False, **changes})
-
-
-def small(**changes: object) -> TrainSettings:
-    """Settings for minutes on a CPU core beside renderers: width 16, at most 4096 points, batches of 2. All ours.
-
-    The network uses guides, and its rate rises and falls over the whole run, however short; weights are averaged over
-    the last hundred steps. One configuration of eight is held out. In networks with maxima over the points, these are
-    relative, as so short a run learns little of lights from absolute ones.
-    """
-    described: dict[str, object] = {
-        "network": NetworkSettings(
-            architecture="guided_transport", width=16, points=4096, maxima="relative", emission="log"
-        ),
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "small": {
+        "network": {
+            "architecture": "guided_transport",
+            "width": 16,
+            "points": 4096,
+            "maxima": "relative",  # so short a run learns little of lights from absolute ones
+            "emission": "log",
+        },
         "loss": "relative",
         "batch": 2,
         "learning_rate": 1e-3,
-        "schedule": "cosine",
+        "schedule": "cosine",  # rises and falls over the whole run, however short
         "average": 0.99,
         "epoch_samples": 256,
         "hold_out": HOLD_OUT,
         "max_steps": 4000,
-    }
-    return TrainSettings.model_validate({**described, **changes})
-
-
-PRESETS: dict[str, Callable[..., TrainSettings]] = {
-    "small": small,
-    "paper": paper,
-    "paper-static": paper_static,
-    "paper-dynamic": paper_dynamic,
+    },
+    "paper": {
+        "network": {**PAPER["network"], "octaves": 0, "occlusion": "window", "maxima": "absolute"},
+        "recover": False,
+    },
+    "paper-static": {**PAPER, "batch": 128},
+    "paper-dynamic": PAPER,
 }
+"""The presets, by what differs from the defaults above.
+
+`paper-static` and `paper-dynamic` have the supplement's settings for static scenes, and for movable objects and lights
+[S 3.1], with 16 384 points (ours). Images are 256² there, and 128² in the static ablation [S Fig. 2]; here they have
+the size of the scene's film. `paper` is the supplement to the letter, as far as it goes: positions have no octaves,
+projection uses the rule on the depth buffer [S 1.2], maxima are absolute [S Fig. 1], and a run never goes back.
+docs/training-settings.md lists the remaining choices of ours, with reasons. `small` is all ours, for minutes on a CPU
+core beside renderers.
+"""
 
 
 def make_preset(name: str, *, network: Mapping[str, object] = MappingProxyType({}), **changes: object) -> TrainSettings:
     """The settings of a preset with changes, those of its network in `network`. Raises ValidationError."""
-    settings = PRESETS[name](**changes)
-    return TrainSettings.model_validate({**dict(settings), "network": {**dict(settings.network), **network}})
+    preset = PRESETS[name]
+    return TrainSettings.model_validate({**preset, **changes, "network": {**preset["network"], **network}})
 
 
 def make_settings(name: str, changes: Mapping[str, Any]) -> TrainSettings:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -44,8 +44,7 @@ class EventFiles:
     def record(self, record: dict[str, Any]) -> None:
         """Add the figures of a record of metrics.jsonl."""
         step = record["step"]
-        holds = record["kind"] in ("changes", "recovered", "end")  # what was shown of that step itself
-        writer = self._from(step + holds)
+        writer = self._begin(step + (record["kind"] in ("changes", "recovered", "end")))  # what was shown of it stays
         figures = {tag: record[name] for name, tag in NAMES.items() if isinstance(record.get(name), int | float)}
         figures |= {f"waits/{name}": share for name, share in record.get("waits", {}).items()}
         for tag, value in figures.items():
@@ -55,18 +54,19 @@ class EventFiles:
     def pictures(self, step: int, target: F32, prediction: F32) -> None:
         """Add targets (the means of A and B) above predictions, at most `SHOWN`, as clip(I, 0, 1)^(1/2.2)."""
         rows = [np.concatenate([display(image, 1.0) for image in images[:SHOWN]], 1) for images in (target, prediction)]
-        self._from(step).add_image("held out/target above prediction", np.concatenate(rows), step, dataformats="HWC")
+        writer = self._begin(step)
+        writer.add_image("held out/target above prediction", np.concatenate(rows), step, dataformats="HWC")
+
+    def _begin(self, step: int) -> Any:
+        """The writer; existing curves are cut before the first step that is written."""
+        if self._writer is None:
+            self._writer = self._make(str(self._folder), purge_step=step)
+        return self._writer
 
     def close(self) -> None:
         """Close the files, complete."""
         if self._writer is not None:
             self._writer.close()
-
-    def _from(self, step: int) -> Any:
-        """The writer; existing curves are cut before the first step that is written."""
-        if self._writer is None:
-            self._writer = self._make(str(self._folder), purge_step=step)
-        return self._writer
 
 
 @contextmanager
@@ -77,8 +77,5 @@ def open_event_files(run: Path) -> Iterator[EventFiles | None]:
         return
     from torch.utils.tensorboard import SummaryWriter
 
-    files = EventFiles(run / FOLDER, writer=SummaryWriter)
-    try:
+    with closing(EventFiles(run / FOLDER, writer=SummaryWriter)) as files:
         yield files
-    finally:
-        files.close()

@@ -222,14 +222,14 @@ class Session:
 
     def _state(self) -> dict[str, Any]:
         """What a checkpoint says beyond the learner and what it may go back to."""
-        samples = len(self._stream.arrived)
+        plans, samples = list(self._feed.plan_requests()), len(self._stream.arrived)
         return {
             **self._identity(),
             "step": self._step,
             "seconds": self._watch.seconds,
             "last_error": self._last_error,
             "following": self._stream.state(),
-            "store": checkpoint.describe_store(self._feed.spec.scene_id, self._feed.plan_requests(), samples),
+            "store": {"scene_id": self._feed.spec.scene_id, "plans": plans, "samples": samples},
             "versions": checkpoint.list_versions(),
         }
 

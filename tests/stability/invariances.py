@@ -7,7 +7,6 @@ its figures, and can be repeated with `command`. Equal seeds give equal bytes wi
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,38 +35,18 @@ _LANES = {False: 256, True: 8192}  # primary rays for the weights' check
 
 
 @dataclass(frozen=True, slots=True)
-class InvarianceResult:
-    """The result of a check."""
-
-    faults: tuple[str, ...]  # why it failed; empty: it passed
-    figures: str  # what was measured, in words
-    cpu_s: float
-
-    @property
-    def verdict(self) -> str:
-        """Pass or FAIL."""
-        return "FAIL" if self.faults else "pass"
-
-
-@dataclass(frozen=True, slots=True)
 class Invariance:
     """A property that must hold."""
 
     name: str
     claim: str  # what must hold
-    find: Callable[[], tuple[list[str], str]]  # (faults, figures)
+    run: Callable[[], tuple[list[str], str]]  # renders what it needs; (why it failed, what was measured in words)
     long: bool
 
     @property
     def command(self) -> str:
         """The command that runs it again."""
         return f"python -m tests.stability --invariances {self.name}" + " --quick" * (not self.long)
-
-    def run(self) -> InvarianceResult:
-        """Render what the check needs, and judge it."""
-        start = time.process_time()
-        faults, figures = self.find()
-        return InvarianceResult(tuple(faults), figures, time.process_time() - start)
 
 
 def checks(*, long: bool) -> Iterator[Invariance]:
@@ -96,20 +75,6 @@ def choose(names: Sequence[str], *, long: bool) -> list[Invariance]:
             known = ", ".join(dict.fromkeys(f"{check.name.partition('-')[0]}-" for check in everything))
             raise ValueError(f"no invariance is called {name!r} or begins so; they begin with {known}")
     return [check for check in everything if not names or check.name.startswith(tuple(names))]
-
-
-def markdown(found: Sequence[tuple[Invariance, InvarianceResult]]) -> str:
-    """A table of checks and their results, and the commands that repeat the failed ones."""
-    lines = [f"| {check.name} | {check.claim} | {f.figures} | {f.cpu_s:.1f} | {f.verdict} |" for check, f in found]
-    failures = [
-        f"- {check.name}: {'; '.join(finding.faults)}. Again: `{check.command}`"
-        for check, finding in found
-        if finding.faults
-    ]
-    head = "| invariance | what must hold | found | CPU s | verdict |\n|---|---|---|---|---|"
-    passed = f"**{len(lines) - len(failures)} of {len(lines)} invariances hold.**"
-    parts = [passed, "\n".join([head, *lines]), "\n".join(failures)]
-    return "\n\n".join(part for part in parts if part)
 
 
 # ------------------------------------------------ The checks ------------------------------------------------

@@ -111,14 +111,12 @@ A row is one of the {ROWS} hard cases, tried by one scene or several; it passes 
 rendered pass. A line of the table is one scene with all its settings, and shows the worst of them (each by itself:
 stability.json). Its columns:
 
-- **truth**: what `bdpt` is compared with. A formula or a number is exact, the name of an integrator is a render.
+- **truth**: what `bdpt` is compared with: a formula, a number, or the integrator that renders it.
 - **settings**: connections, light paths per eye path.
-- **z max (limit)**: the largest difference of a block's mean, or the whole image's, in standard errors. A right scene
-  exceeds the limit by chance with probability {SIGNIFICANCE:g} per settings (Šidák over the blocks). A standard error
-  below {ROUNDING:.2%} of the mean counts as {ROUNDING:.2%}, since Mitsuba's ray offsets and float32 sums are no more
-  exact.
+- **z max (limit)**: the largest difference of a block's mean, or the whole image's, in standard errors of at least
+  {ROUNDING:.2%} of the mean. A right scene exceeds the limit by chance with probability {SIGNIFICANCE:g} per settings.
 - **mean ratio (bound)**: mean of `bdpt` over that of the truth, ± one standard error, of the settings that are farthest
-  from 1 in standard errors. The bound is for the standard error: above it the test would mean nothing, and fails.
+  from 1. The bound is for the standard error: above it the test would mean nothing, and fails.
 - **max/mean (truth)**: brightest pixel of any render over the mean of the image; the same of the truth.
 - **not finite**: how many values of all renders are NaN or infinite; a scene passes with none.
 - **CPU s**: CPU seconds of all that is rendered for the line."""

@@ -14,15 +14,9 @@ from tests.stability.scenes.case import (
     ALL,
     LONG,
     QUICK,
-    TRUTH_SEEDS,
     WITH_LIGHT_PATHS,
-    Effort,
     HardScene,
-    Images,
     SceneDict,
-    Truth,
-    load,
-    render,
     rendered,
 )
 from tests.stability.scenes.hard_scenes import camera, grey, lit_room, rectangle, shining
@@ -158,32 +152,6 @@ def projector(size: int) -> SceneDict:
     return {**lit_room(size), "light": light}
 
 
-def hundred_lights_one_by_one(scene: HardScene, effort: Effort, seed: int) -> Images:
-    """Sums of the images, by `path`, of each light of `hundred_lights` alone: the others are dead and never chosen."""
-    loaded = load(hard_scenes.hundred_lights(effort.size))
-    parameters = mi.traverse(loaded)
-    suffix = ".emitter.radiance.value"
-    names = [key.removesuffix(suffix) for key in parameters.keys() if key.endswith(suffix)]  # noqa: SIM118
-    radiance = {name: float(np.array(parameters[name + suffix]).max()) for name in names}
-
-    def switch(name: str, value: float) -> None:
-        # Data and not literals, or each light would be compiled anew
-        parameters[name + suffix] = mi.Color3f(dr.opaque(mi.Float, value))
-        parameters[f"{name}.emitter.sampling_weight"] = float(value > 0)
-
-    for name in names:
-        switch(name, 0)
-    total = np.zeros(1)
-    integrator = {"type": "path", "max_depth": scene.max_depth, "rr_depth": scene.rr_depth}
-    for k, name in enumerate(name for name in names if radiance[name] > 0):
-        switch(name, radiance[name])
-        parameters.update()
-        first = (k + 1) * TRUTH_SEEDS + seed
-        total = total + render(loaded, integrator, effort.truth_spp, range(first, first + effort.seeds))
-        switch(name, 0)
-    return total
-
-
 # ------------------------------------------------ Rows ------------------------------------------------
 
 _UNGUIDED = tuple(settings for settings in ALL if not settings.guided_light)
@@ -252,18 +220,8 @@ SCENES = (
     HardScene(24, "smooth-mesh-light", smooth_mesh_light, rendered("prb_basic", "`prb_basic`: hits alone")),
     HardScene(
         25,
-        "hundred-lights",
-        hard_scenes.hundred_lights,
-        Truth("sum of single-light images by `path`", hundred_lights_one_by_one),
-        max_depth=4,
-        quick=None,
-        long=replace(LONG, seeds=8, spp=512, truth_spp=32, resolution=0.01),
-    ),
-    HardScene(
-        25,
         "hundred-lights-at-once",
         hard_scenes.hundred_lights,
-        hard="the same against one render of all lights",
         max_depth=4,
         quick=replace(QUICK, spp=256, truth_spp=1024, resolution=0.03),
         long=replace(LONG, spp=512, truth_spp=2048, resolution=0.01),

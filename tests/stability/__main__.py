@@ -1,7 +1,7 @@
 """Renders the 36 rows of hard scenes with `bdpt` and compares each with its truth; writes and prints the report.
 
-    make stability ARGS="--quick --only 13 25-hundred-lights-at-once"
-    python -m tests.stability [--only 13 25-hundred-lights-at-once] [--settings 1,1 0,0] [--seed 0] [--quick] [--threads 1]
+    make stability ARGS="--quick --only 13 11-cove"
+    python -m tests.stability [--only 13 11-cove] [--settings 1,1 0,0] [--seed 0] [--quick] [--threads 1]
         [--out stability] [--invariances [counts additive-many-lights …]]
 
 Without --quick this is the long version. After all scenes (no --only, no --settings), or alone with --invariances, it

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from obj_scenes import SQUARE
+from imported_scenes import SQUARE
 from PIL import Image
 
 from photonfarm.renderer.tools.importing.imported import ImportedScene

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from obj_scenes import (
+from imported_scenes import (
+    COLOURS,
     CORNERS,
-    FOUR,
     FOUR_V,
     WHOLE,
     Loaded,
@@ -189,7 +189,7 @@ def test_images_are_scaled(case: Callable[[str], Path], loaded: Loaded, name: st
     _, made = loaded(case(f"{name}/it.obj"))
     places = ((0.125, 0.875), (0.375, 0.875), (0.375, 0.625), (0.875, 0.375), (0.125, 0.625))
     for at, colour in zip(places, ("red", "green", "white", "green", "blue"), strict=True):
-        assert reflectance(made, *at) == pytest.approx(FOUR[colour], abs=0.01)
+        assert reflectance(made, *at) == pytest.approx(COLOURS[colour], abs=0.01)
 
 
 @pytest.mark.parametrize(
@@ -205,7 +205,7 @@ def test_images_are_scaled(case: Callable[[str], Path], loaded: Loaded, name: st
 def test_options_of_images_are_carried_over(write_obj: Write, loaded: Loaded, options: str, colours: str) -> None:
     scene, made = loaded(write_obj(WHOLE, f"newmtl it\nKd 1 1 1\nmap_Kd {options} four.png"))
     for at, colour in zip(CORNERS, colours.split(), strict=True):
-        assert reflectance(made, *at) == pytest.approx(FOUR[colour], abs=0.01)
+        assert reflectance(made, *at) == pytest.approx(COLOURS[colour], abs=0.01)
     assert not lost(scene)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from obj_scenes import FOUR_V, Loaded, Obj, Read, Write, area, emission, hit, lost, meets, reflectance, said
+from imported_scenes import FOUR_V, Loaded, Obj, Read, Write, area, emission, hit, lost, meets, reflectance, said
 
 from photonfarm.core.errors import SpecError
 

@@ -120,16 +120,6 @@ class Writer:
             top = SubElement(top, "bsdf")
         return top
 
-    def normals(self, part: Map, strength: float, name: str, *, mirrored: bool) -> Map:
-        """A normal map of a strength. Mitsuba's frame is right-handed where images lie mirrored, too."""
-        (a, b, _), (c, d, _) = (part.lie or Lie()).rows
-        if b or c or min(a, d) < 0:
-            self.note("turns or mirrors the image, and not the directions in it", name)
-        if strength == 1 and not mirrored:
-            return part
-        vectors = (2 * part.values - 1) * np.array([strength, -strength if mirrored else strength, 1], np.float32)
-        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.lie)
-
     def put_surface(self, place: Element, plugin: str, parts: Mapping[str, Map], *, painted: bool = False) -> None:
         """Put a material by its properties; that of a `painted` mesh has the colours of its vertices."""
         place.set("type", plugin)
@@ -143,11 +133,8 @@ class Writer:
     def light(self, glow: Map, opacity: Map | None, name: str) -> Element | None:
         """What a surface emits, if anything: Mitsuba's lights shine where their material lets light through."""
         if opacity is not None and glow.values.any():
-            if (
-                glow.lie
-                and opacity.lie
-                and (glow.lie, glow.values.shape[:2]) != (opacity.lie, opacity.values.shape[:2])
-            ):
+            lies = {(part.lie, part.values.shape[:2]) for part in (glow, opacity) if part.lie}
+            if len(lies) > 1:
                 meaning = "lies unlike the image of opacity, or has another size; the mean opacity is taken"
                 self.changes.lose("light", name, meaning, self.place)
                 opacity = Map(opacity.values.mean(axis=(0, 1), keepdims=True))

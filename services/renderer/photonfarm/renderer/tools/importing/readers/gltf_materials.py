@@ -159,10 +159,19 @@ class Materials:
         return Lie(rows, (wraps[0], wraps[1]), sampler.get("magFilter") == _NEAREST)
 
     def _normals(self, entry: Node, look: Look, writer: Writer) -> Map | None:
+        """A normal map of its strength. Mitsuba's frame is right-handed where images lie mirrored, too."""
         node = entry.get("normalTexture")
         strength = node.get("scale", 1.0) if node else 1.0
-        normals = self._map(node, [strength and 1.0] * 3, _RGB)
-        return writer.normals(normals, strength, _TRANSFORM, mirrored=look.mirrored) if normals.lie else None
+        part = self._map(node, [strength and 1.0] * 3, _RGB)
+        if part.lie is None:
+            return None
+        (a, b, _), (c, d, _) = part.lie.rows
+        if b or c or min(a, d) < 0:
+            writer.note("turns or mirrors the image, and not the directions in it", _TRANSFORM)
+        if strength == 1 and not look.mirrored:
+            return part
+        vectors = (2 * part.values - 1) * np.array([strength, -strength if look.mirrored else strength, 1], np.float32)
+        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.lie)
 
     def _surface(self, entry: Node, colour: Map, painted: bool, writer: Writer) -> tuple[str, dict[str, Map]]:
         """The plugin that is nearest to a material, and its properties."""

@@ -106,14 +106,6 @@ class FrameCosts:
         """The times of a half-estimate of 1/k of the pixels, by k, over the timed frames."""
         return {k: Seconds.of(times) for k, times in zip(self.kept.tolist(), self.render_s, strict=True)}
 
-    def medians(self) -> dict[str, float]:
-        """The medians of `parts`."""
-        return {name: part.median for name, part in self.parts().items()}
-
-    def render_medians(self) -> dict[int, float]:
-        """The medians of `renders`."""
-        return {k: render.median for k, render in self.renders().items()}
-
     def write(self, file: Path) -> None:
         """Store them as a NumPy archive, whole or not at all; raises StoreError if the disk refuses."""
         arrays = {each.name: np.asarray(getattr(self, each.name)) for each in fields(self)}

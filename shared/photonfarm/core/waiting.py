@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -67,42 +66,30 @@ class Steps:
     While a step is in hand, what it should take becomes less, and never more.
     """
 
-    def __init__(
-        self,
-        total: int,
-        *,
-        slow: int = 0,
-        most_s: Callable[[], float] = lambda: math.inf,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """Take how many there are; the first `slow` take longer than the others, as they compile.
-
-        `most_s` gives the seconds after which no further step begins.
-        """
-        self.total, self._slow, self._most_s, self._clock = total, slow, most_s, clock
-        self._done, self._in_hand = 0, 1
-        self._before = self._counted = self._last = clock()
+    def __init__(self, total: int, *, slow: int = 0, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take how many there are; the first `slow` take longer than the others, as they compile."""
+        self.total, self._slow, self._clock = total, slow, clock
+        self._done, self._in_hand, self._pace_s = 0, 1, 0.0
+        self._counted = self._last = clock()
 
     def reach(self, done: int) -> None:
         """Note how many are done."""
         if done <= self._done:
             return
-        self._in_hand, self._done = done - self._done, done
-        self._before, self._last = self._last, self._clock()
+        now = self._clock()
+        begun, before = (self._counted, self._slow) if done > self._slow else (self._last, self._done)
+        self._pace_s = (now - begun) / (done - before)
+        self._in_hand, self._done, self._last = done - self._done, done, now
         if done <= self._slow:
-            self._counted = self._last
+            self._counted = now
 
     @property
     def left_s(self) -> float | None:
         """The seconds that the rest should take, or, after slow steps alone, takes at most; None before the first."""
         if not self._done:
             return None
-        counted = self._done - self._slow
-        since = (self._counted, counted) if counted > 0 else (self._before, self._in_hand)
-        pace_s = (self._last - since[0]) / since[1]
-        since_s, rest = self._clock() - self._last, self.total - self._done
-        left_s = max(pace_s * rest - since_s, pace_s * (rest - self._in_hand))
-        return max(min(left_s, max(self._most_s(), pace_s * self._in_hand - since_s)), 0.0)
+        rest, since_s = self.total - self._done, self._clock() - self._last
+        return max(self._pace_s * rest - since_s, self._pace_s * (rest - self._in_hand), 0.0)
 
     def words(self) -> str:
         """Both in words."""

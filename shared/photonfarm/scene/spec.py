@@ -145,16 +145,12 @@ class Transport(Frozen):
 
     @model_validator(mode="after")
     def _has_light_paths_to_connect_to(self) -> Self:
-        if self.connections and not self.light_ratio:
-            raise ValueError(
-                f"has connections = {self.connections} and light_ratio = 0; light_ratio = 0 has no light paths to "
-                "connect to, so connections = 0 or a light_ratio above 0 is required"
-            )
-        if self.guided_light and not self.light_ratio:
-            raise ValueError(
-                "has guided_light = true and light_ratio = 0, which has no light paths to guide; guided_light = false "
-                "or a light_ratio above 0 is required"
-            )
+        for key, off in (("connections", "0"), ("guided_light", "false")):
+            if (value := getattr(self, key)) and not self.light_ratio:
+                raise ValueError(
+                    f"has {key} = {str(value).lower()} and light_ratio = 0, which has no light paths for it; "
+                    f"{key} = {off} or a light_ratio above 0 is required"
+                )
         return self
 
 

@@ -157,11 +157,11 @@ def test_a_sixteenth_of_the_pixels_takes_less_than_half_the_time_of_all() -> Non
     spec = plain(film=128, transport=transport)
     scene = LoadedScene.load(spec)
     costs = frame_costs(scene, scene.base()[1], [frame(INTO_THE_BOX, rest(spec))], kept=[16, 1], timed=5)
-    times = costs.render_medians()
+    times = {k: render.median for k, render in costs.renders().items()}
     assert 0 < times[16] < 0.5 * times[1]
     for name in PARTS:
         assert (getattr(costs, name) > 0).all() == ("photons" not in name), name
-    assert costs.medians()["photons_s"] == costs.medians()["photons_seen_s"] == 0  # a scene without
+    assert costs.parts()["photons_s"].median == costs.parts()["photons_seen_s"].median == 0  # a scene without
 
 
 def test_neighbouring_frames_differ_in_configuration(somewhere: View) -> None:
@@ -210,7 +210,7 @@ def test_each_part_is_charged_with_its_own_seconds(
     )
     monkeypatch.setattr(PartialFilm, "render", takes(lambda film, *_: film.spec.film.width, lambda *_: None))
     costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[4, 1], timed=2)
-    assert costs.medians() == {
+    assert {name: part.median for name, part in costs.parts().items()} == {
         "edit_s": 1,
         "buffers_s": 10,
         "guides_s": 1000,
@@ -218,7 +218,7 @@ def test_each_part_is_charged_with_its_own_seconds(
         "photons_s": 100,
         "photons_seen_s": 8192,
     }
-    assert costs.render_medians() == {4: 12, 1: 24}
+    assert {k: render.median for k, render in costs.renders().items()} == {4: 12, 1: 24}
 
 
 # ------------------------------------------------------------------------------------------------------------- the verb

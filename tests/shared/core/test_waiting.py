@@ -52,20 +52,6 @@ def test_slow_first_steps_say_how_long_the_rest_takes_at_most_and_do_not_count_a
     assert steps.words() == "3 of 8, about 15 s left"
 
 
-def test_what_a_budget_leaves_no_time_for_does_not_count() -> None:
-    now = [0.0]
-    steps = Steps(8, slow=2, most_s=lambda: 50.0 - now[0], clock=lambda: now[0])
-    now[0] = 40.0
-    steps.reach(1)
-    assert steps.words() == "1 of 8, at most 40 s left", "the second step begins in any case, and the first took 40 s"
-    now[0] = 44.0
-    steps.reach(2)
-    assert steps.words() == "2 of 8, at most 6 s left"
-    now[0] = 47.0
-    steps.reach(3)
-    assert steps.words() == "3 of 8, about 3 s left"
-
-
 @pytest.mark.usefixtures("hears_ctrl_c")
 def test_ctrl_c_ends_native_code_at_once() -> None:
     code = (

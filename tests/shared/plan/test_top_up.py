@@ -111,16 +111,6 @@ def test_the_plan_tells_what_it_was_made_for(scene: SceneStore) -> None:
     assert attributes["request"] == {"kind": "top-up", "spp": 8, "adds": True, "where": ["views=first:2"]}
 
 
-def test_a_topped_up_sample_is_complete_with_its_views_job(scene: SceneStore) -> None:
-    scene.plan(TopUp.of("+8"))
-    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
-    for job in scene.missing_jobs()[-2:]:
-        samples.commit(scene, job, samples.outputs(scene, job))
-    assert reader.refresh().size == 0
-    samples.commit_all(scene)
-    assert reader.refresh().size == 20
-
-
 def test_racing_top_ups_plan_no_pass_twice_and_leave_none_out(scene: SceneStore) -> None:
     """Each adds three times and asks four times for one total: 1 + 2 · 3 passes, or that total."""
     code = """

@@ -2,10 +2,8 @@
 
 import time
 
-import pytest
 import queue_samples
 import redis
-from redis.connection import AbstractConnection as Connection
 from rq.results import Result
 
 from photonfarm.queue.failures import (
@@ -36,18 +34,6 @@ def test_what_was_set_aside_is_queued_again_only_when_asked_for(
     assert queue_status(connection).failed == {}
     assert not connection.exists(Result.get_key(name))
     assert open_queue(connection).fetch_job(name).retries_left == TRIES - 1
-
-
-def test_many_failures_are_read_in_a_few_requests(connection: redis.Redis, store: Store, scene: SceneStore) -> None:
-    reconcile(store, connection)
-    for number in range(10):
-        queue_samples.failed(connection, f"why {number}")
-    requests, plain = [], Connection.send_packed_command
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Connection, "send_packed_command", lambda *args, **how: (requests.append(1), plain(*args, **how)))
-        failed = queue_status(connection).failed
-    assert len(requests) < 10
-    assert failed[job_name(scene.scene_id, 9)] == Failure("why 9", TRIES)
 
 
 def test_failures_are_grouped_by_what_they_have_in_common() -> None:

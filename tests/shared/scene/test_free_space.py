@@ -13,9 +13,7 @@ from photonfarm.scene.camera_path import CameraPath, check_clear, orbit
 from photonfarm.scene.free_space import FreeSpace, pack
 from photonfarm.scene.modification import (
     Modification,
-    modification_keys,
     rest,
-    sample_modifications,
 )
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
@@ -72,20 +70,6 @@ def test_cameras_are_uniform_in_what_is_free_of_their_configuration() -> None:
     gone = origins(spec, Modification(np.zeros((1, 3), np.float32), np.zeros(1, np.bool_)), 1000)
     assert not stands_in_the_open(gone, block).all(), "where the object is not, a camera may stand in its place"
     assert stands_in_the_open(gone, None).all()
-
-
-def test_many_views_at_once_are_those_that_are_drawn_one_by_one() -> None:
-    spec = with_space()
-    vectors = sample_modifications(spec, 0, range(1500))
-    keys = modification_keys(spec.radiance_id, vectors)
-    index = [number % 3 for number in range(1500)]
-    found = sample_views(spec, keys, 7, index, vectors)
-    drawn_at_once = sample_views(with_all_free(spec), keys, 7, index, vectors)
-    again = (found != drawn_at_once).any(axis=1)
-    assert 0.1 < again.mean() < 0.6, "or this test asks nothing"
-    for i in range(1500):
-        configuration = Modification.from_vector(vectors[i])
-        np.testing.assert_array_equal(found[i], sample_view(spec, keys[i], 7, index[i], configuration).vector)
 
 
 def with_all_free(spec: SceneSpec) -> SceneSpec:

@@ -67,7 +67,7 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
         (changed(scene={"builtin": "castle"}), r"scene\.builtin = 'castle': .*'cornell' or 'room'"),
         (changed(exposure=0), "exposure = 0"),
         (changed(film={"width": 100, "height": 64}), r"film\.width = 100"),
-        (changed(transport={"light_ratio": 0}), "transport: has connections = 1 and light_ratio = 0;"),
+        (changed(transport={"light_ratio": 0}), "transport: has connections = 1 and light_ratio = 0,"),
         (
             changed(transport={"light_ratio": 0, "connections": 0, "guided_light": True}),
             "transport: has guided_light = true and light_ratio = 0",
@@ -96,12 +96,6 @@ def test_a_scene_that_cannot_be_rendered_is_refused(scenes: Path, added: str, na
     (scenes / "small/scene.xml").write_text(SCENE.replace("</scene>", added + "</scene>"))
     with pytest.raises(SpecError, match=named):
         parse_spec(changed(), where="spec")
-
-
-def test_plain_path_tracing_and_light_paths_without_connections_are_allowed(scenes: Path) -> None:
-    for transport in ({"light_ratio": 0, "connections": 0}, {"connections": 0}, {"light_ratio": 0.25}):
-        spec = parse_spec(changed(transport=transport), where="spec")
-        assert SceneSpec.model_validate_json(spec.model_dump_json()) == spec
 
 
 @pytest.mark.parametrize(

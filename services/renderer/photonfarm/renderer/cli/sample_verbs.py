@@ -129,8 +129,8 @@ def measure_frames(
 
     with tell_waiting(partial(click.echo, err=True), f"timing {timed} frames"):
         costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
-    parts = {**costs.medians(), **{f"render_s 1/{k}": s for k, s in costs.render_medians().items()}}
-    click.echo(", ".join(f"{name} {seconds:.4f}" for name, seconds in parts.items()))
+    parts = {**costs.parts(), **{f"render_s 1/{k}": render for k, render in costs.renders().items()}}
+    click.echo(", ".join(f"{name} {seconds.median:.4f}" for name, seconds in parts.items()))
     click.echo(f"{out}: {len(rows)} rows, {timed} timed frames")
 
 

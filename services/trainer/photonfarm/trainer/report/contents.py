@@ -131,7 +131,7 @@ class ReportContents:
             "untrained": self.baselines.untrained.error.mean,
             "evaluation": rows,
             "machine": asdict(self.machine),
-            "edit_seconds": None if self.costs is None else self.costs.medians()["edit_s"],
+            "edit_seconds": None if self.costs is None else self.costs.parts()["edit_s"].median,
             "published_table": self.published,
             "worst_cases": [asdict(case) for case in self.worst],
         }

@@ -7,8 +7,6 @@ of a worker without what it does once for a scene, and without storing.
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -95,7 +93,7 @@ def sample_costs(scene: LoadedScene, frames: int, log: Log = lambda _: None) -> 
 def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: WorkLog) -> tuple[SampleCosts, int]:
     """The costs, and of how many frames; as many as the budget allows, and one at least after the one that compiles."""
     name, measured = scene.spec.name, list[dict[str, float]]()
-    views = Steps(WARM_UPS + frames, slow=WARM_UPS, most_s=_seconds_left(budget))
+    views = Steps(WARM_UPS + frames, slow=WARM_UPS)
     within = f", in about {budget.seconds:.0f} s of processor time in all" if math.isfinite(budget.seconds) else ""
     work_log.begin(
         f"measuring what samples of {name} cost here, in {frames} views after {WARM_UPS} that do not count{within}",
@@ -119,17 +117,6 @@ def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: Work
     known = {key: [each[key] for each in measured if not math.isnan(each[key])] for key in measured[0]}
     medians = {key: float(np.median(values or [0.0])) for key, values in known.items()}
     return SampleCosts(scene.spec.scene_id, **medians), len(measured)
-
-
-def _seconds_left(budget: Budget) -> Callable[[], float]:
-    """A function that gives how many seconds a budget still lasts, with as much of a core as there has been so far."""
-    begun, spent_s = time.monotonic(), budget.spent_s
-
-    def left_s() -> float:
-        used_s = budget.spent_s - spent_s
-        return budget.left_s * max(1.0, (time.monotonic() - begun) / used_s if used_s else 1.0)
-
-    return left_s
 
 
 def _measure_frame(scene: LoadedScene, cloud: BasePointCloud, number: int) -> dict[str, float]:

@@ -8,9 +8,10 @@ import pytest
 import scipy.linalg
 import torch
 from numpy.typing import NDArray
+from random_inception import random_inception
 
 from photonfarm.core.errors import SpecError
-from photonfarm.trainer.metrics.features import ROWS, Inception, InceptionWeights, fid, kid, load_inception
+from photonfarm.trainer.metrics.features import ROWS, fid, kid, load_inception
 from photonfarm.trainer.metrics.image_metrics import TITLES, feature_l1, measure_images, metric_space
 
 
@@ -120,18 +121,6 @@ def test_kid_needs_two_sets_of_the_same_size_and_three_images() -> None:
 # -------------------------------------------------------------------------------------------- Feature L1 and the row
 
 
-def _random_inception() -> Inception:
-    """A small network with the published one's blocks, and seeded random weights, as loud as a trained one."""
-    torch.manual_seed(0)
-    widths = {"pool0": (3, 64), "pool1": (64, 192), "mixed_7": (192, 768), "mixed_10": (768, 2048)}
-    network = torch.nn.Sequential()
-    for name, (width_in, width) in widths.items():
-        convolution = torch.nn.Conv2d(width_in, width, 3, stride=4)
-        torch.nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
-        network.add_module(name, torch.nn.Sequential(convolution, torch.nn.ReLU()))
-    return Inception(network.requires_grad_(requires_grad=False), InceptionWeights("seeded", "0" * 64, published=False))
-
-
 def _rooms(count: int, size: int = 16, seed: int = 0) -> NDArray[np.float32]:
     """Coarse random exposed radiance, some of it above white."""
     coarse = np.random.default_rng(seed).gamma(1, 0.5, (count, 4, 4, 3))
@@ -153,7 +142,7 @@ def test_feature_l1_is_the_mean_absolute_difference_of_each_image_and_block() ->
 
 def test_a_row_holds_every_metric_per_image_with_intervals_and_is_json() -> None:
     references = _rooms(4)
-    found = measure_images(_noisy(references, 0.3, 1), torch.from_numpy(references), _random_inception())
+    found = measure_images(_noisy(references, 0.3, 1), torch.from_numpy(references), random_inception())
     assert found.images == 4
     for metric in (found.mse, found.mssim, found.flip, *found.feature_l1):
         assert len(metric.values) == 4
@@ -167,7 +156,7 @@ def test_a_row_holds_every_metric_per_image_with_intervals_and_is_json() -> None
 
 
 def test_equal_images_have_no_error_and_more_noise_is_worse_in_every_column() -> None:
-    references, inception = _rooms(3), _random_inception()
+    references, inception = _rooms(3), random_inception()
     none, low, high = (
         measure_images(images, references, inception).estimates()
         for images in (references, _noisy(references, 0.1, 2), _noisy(references, 0.6, 2))
@@ -183,7 +172,7 @@ def test_without_weights_and_of_two_images_there_is_what_can_be_had() -> None:
     found = measure_images(_noisy(references, 0.3, 3), references, None)
     assert set(found.estimates()) == {"mse", "mssim", "flip"}
     assert json.loads(json.dumps(asdict(found), allow_nan=False))["fid"] is None
-    found = measure_images(_rooms(2), _rooms(2, seed=1), _random_inception())
+    found = measure_images(_rooms(2), _rooms(2, seed=1), random_inception())
     assert (found.fid, found.kid) == (None, None)
     assert found.feature_l1 is not None
 

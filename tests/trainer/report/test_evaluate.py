@@ -78,33 +78,19 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(measured, 
 def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured, trained, tmp_path: Path) -> None:
     pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
     runs = [TrainedRun.load(measured.runs[1]), trained(seed=1)]
-    named = [
-        "--store",
-        measured.store,
-        "--references",
-        measured.references,
-        "--run",
-        runs[0].folder,
-        "--run",
-        runs[1].folder,
-    ]
+    named = ["--store", measured.store, "--references", measured.references]
+    named += [argument for run in runs for argument in ("--run", run.folder)]
     arguments = ["evaluate", *named, "--denoiser", "oidn", "--denoiser", "fill-in", "--kept", 4, "--samples", 3]
     result = CliRunner().invoke(umbrella, [str(a) for a in (*arguments, "--inception", tmp_path / "none")])
     assert isinstance(result.exception, StoreError), "weights that are named must be there"
     result = CliRunner().invoke(umbrella, [str(a) for a in arguments], catch_exceptions=False)
     assert result.exit_code == 0
     lines = [line for line in result.stdout.splitlines() if line.startswith("|")]
-    assert [line.split(" | ")[0].removeprefix("| ").split(" ")[0] for line in lines[2:]] == [
-        "denoise_4",
-        "light_transport",
-        "oidn",
-        "fill-in",
-    ]
+    rows = [line.removeprefix("| ").split(" ")[0] for line in lines[2:]]
+    assert rows == ["denoise_4", "light_transport", "oidn", "fill-in"]
     assert lines[0].count("|") == lines[-1].count("|")
-    assert [line for line in result.stderr.splitlines() if line.endswith(": 3 samples")][2:] == [
-        "oidn 1/4: 3 samples",
-        "fill-in 1/4: 3 samples",
-    ]
+    said = [line for line in result.stderr.splitlines() if line.endswith(": 3 samples")]
+    assert said[2:] == ["oidn 1/4: 3 samples", "fill-in 1/4: 3 samples"]
     documents = [json.loads((run.folder / EVALUATION).read_text()) for run in runs]
     assert documents[0] == documents[1]
     assert documents[0]["rows"][2]["predictor"] == "oidn 1/4"

@@ -180,7 +180,6 @@ def list_facts(contents: ReportContents) -> list[tuple[str, str]]:
         ("rendered by", f"{format_count(card.workers, 'worker')} with {versions}"),
         ("times taken on", contents.machine.sentence),
         ("trained on", "; ".join(f"{story.name}: {'a GPU' if story.on_gpu else 'CPUs'}" for story in contents.stories)),
-        ("networks measured on", contents.evaluation.device),
     ]
 
 

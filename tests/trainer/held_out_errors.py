@@ -8,7 +8,7 @@ from photonfarm.store import SceneReader
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predictors.evaluation import make_network_predictor, measure, read_batches
 from photonfarm.trainer.predictors.trained import TrainedRun
-from photonfarm.trainer.report.trained_runs import Baselines
+from photonfarm.trainer.report.data_and_runs import Baselines
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT
 
 

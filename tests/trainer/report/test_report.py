@@ -30,10 +30,9 @@ from photonfarm.trainer.metrics.image_metrics import confidence_interval, metric
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.report import write_report
 from photonfarm.trainer.report.contents import MOVABLE_LIGHTS
-from photonfarm.trainer.report.dataset_card import DatasetCard, PlanTotals
+from photonfarm.trainer.report.data_and_runs import DatasetCard, PlanTotals, shorten_names
 from photonfarm.trainer.report.frame_times import FrameTime
 from photonfarm.trainer.report.plots import Plot, draw_plots
-from photonfarm.trainer.report.trained_runs import shorten_names
 from photonfarm.trainer.runs.progress import find_bottleneck
 from photonfarm.trainer.runs.run_folder import SETTINGS
 from photonfarm.trainer.training.loop import Hooks, train

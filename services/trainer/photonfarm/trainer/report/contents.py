@@ -20,7 +20,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureOptions, PredictorRow, compare
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
-from photonfarm.trainer.report.dataset_card import DatasetCard
+from photonfarm.trainer.report.data_and_runs import Baselines, DatasetCard, RunStory, shorten_names
 from photonfarm.trainer.report.frame_times import (
     FrameTime,
     Machine,
@@ -28,7 +28,6 @@ from photonfarm.trainer.report.frame_times import (
     count_points,
     measure_frame_costs,
 )
-from photonfarm.trainer.report.trained_runs import Baselines, RunStory, shorten_names
 from photonfarm.trainer.report.worst_cases import HeldOutView, WorstCase, find_worst_cases
 
 

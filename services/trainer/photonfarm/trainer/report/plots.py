@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from photonfarm.trainer.metrics.image_metrics import TITLES, confidence_interval
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry
-from photonfarm.trainer.report.trained_runs import CurvePoint, RunStory
+from photonfarm.trainer.report.data_and_runs import CurvePoint, RunStory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

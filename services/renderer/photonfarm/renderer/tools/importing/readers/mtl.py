@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -34,6 +34,8 @@ _OPTIONS = re.compile(r"(o|s|clamp|blendu|blendv|boost|texres) .*|\w+ (off|[0. ]
 
 _GLASS, _MIRRORS, _LIT = (4, 6, 7, 9), (3, 5, 8), range(1, 10)
 """The models of illumination that are glass, those that reflect the scene, and those of what light and shadows meet."""
+
+_Image = tuple[Path, Lie]  # a file, and how it lies on a surface
 
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 _GREY = (0.7, 0.7, 0.7)  # the reflectance of what has no colour
@@ -108,39 +110,26 @@ def _find(folder: Path, name: str) -> Path | None:
     return file if file.is_file() else None
 
 
-@dataclass(frozen=True, slots=True)
-class _Image:
-    """An image file, and the options that stand before its name, without their hyphens."""
+def _is_plain(file: Path) -> bool:
+    """Whether Mitsuba reads an image as it is; of other formats and modes it misreads some without a word."""
+    with suppress(OSError, ValueError, SyntaxError), Pillow.open(file) as image:
+        return image.format in ("PNG", "JPEG") and image.mode in ("L", "RGB", "RGBA")
+    return False
 
-    file: Path
-    options: dict[str, str]
 
-    @property
-    def is_plain(self) -> bool:
-        """Whether Mitsuba reads the file as it is; of other formats and modes it misreads some without a word."""
-        with suppress(OSError, ValueError, SyntaxError), Pillow.open(self.file) as image:
-            return image.format in ("PNG", "JPEG") and image.mode in ("L", "RGB", "RGBA")
-        return False
+def _lie(options: Mapping[str, str]) -> Lie:
+    """How an image with options lies. MTL's v goes upwards, and Mitsuba's downwards."""
+    s, o = ([float(word) for word in options.get(key, "").split() if word not in ("on", "off")] for key in "so")
+    (su, sv), (u, v) = [*s, 1.0, 1.0][:2], [*o, 0.0, 0.0][:2]
+    wrap = "clamp" if options.get("clamp") == "on" else "repeat"
+    return Lie(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))
 
-    def numbers(self, option: str, otherwise: float = 0.0) -> list[float]:
-        """The numbers of an option, three or those that are missing `otherwise`."""
-        words = [word for word in self.options.get(option, "").split() if word not in ("on", "off")]
-        return [*map(float, words), *[otherwise] * 3][:3]
 
-    def values(self, *, raw: bool = False) -> images.Image:
-        """Its values as they are stored (H, W, 4)."""
-        return images.decode(self.file.read_bytes(), str(self.file), raw=raw)
-
-    def map(self, factor: Sequence[float]) -> Map:
-        """Its linear colours times a factor."""
-        return Map(images.linear(self.values()[..., :3]) * np.array(factor, np.float32), self.lie)
-
-    @property
-    def lie(self) -> Lie:
-        """How it lies. MTL's v goes upwards, and Mitsuba's downwards."""
-        (su, sv, _), (u, v, _) = self.numbers("s", 1.0), self.numbers("o")
-        wrap = "clamp" if self.options.get("clamp") == "on" else "repeat"
-        return Lie(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))
+def _read_map(image: _Image, factor: Sequence[float]) -> Map:
+    """An image's linear colours times a factor."""
+    file, lie = image
+    values = images.decode(file.read_bytes(), str(file))[..., :3]
+    return Map(images.linear(values) * np.array(factor, np.float32), lie)
 
 
 @dataclass(slots=True, eq=False)
@@ -236,7 +225,7 @@ class Material:
         for name, value in options.items():
             if not _OPTIONS.fullmatch(f"{name} {value}"):
                 self.say("colour", f"{word} -{name}", "is an option that is not carried over")
-        return _Image(file, options)
+        return file, _lie(options)
 
     @property
     def _is_textured(self) -> bool:
@@ -246,16 +235,17 @@ class Material:
         """What it emits, by `Ke` and an image."""
         image = self._image("map_ke")
         ke = self._cut("ke", _WHITE if image else _BLACK, math.inf, "light")
-        return image.map(ke) if image else constant(*ke)
+        return _read_map(image, ke) if image else constant(*ke)
 
     def _opacity(self, illum: float) -> Map | None:
         """Its opacity; None is opaque. An image's own opacity where it has some, or else its brightness."""
         opacity, image = self._dissolve(illum), self._image("map_d")
         if image is None:
             return constant(opacity) if opacity < 1 else None
-        values = image.values(raw=True)
+        file, lie = image
+        values = images.decode(file.read_bytes(), str(file), raw=True)
         grey = values[..., 3:] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2, keepdims=True)
-        return Map(np.float32(opacity) * grey.clip(0, 1), image.lie)
+        return Map(np.float32(opacity) * grey.clip(0, 1), lie)
 
     def _dissolve(self, illum: float) -> float:
         """Its `d`, or 1 − `Tr`, unless that hides what is there to be seen."""
@@ -307,9 +297,10 @@ class Material:
             if "kd" not in self.lines and self.lines:
                 self.say(None, "Kd", "is not there; the surface is grey")
             return constant(*kd)
-        if min(kd) >= 1 and image.is_plain:
-            return Map(np.zeros((0, 0, 3), np.float32), image.lie, image.file)
-        colour = image.map(kd)
+        file, lie = image
+        if min(kd) >= 1 and _is_plain(file):
+            return Map(np.zeros((0, 0, 3), np.float32), lie, file)
+        colour = _read_map(image, kd)
         if colour.values.max() > 1.001:
             self.say("colour", "map_Kd", "goes beyond 1, which no surface reflects, and is cut")
         return replace(colour, values=colour.values.clip(0, 1))

@@ -207,16 +207,3 @@ def test_a_store_that_is_gone_is_an_answer_of_503(scene: SceneStore, store: Stor
         port = int(line.rpartition(":")[2].partition("/")[0])
         Path(store.root).rename(f"{store.root}-away")
         assert asked(port, "/metrics")[0] == 503
-
-
-def test_serving_metrics_loads_no_more_than_it_needs(scene: SceneStore, store: Store) -> None:
-    code = f"""
-import json, sys
-from photonfarm.web import cli
-cli._serve = lambda routes, path, **_: (routes[0][2](), print(json.dumps(sorted(sys.modules))))
-cli.serve_metrics.main(["--store", {str(store.root)!r}, "--redis", "unix:///none"], standalone_mode=False)
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded = {name.partition(".")[0] for name in json.loads(done.stdout.splitlines()[-1])}
-    assert {"PIL", "torch", "mitsuba"}.isdisjoint(loaded)
-    assert "prometheus_client" in loaded

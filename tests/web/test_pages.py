@@ -4,7 +4,6 @@ import http.client
 import io
 import json
 import re
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -19,9 +18,7 @@ import store_samples as samples
 from chromium import chromium, needs_chromium
 from PIL import Image, PngImagePlugin
 
-from photonfarm.cli.main import main
 from photonfarm.core import pictures
-from photonfarm.core.errors import StoreError
 from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.request import Request
 from photonfarm.plan.sample_costs import relative_variance
@@ -265,19 +262,6 @@ def test_a_name_of_elsewhere_is_refused(server: PageServer) -> None:
         assert asked(server, "/api/state", Host=name)[0] == 200, name
 
 
-def test_it_survives_what_is_no_http(server: PageServer) -> None:
-    for garbage in (
-        b"\x16\x03\x01\x02\x00",
-        b"GET\r\n\r\n",
-        b"GET / HTTP/9.9\r\n\r\n",
-        b"A" * 70_000 + b"\r\n\r\n",
-        b"",
-    ):
-        with socket.create_connection(("127.0.0.1", server.server_address[1]), timeout=10) as connection:
-            connection.sendall(garbage)
-    assert asked(server, "/api/state")[0] == 200
-
-
 def test_damaged_bytes_are_said_to_be_damaged(store: Store) -> None:
     scene = made(store)
     (shard,) = scene.folder.glob("plans/*/radiance/c.1.*")
@@ -362,10 +346,3 @@ def test_a_mouse_and_a_finger_turn_the_points(server: PageServer, scene: SceneSt
 
 
 # ------------------------------------------------------------------------------------------------------------ the verb
-
-
-def test_the_verb_says_that_there_is_no_store(tmp_path: Path) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["web", "--store", str(tmp_path / "none")])
-    assert ended.value.code == StoreError.exit_code
-    assert list(tmp_path.iterdir()) == []

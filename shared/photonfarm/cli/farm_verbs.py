@@ -15,8 +15,10 @@ from photonfarm.cli.options import (
     device_option,
     json_option,
     names_redis,
+    no_queue_option,
     redis_option,
     request_options,
+    retry_option,
     run_option,
     store_option,
 )
@@ -41,7 +43,7 @@ def scene_show(spec: str, as_json: bool) -> None:
     from photonfarm.scene.spec_loading import load_spec
 
     loaded = load_spec(spec)
-    show.scene(loaded, as_json)
+    show.print_scene(loaded, as_json)
     if not as_json and loaded.emitters != Emitters():
         click.echo(f"\nthe scene's own lights: {loaded.emitters}")
 
@@ -51,8 +53,8 @@ def scene_show(spec: str, as_json: bool) -> None:
 @request_options
 @store_option
 @redis_option
-@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
-@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
+@no_queue_option
+@retry_option
 @click.option(
     "--halves-from",
     metavar="ID",
@@ -102,7 +104,7 @@ def submit(
         result = submission.submit(
             named, store, url, request, retry=retry, shard_rows=shard_rows, halves_from=halves_from
         )
-    show.submission(result, as_json)
+    show.print_submission(result, as_json)
 
 
 @click.command("top-up")
@@ -116,8 +118,8 @@ def submit(
 @click.option("--where", multiple=True, metavar="CONDITION", help="Which views, instead of all; see above.")
 @store_option
 @redis_option
-@click.option("--no-queue", is_flag=True, help="Only write the plan; idle workers find it by themselves.")
-@click.option("--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures.")
+@no_queue_option
+@retry_option
 @click.option("--dry-run", is_flag=True, help="Say what would be planned, and write nothing.")
 @json_option
 def top_up(
@@ -150,7 +152,7 @@ def top_up(
 
     url = None if no_queue else redis_url
     result = submission.top_up(NamedSpec.load(spec), store, url, spp, where=where, **options)
-    show.submission(result, as_json)
+    show.print_submission(result, as_json)
     noun = "pass" if result.passes == 1 else "passes"
     click.echo(f"{spp} samples per pixel: {result.passes} {noun} of {result.spp_per_pass} each", err=True)
 
@@ -199,13 +201,18 @@ def reconcile(store: str | Path, redis_url: str, as_json: bool) -> None:
     failed too often wait for `submit --retry`.
     """
     from photonfarm.cli import show
+    from photonfarm.core.formatting import format_count
     from photonfarm.queue.connection import connect
-    from photonfarm.queue.reconciliation import reconcile
+    from photonfarm.queue.reconciliation import reconcile as queue_missing
     from photonfarm.store import Store
 
     opened = Store(store)
     with connect(redis_url) as connection:
-        show.print_queued(reconcile(opened, connection), as_json)
+        jobs = queue_missing(opened, connection)
+    if as_json:
+        show.print_json({"queued": jobs})
+    else:
+        click.echo(f"{format_count(jobs, 'job')} queued")
 
 
 @click.command("redis")

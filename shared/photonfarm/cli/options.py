@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable
-from functools import wraps
+from functools import reduce, wraps
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -57,49 +57,52 @@ class WholeNumber(click.IntRange):
         return super().convert(int(value if exact else number), param, ctx)
 
 
-def store_option(command: Command) -> Command:
-    """`--store`, the sample store."""
-    return click.option(
-        "--store",
-        type=StorePlace(),
-        metavar="DIR|URL",
-        envvar="PHOTONFARM_STORE",
-        default="store",
-        show_default=True,
-        help="The sample store: a folder, or s3://bucket/prefix (credentials: the AWS_… variables).",
-    )(command)
+store_option = click.option(
+    "--store",
+    type=StorePlace(),
+    metavar="DIR|URL",
+    envvar="PHOTONFARM_STORE",
+    default="store",
+    show_default=True,
+    help="The sample store: a folder, or s3://bucket/prefix (credentials: the AWS_… variables).",
+)
+run_option = click.option(
+    "--run",
+    type=click.Path(path_type=Path, file_okay=False),
+    default="run",
+    show_default=True,
+    help="The trainer's folder.",
+)
+json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
+retry_option = click.option(
+    "--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures."
+)
+no_queue_option = click.option(
+    "--no-queue", is_flag=True, help="Use no Redis: only write the plan, which workers find by themselves."
+)
 
 
-def run_option(command: Command) -> Command:
-    """The option --run of verbs that start a trainer."""
-    return click.option(
-        "--run",
-        type=click.Path(path_type=Path, file_okay=False),
-        default="run",
-        show_default=True,
-        help="The trainer's folder.",
-    )(command)
+def combine_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """A decorator that adds several options, the first one on top."""
+    return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
-def redis_option(command: Command) -> Command:
-    """`--redis URL`, the queue's server; its password may come from the file that a variable names."""
-    return click.option(
-        "--redis",
-        "redis_url",
-        envvar="PHOTONFARM_REDIS_URL",
-        default="redis://localhost:6379/0",
-        show_default=True,
-        help="The queue's Redis. A password is refused here, as command lines can be read by all; it belongs into the "
-        "file that PHOTONFARM_REDIS_PASSWORD_FILE names, and is the user photonfarm's unless the URL names another: "
-        "redis://default@host for a Redis with requirepass.",
-        show_envvar=True,
-        callback=_with_password,
-    )(command)
+def _check_password(ctx: click.Context, param: click.Parameter, url: str | None) -> str | None:
+    if url and ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
+        from photonfarm.queue.connection import has_password
+
+        if has_password(url):
+            raise click.BadParameter(
+                "a password on the command line can be read by everybody on this machine, and stays in the shell's "
+                "history; give the URL without it, and put the password into a file that "
+                "PHOTONFARM_REDIS_PASSWORD_FILE names. (A URL with a password may stand in PHOTONFARM_REDIS_URL, or as "
+                "`redis` in the configuration file.)"
+            )
+    return url or None
 
 
-def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
-    if ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
-        _refuse_password(url)
+def _add_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
+    _check_password(ctx, param, url)
     if (file := password_file()) is None:
         return url
     from photonfarm.queue.connection import add_password
@@ -107,22 +110,27 @@ def _with_password(ctx: click.Context, param: click.Parameter, url: str) -> str:
     return add_password(file, url)
 
 
+redis_option = click.option(
+    "--redis",
+    "redis_url",
+    envvar="PHOTONFARM_REDIS_URL",
+    default="redis://localhost:6379/0",
+    show_default=True,
+    help="The queue's Redis. A password is refused here, as command lines can be read by all; it belongs into the "
+    "file that PHOTONFARM_REDIS_PASSWORD_FILE names, and is the user photonfarm's unless the URL names another: "
+    "redis://default@host for a Redis with requirepass.",
+    show_envvar=True,
+    callback=_add_password,
+)
+"""The queue's server; its password may come from the file that a variable names."""
+
+
 def optional_redis_option(help_text: str) -> Callable[[Command], Command]:
     """`--redis URL` without a default, as `queue_url`; the file of its password is not read."""
+    variable = "PHOTONFARM_REDIS_URL"
     return click.option(
-        "--redis",
-        "queue_url",
-        envvar="PHOTONFARM_REDIS_URL",
-        show_envvar=True,
-        callback=_without_password,
-        help=help_text,
+        "--redis", "queue_url", envvar=variable, show_envvar=True, callback=_check_password, help=help_text
     )
-
-
-def _without_password(ctx: click.Context, param: click.Parameter, url: str | None) -> str | None:
-    if url and ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
-        _refuse_password(url)
-    return url or None
 
 
 def password_file() -> Path | None:
@@ -135,17 +143,6 @@ def names_redis() -> bool:
     """Whether the user of the current command has named its Redis, in any way."""
     context = click.get_current_context(silent=True)
     return context is None or context.get_parameter_source("redis_url") is not ParameterSource.DEFAULT
-
-
-def _refuse_password(url: str) -> None:
-    from photonfarm.queue.connection import has_password
-
-    if has_password(url):
-        raise click.BadParameter(
-            "a password on the command line can be read by everybody on this machine, and stays in the shell's "
-            "history; give the URL without it, and put the password into a file that PHOTONFARM_REDIS_PASSWORD_FILE "
-            "names. (A URL with a password may stand in PHOTONFARM_REDIS_URL, or as `redis` in the configuration file.)"
-        )
 
 
 def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -179,11 +176,6 @@ def _device(ctx: click.Context, param: click.Parameter, name: str) -> str:  # no
     return name
 
 
-def json_option(command: Command) -> Command:
-    """`--json`: machine-readable results."""
-    return click.option("--json", "as_json", is_flag=True, help="Print JSON.")(command)
-
-
 def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """The options that make a request, which the command gets as `request`, and `shard_rows`."""
 
@@ -194,7 +186,7 @@ def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
         asked = {"modifications": modifications, "views_per_modification": views, "passes": passes, "seed": seed}
         return command(request=Request.of(**asked), **options)
 
-    options = (
+    return combine_options(
         click.option(
             "--modifications",
             type=WholeNumber(1),
@@ -212,8 +204,4 @@ def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
             help="Samples per job, fixed for a scene by its first plan.  [default: some seconds of work, at "
             "most 32, and several jobs for every worker]",
         ),
-    )
-    found: Callable[..., Any] = with_request
-    for option in reversed(options):
-        found = option(found)
-    return found
+    )(with_request)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 from rich import markup
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 
-from photonfarm.core.formatting import format_count
+from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import format_span
 from photonfarm.scene.spec import SceneSpec, shape_ids
 
@@ -26,11 +26,11 @@ def print_json(document: Any) -> None:
     click.echo(json.dumps(document, indent=2))
 
 
-def make_table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> Table:
-    """Rows of text as a table, with a head or without one."""
+def make_table(rows: Iterable[tuple[RenderableType, ...]], head: tuple[str, ...] = ()) -> Table:
+    """Rows as a table, with a head or without one; text is shown as it is."""
     table = Table(*head, box=None, show_header=bool(head), pad_edge=False)
     for row in rows:
-        table.add_row(*map(markup.escape, row))
+        table.add_row(*(markup.escape(cell) if isinstance(cell, str) else cell for cell in row))
     return table
 
 
@@ -44,7 +44,7 @@ def print_table(rows: Iterable[tuple[str, ...]], head: tuple[str, ...] = ()) -> 
 # ----------------------------------------------------------------------------------------------------------- scene show
 
 
-def scene(spec: SceneSpec, as_json: bool) -> None:
+def print_scene(spec: SceneSpec, as_json: bool) -> None:
     """Print a checked spec: its id, its settings, its movable groups."""
     if as_json:
         sizes = {"bytes_per_sample": bytes_per_sample(spec)}
@@ -98,7 +98,7 @@ def _box(low: tuple[float, ...], high: tuple[float, ...]) -> str:
 # --------------------------------------------------------------------------------------------------------------- submit
 
 
-def submission(result: Submission, as_json: bool) -> None:
+def print_submission(result: Submission, as_json: bool) -> None:
     """Print the outcome of a submission, or of a dry run of one."""
     from photonfarm.farm.dry_run import DryRun
 
@@ -110,7 +110,7 @@ def submission(result: Submission, as_json: bool) -> None:
             f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
         )
         if isinstance(result, DryRun) and result.planned:
-            _cost(result)
+            _print_cost(result)
         return
     queued = "not queued" if result.queued is None else f"{format_count(result.queued, 'job')} queued"
     click.echo(
@@ -128,27 +128,19 @@ def submission(result: Submission, as_json: bool) -> None:
         click.echo(f"workers find its scene file with {SCENES_VARIABLE}={result.scenes}", err=True)
 
 
-def print_queued(jobs: int, as_json: bool) -> None:
-    """Print how many jobs `reconcile` has queued."""
-    if as_json:
-        print_json({"queued": jobs})
-    else:
-        click.echo(f"{format_count(jobs, 'job')} queued")
-
-
-def _cost(result: DryRun) -> None:
+def _print_cost(result: DryRun) -> None:
     """Print the size and the cost of what would be planned, and a better use of the same cost."""
-    size = f"at most {result.size_bytes / 1e6:,.1f} MB before compression"
+    size = f"at most {format_bytes(result.size_bytes)} before compression"
     if result.core_s is None or result.wall_s is None:
         click.echo(size)
         return
-    cores = "1 core" if result.cores == 1 else f"{result.cores} cores"
-    click.echo(f"{size}; {_amount(result.core_s)} core-seconds: {format_span(result.wall_s)} on the {cores} here")
-    if result.planned:
-        click.echo(_suggestion(result))
+    core_s = f"{result.core_s:,.0f}" if result.core_s >= 10 else f"{result.core_s:.1f}"
+    cores = format_count(result.cores, "core")
+    click.echo(f"{size}; {core_s} core-seconds: {format_span(result.wall_s)} on the {cores} here")
+    click.echo(_describe_suggestion(result))
 
 
-def _suggestion(result: DryRun) -> str:
+def _describe_suggestion(result: DryRun) -> str:
     better = result.suggestion
     if result.reduction is None:
         return f"no suggestion: another half_spp would render the {result.planned_before} planned samples again"
@@ -162,7 +154,3 @@ def _suggestion(result: DryRun) -> str:
         f"suggested at this cost: half_spp = {better.half_spp} in [transport], {request}: "
         f"{100 * result.reduction:.0f} % less excess error predicted for light_transport; guided networks gain less"
     )
-
-
-def _amount(seconds: float) -> str:
-    return f"{seconds:,.0f}" if seconds >= 10 else f"{seconds:.1f}"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 from rich.console import Console, Group
 from rich.live import Live
+from rich.progress_bar import ProgressBar
 from rich.text import Text
 
 from photonfarm.cli.show import make_table, print_json, print_table
@@ -74,9 +75,15 @@ def follow_up(store: str | Path) -> Iterator[Callable[[FarmProgress, bool], None
 
 
 def draw_farm(farm: FarmProgress, store: str | Path) -> Group:
-    """The farm as a terminal shows it."""
+    """The farm as a terminal shows it, with a bar for each scene."""
+    bars = (
+        ProgressBar(max(scene.status.samples_planned, 1), scene.status.samples_complete + scene.in_hand, width=24)
+        for scene in farm.scenes
+        if not scene.status.error
+    )
+    rows = [(*row, bar) for row, bar in zip(_list_scenes(farm, letters=8), bars, strict=True)]
     text = Text("\n".join(list_lines(farm, store)))
-    return Group(Text(time.strftime("%H:%M:%S")), make_table(_list_scenes(farm, letters=8), HEAD), text)
+    return Group(Text(time.strftime("%H:%M:%S")), make_table(rows, (*HEAD, "")), text)
 
 
 def describe_farm(farm: FarmProgress) -> str:

@@ -10,9 +10,11 @@ import click
 
 from photonfarm.cli.options import (
     json_option,
+    no_queue_option,
     optional_redis_option,
     password_file,
     request_options,
+    retry_option,
     run_option,
     store_option,
 )
@@ -29,8 +31,8 @@ if TYPE_CHECKING:
     "The queue's Redis, if nodes reach one. A password belongs into the file that "
     "PHOTONFARM_REDIS_PASSWORD_FILE names.  [default: none; the store alone says what is missing]"
 )
-@click.option("--no-queue", is_flag=True, help="Use no Redis, even if one is named.")
-@click.option("--retry", is_flag=True, help="Also render jobs that were set aside after repeated failures.")
+@no_queue_option
+@retry_option
 @click.option(
     "--workers",
     type=click.IntRange(1),

@@ -112,18 +112,20 @@ def cards_here() -> Cards:
 def list_cards() -> Cards:
     """The cards of this machine, asked for in this process, which then cannot choose among them any more."""
     library = ctypes.CDLL(_path("cuda"))
-    failed = library.cuInit(0)
-    if failed:
-        return Cards((), _driver_version(), 0, f"there is no usable NVIDIA card (cuInit: {_reason(library, failed)})")
+    if failed := library.cuInit(0):
+        said = ctypes.c_char_p()
+        library.cuGetErrorString(failed, ctypes.byref(said))
+        why = said.value.decode(errors="replace") if said.value else f"error {failed}"
+        return Cards((), _driver_version(), 0, f"there is no usable NVIDIA card (cuInit: {why})")
     version, count = ctypes.c_int(), ctypes.c_int()
     library.cuDriverGetVersion(ctypes.byref(version))
     library.cuDeviceGetCount(ctypes.byref(count))
-    cards = tuple(_card(library, number) for number in range(count.value))
+    cards = tuple(_describe_card(library, number) for number in range(count.value))
     cuda = version.value // 10
-    return Cards(cards, _driver_version(), cuda, _trouble(len(cards), cuda, _find_unopened("optix")))
+    return Cards(cards, _driver_version(), cuda, _find_trouble(len(cards), cuda, _find_unopened("optix")))
 
 
-def _trouble(cards: int, cuda: int, no_optix: str | None) -> str:
+def _find_trouble(cards: int, cuda: int, no_optix: str | None) -> str:
     """Why cards that are listed cannot render; "" if they can."""
     says = f"it works with CUDA {cuda // 100}.{cuda % 100}"
     if not cards:
@@ -137,7 +139,7 @@ def _trouble(cards: int, cuda: int, no_optix: str | None) -> str:
     return ""
 
 
-def _card(library: Any, number: int) -> Card:
+def _describe_card(library: Any, number: int) -> Card:
     device, name, memory = ctypes.c_int(), ctypes.create_string_buffer(256), ctypes.c_size_t()
     library.cuDeviceGet(ctypes.byref(device), number)
     library.cuDeviceGetName(name, len(name), device)
@@ -148,12 +150,6 @@ def _card(library: Any, number: int) -> Card:
         library.cuDeviceGetAttribute(ctypes.byref(value), attribute, device)
         capability.append(str(value.value))
     return Card(number, name.value.decode(errors="replace"), ".".join(capability), memory.value)
-
-
-def _reason(library: Any, code: int) -> str:
-    said = ctypes.c_char_p()
-    library.cuGetErrorString(code, ctypes.byref(said))
-    return said.value.decode(errors="replace") if said.value else f"error {code}"
 
 
 def _driver_version() -> str:

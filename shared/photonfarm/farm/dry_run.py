@@ -12,7 +12,6 @@ from photonfarm.core.processes import can_render, command, usable_cores
 from photonfarm.farm.submission import Submission
 from photonfarm.plan.request import Extent, Request
 from photonfarm.plan.sample_costs import Allocation, CostModel, SampleCosts
-from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
 from photonfarm.store.format.schema import bytes_of_rows
@@ -64,38 +63,45 @@ def rehearse(
     """What `submission.submit` would plan.
 
     With `measure`, also its cost, and how the same cost would be spent best; `log` is called with the reason if the
-    cost is unknown. Raises SpecError and StoreError as `submit` does.
+    cost is unknown. Nothing is suggested if some samples of the request are planned already: another half_spp makes
+    another scene, in which all of them would be rendered again. Raises SpecError and StoreError as `submit` does.
     """
-    found = _count(named.spec, request, store, shard_rows)
-    if not (measure and found.planned):
+    spec = named.spec
+    if is_vacant(store):
+        new, known, extent = request.samples, 0, request.extent(spec)
+    else:
+        planned = Store(store).plan(spec, request, shard_rows=shard_rows, dry_run=True)
+        new, known, extent = planned.new, planned.known, planned.extent
+    of, cores = bytes_of_rows(spec), usable_cores()
+    size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
+    found = DryRun(spec.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=cores)
+    if not (measure and new):
         return found
     try:
-        costs = costs_by_renderer(named.name, min(max(SHARE_S * found.planned, LEAST_S), MOST_S))
+        costs = costs_by_renderer(named.name, min(max(SHARE_S * new, LEAST_S), MOST_S))
     except BackendError as error:
         log(f"cost and time are not known: {error}")
         return found
-    return _price(found, named.spec, request, costs)
-
-
-def _count(loaded: SceneSpec, wanted: Request, store: str | Path, shard_rows: int | None) -> DryRun:
-    """What would be planned, and its size."""
-    if is_vacant(store):
-        new, known, extent = wanted.samples, 0, wanted.extent(loaded)
-    else:
-        opened = Store(store)
-        planned = opened.plan(loaded, wanted, shard_rows=shard_rows, dry_run=True)
-        new, known, extent = planned.new, planned.known, planned.extent
-    of = bytes_of_rows(loaded)
-    size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
-    return DryRun(loaded.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=usable_cores())
+    spp, static = 2 * spec.transport.half_spp, not spec.groups
+    core_s = costs.seconds(spp, configurations=extent.configurations, views=extent.views, samples=new)
+    found = replace(found, costs=costs, core_s=core_s, wall_s=core_s / cores)
+    if known:
+        return found
+    asked = Allocation(request.modifications, request.views_per_modification, request.passes, spp)
+    if static:
+        asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
+    reduction, better = CostModel.of(costs, static=static).improve(asked)
+    if reduction < WORTH_A_CHANGE:
+        return replace(found, reduction=reduction)
+    modifications, views = (None, None) if static else (better.modifications, better.views)
+    suggestion = Suggestion(better.spp // 2, modifications, views, better.samples)
+    return replace(found, reduction=reduction, suggestion=suggestion)
 
 
 def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
-    """The costs that the renderer measures for a spec in so much processor time, or has kept.
+    """The costs that the renderer measures for a spec in so much processor time, or has kept; it talks to stderr.
 
     Raises BackendError with the reason for none.
-
-    The renderer's own messages go to stderr.
     """
     name = " ".join(VERB)
     if not can_render():
@@ -109,25 +115,3 @@ def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
         return SampleCosts.read(done.stdout)
     except StoreError as error:
         raise BackendError(f"`photonfarm {name}` said {error}") from error
-
-
-def _price(found: DryRun, spec: SceneSpec, wanted: Request, costs: SampleCosts) -> DryRun:
-    """What would be planned, with its cost, and the suggestion.
-
-    There is no suggestion if some samples of the request are planned already: another half_spp makes another scene, in
-    which all of them would be rendered again.
-    """
-    of, spp, static = found.extent, 2 * spec.transport.half_spp, not spec.groups
-    core_s = costs.seconds(spp, configurations=of.configurations, views=of.views, samples=found.planned)
-    timed = replace(found, costs=costs, core_s=core_s, wall_s=core_s / found.cores)
-    if found.planned_before or not found.planned:
-        return timed
-    asked = Allocation(wanted.modifications, wanted.views_per_modification, wanted.passes, spp)
-    if static:
-        asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
-    reduction, better = CostModel.of(costs, static=static).improve(asked)
-    if reduction < WORTH_A_CHANGE:
-        return replace(timed, reduction=reduction)
-    modifications, views = (None, None) if static else (better.modifications, better.views)
-    suggestion = Suggestion(better.spp // 2, modifications, views, better.samples)
-    return replace(timed, reduction=reduction, suggestion=suggestion)

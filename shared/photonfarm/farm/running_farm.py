@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from photonfarm.core.files import write_whole
-from photonfarm.core.processes import process_space
+from photonfarm.core.processes import is_gone, process_space
 
 if TYPE_CHECKING:
     from photonfarm.store import Store
@@ -55,13 +55,7 @@ def announce(store: Store, *, redis_url: str, run: Path | None, web: str | None)
 def running_farm(store: Store) -> RunningFarm | None:
     """The farm that works on a store, if one of this user does on this machine."""
     found = _read(_file(store))
-    if found is None or found.space != process_space():
-        return None
-    try:
-        os.kill(found.process, 0)
-    except OSError:
-        return None
-    return found
+    return None if found is None or found.space != process_space() or is_gone(found.process) else found
 
 
 def _folder() -> Path:

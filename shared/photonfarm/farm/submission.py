@@ -290,26 +290,16 @@ def _queue(store: Store, redis_url: str | None, *, retry: bool | str) -> int | N
     return None if redis_url is None else queue_missing(store, redis_url, retry=retry)
 
 
-def queue_missing(
-    store: Store,
-    redis_url: str,
-    *,
-    scene_id: str | None = None,
-    retry: bool | str = False,
-    stored: str = "The plan is stored",
-    verb: str = "submits",
-) -> int:
-    """Queue every missing job of a store, or of one scene; returns how many.
+def queue_missing(store: Store, redis_url: str, *, retry: bool | str = False) -> int:
+    """Queue every missing job of a store; returns how many.
 
-    With `retry` also jobs that were set aside. Raises QueueError; its message says what
-    is `stored` nevertheless, and that --no-queue {verb} without Redis.
+    With `retry` also jobs that were set aside. Raises QueueError, which says that the plan is stored nevertheless.
     """
     try:
         connection = connect(redis_url)
-        return reconcile(store, connection, scene_id=scene_id, retry=retry)
+        return reconcile(store, connection, retry=retry)
     except OtherStoreError as error:
-        raise QueueError(f"{error}. {stored} in {store.storage.where}") from error
+        raise QueueError(f"{error}. The plan is stored in {store.storage.where}") from error
     except QueueError as error:
-        raise QueueError(
-            f"{str(error).rstrip('.')}. {stored}, and idle workers will find it; --no-queue {verb} without Redis"
-        ) from error
+        how = "The plan is stored, and idle workers will find it; --no-queue submits without Redis"
+        raise QueueError(f"{str(error).rstrip('.')}. {how}") from error

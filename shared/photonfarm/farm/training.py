@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.formatting import format_count
 from photonfarm.core.statistics import format_estimate
 from photonfarm.core.waiting import format_span
 from photonfarm.scene.spec import SceneSpec
@@ -53,32 +54,21 @@ class TrainingProgress:
     seconds: dict[str, float] = field(default_factory=dict)  # so far, by what they were spent on
 
     @property
-    def error(self) -> str:
-        """The last held-out error in words; "" before the first validation."""
-        found = self.validation
-        if found is None:
-            return ""
-        samples = "1 sample" if found["held_out"] == 1 else f"{found['held_out']} samples"
-        return f"held-out error {format_estimate(found['error'], found['standard_error'])} on {samples}"
-
-    @property
     def figures(self) -> str:
-        """How long training still takes, and its last error, each after a comma."""
-        left = None if self.left_s is None else f"{format_span(self.left_s)} left"
-        return "".join(f", {part}" for part in (left, self.error) if part)
-
-    @property
-    def note(self) -> str:
-        """What holds training up, and its figures, each after a comma."""
-        doing = f", {self.phase}" if self.phase and self.phase != TRAINS else ""
-        return doing + self.figures
+        """How long training still takes, and its last held-out error, each after a comma."""
+        parts = [] if self.left_s is None else [f"{format_span(self.left_s)} left"]
+        if (found := self.validation) is not None:
+            error = format_estimate(found["error"], found["standard_error"])
+            parts.append(f"held-out error {error} on {format_count(found['held_out'], 'sample')}")
+        return "".join(f", {part}" for part in parts)
 
     @property
     def line(self) -> str:
         """All of it in words."""
         steps = count_steps(self.step, self.steps) if self.steps else str(self.step)
+        doing = f", {self.phase}" if self.phase and self.phase != TRAINS else ""
         ended = f", ended ({self.ended})" if self.ended else ""
-        return f"training {self.run}: step {steps}{self.note}{ended}"
+        return f"training {self.run}: step {steps}{doing}{self.figures}{ended}"
 
 
 def count_steps(step: int, steps: int) -> str:
@@ -103,17 +93,16 @@ class RunFolder:
         if time.time() - said.get("at_s", 0.0) > FRESH_S:
             said = {}
         last = self.records[-1] if self.records else {}
-        ended = str(last.get("reason")) if last.get("kind") == "end" and not said else None
-        validation = next((each for each in reversed(self.records) if each.get("kind") == "validation"), None)
+        losses = [each.get("loss") for each in self.records if each.get("kind") == "train"]
         return TrainingProgress(
             self.folder.name,
             max(_number(last.get("step")), _number(said.get("step"))),
             _number(said.get("steps")) or _number(_read_json(self.folder / SETTINGS).get("max_steps")),
             said.get("phase"),
             said.get("left_s"),
-            validation,
-            ended,
-            next((loss for each in reversed(self.records) if (loss := _loss(each)) is not None), None),
+            next((each for each in reversed(self.records) if each.get("kind") == "validation"), None),
+            str(last.get("reason")) if last.get("kind") == "end" and not said else None,
+            next((loss for loss in reversed(losses) if isinstance(loss, float) and math.isfinite(loss)), None),
             next((each["seconds"] for each in reversed(self.records) if isinstance(each.get("seconds"), dict)), {}),
         )
 
@@ -175,13 +164,6 @@ def _record(line: bytes) -> dict[str, Any]:
     except ValueError:
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def _loss(record: dict[str, Any]) -> float | None:
-    """The loss that a record of the log holds; None if it holds none, or one that is no number."""
-    loss = record.get("loss")
-    trains = record.get("kind") == "train" and isinstance(loss, float) and math.isfinite(loss)
-    return loss if trains else None
 
 
 def _read_json(file: Path) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from itertools import cycle
 from pathlib import Path
 
 from photonfarm.core.errors import IncompleteError, SpecError, store_errors
@@ -46,11 +47,6 @@ Display = AbstractContextManager[Callable[[FarmProgress, bool], None]]
 def trainer_arguments(spec: str, *, run: Path, train_steps: int, hold_out: float) -> list[str]:
     """The trainer's verb with its arguments."""
     return ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
-
-
-def worker_arguments(scene_id: str, name: str, device: str) -> list[str]:
-    """A worker's verb with its arguments."""
-    return ["work", "--until-complete", "--scene", scene_id, "--name", name, "--device", device]
 
 
 def run_farm(
@@ -110,24 +106,23 @@ def run_farm(
         rows = opened.scene(planned.scene_id).plans()[0].shard_rows
         say(f"samples come in jobs of {rows}; a worker's first also loads the scene and compiles its kernels")
         environment = _environment(spec, store, redis.url)
-        verbs = {
-            f"worker-{i + 1}": worker_arguments(planned.scene_id, f"worker-{i + 1}", devices[i % len(devices)])
-            for i in range(workers)
-        }
+        verbs = {}
+        for name, device in zip((f"worker-{i + 1}" for i in range(workers)), cycle(devices), strict=False):
+            scene = ["--scene", planned.scene_id, "--name", name, "--device", device]
+            verbs[name] = ["work", "--until-complete", *scene]
         if train_steps:
             verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=share)
-        address, trained = None, [run] if train_steps else []
+        address, trained = None, run if train_steps else None
         if web:
             port = free_port(WEB_PORT)
             address = f"http://localhost:{port}/"
             verbs[PAGES] = ["web", "--run", str(run), "--port", str(port)]
             say(f"watch it at {address}")
-        announced = announce(opened, redis_url=redis.url, run=run if train_steps else None, web=address)
-        stack.enter_context(announced)
+        stack.enter_context(announce(opened, redis_url=redis.url, run=trained, web=address))
         running = stack.enter_context(_processes(verbs, environment, run, say))
         preview = ["preview", planned.scene_id, "--out", str(out / "preview.html")]
         try:
-            watch = FarmWatch(opened, redis.url, trained, scene_id=planned.scene_id)
+            watch = FarmWatch(opened, redis.url, [run] if trained else [], scene_id=planned.scene_id)
             with display as show:
                 _watch(running, watch, redis, show, run)
             if train_steps:

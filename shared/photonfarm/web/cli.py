@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photonfarm.cli.options import Command, names_redis, redis_option, store_option
+from photonfarm.cli.options import combine_options, names_redis, redis_option, store_option
 from photonfarm.farm.running_farm import METRICS_PORT, WEB_PORT
 
 if TYPE_CHECKING:
@@ -18,35 +18,30 @@ if TYPE_CHECKING:
     from photonfarm.web.server import Routes
 
 
-def _watch_options(command: Command) -> Command:
-    """The options that say which farm is watched, and where that is served."""
-    options = (
-        store_option,
-        redis_option,
-        click.option(
-            "--run",
-            "runs",
-            type=click.Path(path_type=Path, file_okay=False),
-            multiple=True,
-            help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or run]",
-        ),
-        click.option(
-            "--host",
-            default="localhost",
-            show_default=True,
-            help="The address to listen on; whoever reaches any other one sees all that is served.",
-        ),
-        click.option(
-            "--name",
-            "names",
-            multiple=True,
-            help="A name, beside the host's, by which others may ask; may be repeated.",
-        ),
-    )
-    decorated: Any = command
-    for option in reversed(options):
-        decorated = option(decorated)
-    return decorated
+_watch_options = combine_options(
+    store_option,
+    redis_option,
+    click.option(
+        "--run",
+        "runs",
+        type=click.Path(path_type=Path, file_okay=False),
+        multiple=True,
+        help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or run]",
+    ),
+    click.option(
+        "--host",
+        default="localhost",
+        show_default=True,
+        help="The address to listen on; whoever reaches any other one sees all that is served.",
+    ),
+    click.option(
+        "--name",
+        "names",
+        multiple=True,
+        help="A name, beside the host's, by which others may ask; may be repeated.",
+    ),
+)
+"""The options that say which farm is watched, and where that is served."""
 
 
 @click.command()

@@ -17,9 +17,7 @@ from photonfarm.core.errors import QueueError
 from photonfarm.farm.submission import submit
 from photonfarm.plan.request import Request
 from photonfarm.queue.failures import read_kept_failures
-from photonfarm.queue.job import TRIES, Share
-from photonfarm.renderer.worker.child import RenderWorker
-from photonfarm.renderer.worker.settings import WorkerSettings
+from photonfarm.queue.job import TRIES
 from photonfarm.renderer.worker.worker import run_worker
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import SceneStore, Store
@@ -108,6 +106,7 @@ def test_jobs_that_fail_end_a_complete_run_and_are_not_tried_again_before_a_retr
     assert scene.missing_jobs() == []
 
 
+@pytest.mark.slow
 def test_a_job_whose_process_is_killed_comes_last_and_is_tried_again(
     analytic: ModuleType, planned: Callable[..., SceneStore], start: Starter
 ) -> None:
@@ -121,32 +120,6 @@ def test_a_job_whose_process_is_killed_comes_last_and_is_tried_again(
     assert int(committed[-1].stem) == 0
     (failure,) = read_kept_failures(Store(scene.folder.parent.parent)).values()
     assert "SIGKILL" in failure.reason
-
-
-def test_looks_of_a_worker_cost_little_and_the_last_one_sees_all(
-    planned: Callable[..., SceneStore], analytic: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    scene = planned(4)
-    store = Store(scene.folder.parent.parent)
-    settings = WorkerSettings(
-        store=str(store.root), name="one", share=Share.parse("0/1"), until_complete=True, reserve_bytes=0
-    )
-    worker = RenderWorker(settings, store, analytic.AnalyticScene.load)
-    looks, plain = [], SceneStore.missing_jobs
-
-    def missing(scene: SceneStore, *, followed: bool = False) -> list[int]:
-        looks.append(followed)
-        return plain(scene, followed=followed)
-
-    monkeypatch.setattr(SceneStore, "missing_jobs", missing)
-    jobs = scene.jobs()
-    for _ in range(jobs):
-        assert worker.step() is None
-    assert looks == [True]
-    assert plain(scene) == []
-    looks.clear()
-    assert worker.step() == 0
-    assert looks == [True, False], "a followed one, and since it found nothing, a whole one"
 
 
 @pytest.mark.parametrize(

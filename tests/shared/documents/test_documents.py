@@ -1,6 +1,7 @@
 """The pages and the code name the same verbs, keys, variables and exit codes; links lead somewhere."""
 
 import functools
+import os
 import re
 import runpy
 import tomllib
@@ -10,12 +11,14 @@ from typing import Any, get_args
 
 import click
 import pytest
+import yaml
 from pydantic import BaseModel
 
 from photonfarm.cli.main import file_defaults, options_by_command, umbrella
 from photonfarm.core import errors
 from photonfarm.scene import spec as scene_spec
 from photonfarm.scene.free_space import FreeSpace
+from photonfarm.store.model.findings import Cause
 from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Occlusion, TrainSettings, make_preset
 
 ROOT = Path(__file__).parents[3]
@@ -183,3 +186,22 @@ def test_the_example_of_a_spec_is_one() -> None:
     (example,) = re.findall(r"```toml\n(.*?)```", (DOCS / "own-scene.md").read_text(), re.DOTALL)
     described = scene_spec.SceneSpec.model_validate(tomllib.loads(example))
     assert [group.name for group in described.groups] == ["sofa", "ceiling-light"]
+
+
+def test_the_page_of_the_check_lists_every_cause_with_its_sentence_and_what_helps() -> None:
+    listed = re.findall(r"^\| `([a-z-]+)` \| (.+) \| (.+) \|$", (DOCS / "store-check.md").read_text(), re.MULTILINE)
+    assert listed == [(cause.label, cause.sentence, cause.remedy.value) for cause in Cause]
+
+
+def test_the_hosted_ci_runs_the_same_command_on_every_supported_python() -> None:
+    workflow: dict[Any, Any] = yaml.safe_load((ROOT / ".github/workflows/ci.yml").read_text())
+    (job,) = workflow["jobs"].values()
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    named = [re.search(r":: (3\.\d+)$", classifier) for classifier in project["classifiers"]]
+    supported = [match[1] for match in named if match]
+    assert job["strategy"]["matrix"]["python"] == supported
+    assert project["requires-python"] == f">={supported[0]}"
+    assert "${{ matrix.python }}" in job["container"]
+    assert [step["run"] for step in job["steps"] if "run" in step] == [".ci/run"]
+    assert os.access(ROOT / ".ci/run", os.X_OK)
+    assert workflow[True].keys() == {"push", "pull_request"}  # YAML 1.1 takes `on` for true

@@ -14,7 +14,6 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.farm_verbs import submit
 from photonfarm.cli.show import bytes_per_sample
-from photonfarm.core.errors import SpecError
 from photonfarm.farm import dry_run
 from photonfarm.farm.dry_run import DryRun, rehearse
 from photonfarm.plan.request import Extent, Request
@@ -145,18 +144,6 @@ def test_the_suggestion_costs_no_more_and_saves_what_is_said(tmp_path: Path, ver
     assert found.reduction >= 0.05
 
 
-def test_what_is_best_already_is_left_as_it_is(tmp_path: Path, verb: Verb) -> None:
-    verb()
-    better = rehearsed(tmp_path, tmp_path / "none", modifications=100).suggestion
-    assert better is not None
-    spec = spec_file(tmp_path, transport={"half_spp": better.half_spp})
-    found = rehearsed(
-        tmp_path, tmp_path / "none", spec=spec, modifications=better.modifications, views_per_modification=better.views
-    )
-    assert found.suggestion is None
-    assert 0 <= found.reduction < 0.05
-
-
 def test_of_a_static_scene_only_samples_per_pixel_are_suggested_and_its_configuration_is_paid_once(
     tmp_path: Path, verb: Verb
 ) -> None:
@@ -205,19 +192,6 @@ def test_a_measurement_that_fails_takes_one_line_and_nothing_else(
     assert told[0].startswith(f"cost and time are not known: {reason}")
 
 
-@pytest.mark.parametrize("more", [{"measure": False}, {"modifications": 0}])
-def test_nothing_is_measured_where_it_is_not_wanted_or_the_request_is_wrong(
-    tmp_path: Path, verb: Verb, more: dict[str, Any]
-) -> None:
-    asked = verb()
-    if more.get("modifications") == 0:
-        with pytest.raises(SpecError):
-            rehearsed(tmp_path, tmp_path / "none", **more)
-    else:
-        rehearsed(tmp_path, tmp_path / "none", **more)
-    assert not asked.exists()
-
-
 # -------------------------------------------------------------------------------------------------------- as printed
 
 
@@ -229,17 +203,6 @@ def test_the_command_prints_what_when_and_what_would_be_better(tmp_path: Path, v
     assert third.startswith("suggested at this cost: half_spp = ")
     assert "% less excess error predicted for light_transport" in third
     assert not (tmp_path / "none").exists()
-
-
-def test_where_samples_are_planned_the_command_says_why_it_suggests_nothing(tmp_path: Path, verb: Verb) -> None:
-    verb()
-    spec, store = spec_file(tmp_path), Store(tmp_path / "store", create=True)
-    store.plan(load_spec(spec), dry_run.Request(modifications=1, views_per_modification=2))
-    lines = run(spec, Path(store.root)).stdout.splitlines()
-    assert lines[2] == "no suggestion: another half_spp would render the 2 planned samples again"
-    assert run(spec, Path(store.root), "--modifications", "1").stdout.endswith(
-        "0 samples would be planned, 2 are already\n"
-    )
 
 
 def test_as_json_there_are_the_same_numbers_as_fields(tmp_path: Path, verb: Verb) -> None:

@@ -246,7 +246,7 @@ def test_a_runs_log_is_followed_and_read_anew_where_a_trainer_has_replaced_it(tm
     (tmp_path / "settings.json").write_text('{"max_steps": 40}')
     log.write_text(validation(10, 0.5) + validation(20, 0.4)[:-9])
     found = run.look()
-    assert (found.step, found.steps, found.note) == (10, 40, ", held-out error 0.50000 ± 0.10000 on 3 samples")
+    assert (found.step, found.steps, found.figures) == (10, 40, ", held-out error 0.50000 ± 0.10000 on 3 samples")
     log.write_text(validation(10, 0.5) + validation(20, 0.4))
     assert run.look().step == 20
     (tmp_path / "other").write_text(json.dumps({"kind": "end", "step": 97, "reason": "steps"}) + "\n")
@@ -259,7 +259,7 @@ def test_a_trainers_own_word_is_believed_while_it_is_fresh(tmp_path: Path) -> No
     said = {"step": 7, "steps": 40, "phase": "waits for samples", "left_s": 120.0, "at_s": time.time()}
     (tmp_path / "progress.json").write_text(json.dumps(said))
     found = RunFolder(tmp_path).look()
-    assert (found.step, found.phase, found.note) == (7, "waits for samples", ", waits for samples, 2 min left")
+    assert found.line == f"training {tmp_path.name}: step 7/40, waits for samples, 2 min left"
     (tmp_path / "progress.json").write_text(json.dumps(said | {"at_s": time.time() - 3600}))
     assert RunFolder(tmp_path).look().phase is None
 

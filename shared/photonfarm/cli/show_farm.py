@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich.console import Console, Group
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
 from rich.text import Text
@@ -81,7 +81,9 @@ def draw_farm(farm: FarmProgress, store: str | Path) -> Group:
         for scene in farm.scenes
         if not scene.status.error
     )
-    rows = [(*row, bar) for row, bar in zip(_list_scenes(farm, letters=8), bars, strict=True)]
+    rows: list[tuple[RenderableType, ...]] = [
+        (*row, bar) for row, bar in zip(_list_scenes(farm, letters=8), bars, strict=True)
+    ]
     text = Text("\n".join(list_lines(farm, store)))
     return Group(Text(time.strftime("%H:%M:%S")), make_table(rows, (*HEAD, "")), text)
 

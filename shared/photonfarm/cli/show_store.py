@@ -24,7 +24,6 @@ from photonfarm.store.check.check import CheckProgress, SceneReport, StoreReport
 from photonfarm.store.model.findings import FindingGroup, Remedy
 from photonfarm.store.model.withdrawal import Withdrawal
 from photonfarm.store.read.find import FoundSample, Matches
-from photonfarm.store.read.merge import WrittenView
 
 
 @contextlib.contextmanager
@@ -176,13 +175,6 @@ def list_commands(sample: FoundSample, store: str | Path) -> dict[str, str]:
 
 
 # ---------------------------------------------------------------------------------------------- merge, join, withdraw
-
-
-def print_merged(view: WrittenView) -> None:
-    """Print a line about a merged view."""
-    passes = "1 pass" if view.passes == 1 else f"{view.passes} passes"
-    error = f"standard error of a value {view.standard_error:.2g} (RMS)"
-    click.echo(f"{view.file}: {passes}, mean {view.mean:.4g}, {error}")
 
 
 def print_joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:

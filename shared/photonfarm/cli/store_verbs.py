@@ -151,7 +151,6 @@ def merge(
 
     Exit codes: 0 some view was merged, 7 none yet, as samples or passes are missing, 4 no sample that is planned fits.
     """
-    from photonfarm.cli import show_store
     from photonfarm.cli.show import print_json
     from photonfarm.store import Store
     from photonfarm.store.read.find import Query, find_samples, scene_named
@@ -165,7 +164,9 @@ def merge(
     for each in write_views(merged, out):
         written.append(each)
         if not as_json:
-            show_store.print_merged(each)
+            passes = "1 pass" if each.passes == 1 else f"{each.passes} passes"
+            error = f"standard error of a value {each.standard_error:.2g} (RMS)"
+            click.echo(f"{each.file}: {passes}, mean {each.mean:.4g}, {error}")
     if as_json:
         print_json([asdict(each) for each in written])
     if not written:

@@ -62,8 +62,11 @@ def make_scripts(named: Sequence[NamedSpec], store: str | Path, redis_url: str |
     if scenes := dict.fromkeys(spec.scenes for spec in named if spec.scenes):
         folders = shlex.quote(":".join(scenes))
         variables[SCENES_VARIABLE] = f'{folders}"${{{SCENES_VARIABLE}:+:${SCENES_VARIABLE}}}"'
-    if redis_url is not None and not _has_password(redis_url):
-        variables["PHOTONFARM_REDIS_URL"] = shlex.quote(redis_url)
+    if redis_url is not None:
+        from photonfarm.queue.connection import has_password
+
+        if not has_password(redis_url):
+            variables["PHOTONFARM_REDIS_URL"] = shlex.quote(redis_url)
     for name in ("PHOTONFARM_CONFIG", "PHOTONFARM_REDIS_PASSWORD_FILE"):
         if path := os.environ.get(name):
             variables[name] = shlex.quote(str(Path(path).absolute()))
@@ -123,12 +126,6 @@ def _make_script(
         verb=verb,
         requeues=REQUEUES,
     )
-
-
-def _has_password(redis_url: str) -> bool:
-    from photonfarm.queue.connection import has_password
-
-    return has_password(redis_url)
 
 
 def _name_spec(name: str) -> str:

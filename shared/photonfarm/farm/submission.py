@@ -222,6 +222,13 @@ def submit(
     usual = rows_per_job(named.spec, request, workers)
     other = scene_named(opened, halves_from) if halves_from else find_same_radiance(opened, named.spec)
     before = stored_spec(opened.storage, named.spec.scene_id)
+    replaced = None
+    if before is not None:
+        then, now = (
+            each.model_dump(mode="json", exclude={"scene", "stored_exponent"}) for each in (before, named.spec)
+        )
+        changes = differing(then, now).items()
+        replaced = ", ".join(f"{key} ({was} before, {is_} now)" for key, (was, is_) in changes) or None
     with announce_work(opened.storage, named.spec.scene_id, "submit", log.warning):
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten
@@ -234,16 +241,9 @@ def submit(
         queued,
         note=note_first_plan(opened, named.spec) if planned.plan == 0 else None,
         halves_from=other if planned.new else None,
-        replaced=None if before is None else _describe_replaced(before, named.spec),
+        replaced=replaced,
         scenes=named.scenes,
     )
-
-
-def _describe_replaced(there: SceneSpec, here: SceneSpec) -> str | None:
-    """What a stored spec has lost to a submitted one of the same ids, in words; None if they agree."""
-    then, now = (spec.model_dump(mode="json", exclude={"scene", "stored_exponent"}) for spec in (there, here))
-    changes = differing(then, now)
-    return ", ".join(f"{key} ({was} before, {is_} now)" for key, (was, is_) in changes.items()) or None
 
 
 def top_up(

@@ -242,19 +242,12 @@ def _watch(
         for name, code in codes.items():
             if code:
                 log = logs / f"{name}.log"
-                said = f"{name} {_end(code)}; {log} says: {_tail(log)}. What is rendered and trained"
+                end = f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+                (*_, last_line) = log.read_text(errors="replace").strip().splitlines() or ["nothing"]
+                said = f"{name} {end}; {log} says: {last_line}. What is rendered and trained"
                 if code == SpecError.exit_code:  # the same command would be refused again
                     raise IncompleteError(f"{said} is kept")
                 raise IncompleteError(f"{said} is kept, and the same command goes on from there")
         if last:
             return
         time.sleep(POLL_S)
-
-
-def _end(code: int) -> str:
-    return f"was ended by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-
-
-def _tail(log: Path) -> str:
-    lines = log.read_text(errors="replace").strip().splitlines()
-    return lines[-1] if lines else "nothing"

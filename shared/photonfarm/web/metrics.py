@@ -54,7 +54,7 @@ class FarmMetrics(Collector):
     def collect(self) -> Iterator[Metric]:
         """Yield the metrics of the farm as it is now."""
         farm = self._look()
-        rows = (*_measure_scenes(farm), *_measure_queue(farm.queue), *_measure_trainings(farm), _measure_waits(farm))
+        rows = (*_measure_store(farm), *_measure_queue(farm.queue), *_measure_trainings(farm))
         for name, labels, about, values in rows:
             kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
             family = kind(f"photonfarm_{name}", about, labels=labels.split())
@@ -63,7 +63,7 @@ class FarmMetrics(Collector):
             yield family
 
 
-def _measure_scenes(farm: FarmProgress) -> Iterator[Row]:
+def _measure_store(farm: FarmProgress) -> Iterator[Row]:
     readable = [scene for scene in farm.scenes if not scene.status.error]
     by_scene = {(_escape_text(scene.status.name), scene.status.scene_id): scene for scene in readable}
     by_pass = {(*of, "first"): scene.samples for of, scene in by_scene.items()}
@@ -73,6 +73,10 @@ def _measure_scenes(farm: FarmProgress) -> Iterator[Row]:
     labels, committed, planned = "scene scene_id pass", "Committed samples.", "Planned samples."
     yield "samples_committed_total", labels, committed, {of: counts[0] for of, counts in by_pass.items()}
     yield "samples_planned", labels, planned, {of: counts[1] for of, counts in by_pass.items()}
+    waits: Counter[Labels] = Counter({(kind,): 0 for kind in get_args(WaitKind)})
+    for wait in farm.waits:
+        waits[wait.kind,] += wait.count
+    yield "waits", "kind", "What waits: scenes, workers, failed jobs, samples, trainers.", waits
     in_hand = "Samples that are rendered, in jobs that are not committed yet."
     yield "samples_in_hand", "scene scene_id", in_hand, {of: scene.in_hand for of, scene in by_scene.items()}
     for name, key, about in (
@@ -146,13 +150,6 @@ def _measure_trainings(farm: FarmProgress) -> Iterator[Row]:
     about = "1 for the state that the trainer is in, 0 for the others."
     states = {(*of, state): float(state == _name_state(run)) for of, run in runs.items() for state in STATES}
     yield "trainer_state", "run state", about, states
-
-
-def _measure_waits(farm: FarmProgress) -> Row:
-    waits: Counter[Labels] = Counter({(kind,): 0 for kind in get_args(WaitKind)})
-    for wait in farm.waits:
-        waits[wait.kind,] += wait.count
-    return "waits", "kind", "What waits: scenes, workers, failed jobs, samples, trainers.", waits
 
 
 def _name_state(training: TrainingProgress) -> str:

@@ -9,11 +9,9 @@ import threading
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import analytic_scene as analytic
 import numpy as np
-import zarr
 
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.store import SceneReader, SceneStore, Store
@@ -136,7 +134,6 @@ def differences(scene: SceneStore, clean: Path, journal: Journal, watcher: Watch
         *_committed_twice(scene, journal, watcher),
         *_unlike(scene, rendered_undisturbed(scene, clean), watcher),
         *_not_once(scene, watcher),
-        *_unlike_through_zarr(scene),
         *(f"{name} is left half-written" for name in scene.storage.names("tmp")),
     ]
 
@@ -189,18 +186,6 @@ def _not_once(scene: SceneStore, watcher: Watcher) -> Iterator[str]:
     }.items():
         if count != planned:
             yield f"{planned} samples are planned, and {count} {what}"
-
-
-def _unlike_through_zarr(scene: SceneStore) -> Iterator[str]:
-    reader = SceneReader(scene.storage.where, scene.scene_id)
-    rows = reader.refresh()
-    for plan in scene.plans():
-        group: Any = zarr.open_group(str(scene.storage.local(plan.folder)), mode="r")
-        stored = group["radiance"][:].astype(np.float32)
-        scale = np.float32(2.0 ** -group["radiance"].attrs["radiance_exponent"])
-        for row in rows[(rows >= plan.first_row) & (rows < plan.end_row)]:
-            if not np.array_equal(stored[row - plan.first_row] * scale, reader.read(int(row)).radiance):
-                yield f"row {row} is another one through zarr-python"
 
 
 def _data(scene: SceneStore) -> dict[str, bytes]:

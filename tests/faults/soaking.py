@@ -1,8 +1,8 @@
 """A soak: workers, Redis and submitters are killed, stopped and made to forget at random, while a reader looks on.
 
 Invariants, checked all the time: the committed set only grows, and what is committed reads whole and is what an
-undisturbed worker renders. In the end every slot is there once, bit for bit, through zarr-python too, and every marker
-is the one that was seen first.
+undisturbed worker renders. In the end every slot is there once, bit for bit, and every marker is the one that was seen
+first.
 """
 
 import contextlib

@@ -114,18 +114,7 @@ def test_a_farm_whose_store_is_mended_undone_and_joined_under_load_has_everythin
             stack.enter_context(worker)
             stack.callback(worker.kill)
             workers.append(worker)
-        for name in (
-            "repair",
-            "withdraw",
-            "forget",
-            "join",
-            "repair",
-            "forget",
-            "withdraw",
-            "repair",
-            "join",
-            "withdraw",
-        ):
+        for name in ("repair", "withdraw", "forget", "join", "repair", "withdraw", "join"):
             time.sleep(random.Random(name).uniform(0.3, 1.5))
             if (child := analytic.child_of(workers[0])) is not None:
                 os.kill(child, signal.SIGKILL)

@@ -44,9 +44,6 @@ SCENES = {
     "what comes later": square('<ref id="a"/>') + RED.format("a"),
     "what is in another shape": f'<shape type="sphere">{RED.format("m")}</shape>' + square('<ref id="m"/>'),
     "an image": square(f'<bsdf type="diffuse">{IMAGE.format("reflectance")}</bsdf>'),
-    "nested materials": square(
-        f'<bsdf type="mask"><float name="opacity" value="0.5"/><bsdf type="twosided">{RED.format("red")}</bsdf></bsdf>'
-    ),
     "a blend": square(
         f'<bsdf type="blendbsdf"><float name="weight" value="0.3"/>{RED.format("x")}<bsdf type="diffuse"/></bsdf>'
     ),
@@ -55,17 +52,13 @@ SCENES = {
         '<transform name="to_world"><translate x="1"/><rotate y="1" angle="30"/><scale value="2"/>'
         '<matrix value="1 0 0 0.1 0 1 0 0.2 0 0 1 0.3 0 0 0 1"/></transform>'
     ),
-    "a uniform spectrum": square('<bsdf type="diffuse"><spectrum name="reflectance" value="0.4"/></bsdf>'),
     "a sampled spectrum": square('<bsdf type="diffuse"><spectrum name="reflectance" value="400:.1, 700:.3"/></bsdf>'),
     "a spectrum of a file": square('<bsdf type="diffuse"><spectrum name="reflectance" filename="s.spd"/></bsdf>'),
     "an area light": square('<emitter type="area"><rgb name="radiance" value="2 3 4"/></emitter>'),
-    "a point light": square("")
-    + '<emitter type="point"><point name="position" x="0" y="0" z="2"/><rgb name="intensity" value="5 4 3"/></emitter>',
     "a spot": square("") + '<emitter type="spot"><transform name="to_world"><lookat origin="0 0 2" target="0 0 0" '
     'up="0 1 0"/></transform><rgb name="intensity" value="9"/></emitter>',
     "an image of the sky": square("") + '<emitter type="envmap"><string name="filename" value="images/a.png"/>'
     '<transform name="to_world"><rotate x="1" angle="90"/></transform></emitter>',
-    "metal": square('<bsdf type="roughconductor"><string name="material" value="Au"/></bsdf>'),
 }
 
 

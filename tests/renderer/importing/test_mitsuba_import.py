@@ -49,10 +49,6 @@ def test_what_no_shape_uses_is_no_loss(write_xml: Callable[..., Path], loaded: L
     assert not list(loaded(write_xml(gone + SPHERE))[0].changes)
 
 
-def test_a_shape_that_the_scene_names_twice_is_there_once(write_xml: Callable[..., Path], loaded: Loaded) -> None:
-    assert len(loaded(write_xml(f'{SPHERE}<ref id="Ball"/>'))[1].shapes()) == 1
-
-
 def test_media_and_what_only_bounds_one_are_left_out_and_named(write_xml: Callable[..., Path], read: Read) -> None:
     content = (
         """<medium type="homogeneous" id="fog"/>
@@ -82,28 +78,15 @@ def test_instances_beyond_the_most_are_counted(
     assert "geometry differs: instance: 3 of 4 are missing" in " ".join(map(str, scene.changes))
 
 
-def test_instances_become_shapes_where_they_stand(write_xml: Callable[..., Path], loaded: Loaded) -> None:
-    content = """<shape type="shapegroup" id="Group"><shape type="cube" id="Part">
-        <transform name="to_world"><translate x="1"/></transform></shape></shape>
-      <shape type="instance"><ref id="Group"/><transform name="to_world"><scale value="2"/></transform></shape>
-      <shape type="instance"><ref id="Group"/></shape>"""
-    _, made = loaded(write_xml(content))
-    assert [shape.id() for shape in made.shapes()] == ["Part_1", "Part_2"]
-    assert [float(shape.bbox().max[0]) for shape in made.shapes()] == [4, 2]
-
-
 @pytest.mark.parametrize(
     ("kind", "inside", "step"),
     [
         ("sphere", "", '<scale x="-1"/>'),
         ("sphere", '<boolean name="flip_normals" value="true"/>', '<scale value="-2"/>'),
-        ("sphere", '<point name="center" x=".1" y="0" z="0"/>', '<scale value="2"/>'),
-        ("cylinder", '<point name="p0" x="-1" y="0" z="0"/>', '<scale x="-1"/>'),
         ("disk", "", '<scale x="-1"/>'),
         ("rectangle", "", '<scale x="-1"/>'),
         ("cube", "", '<scale x="-1" y="-1"/>'),
         ("ply", "", '<scale x="-1"/>'),
-        ("obj", "", '<scale x="-1"/>'),
         ("obj", '<boolean name="face_normals" value="true"/>', '<scale z="-1"/>'),
         ("obj", '<boolean name="flip_normals" value="true"/>', '<scale x="-2"/>'),
         ("ply", '<transform name="to_world"><scale y="-1"/></transform>', '<scale x="-2" y="1"/>'),

@@ -30,8 +30,7 @@ def pictures(values: np.ndarray, noise: float = 0.0) -> Pictures:
 # ------------------------------------------------------------------------------------------------------- the search
 
 
-@pytest.mark.parametrize("radiance", [1e-6, 0.02, 7.0, 3e5])
-@pytest.mark.parametrize("target", [0.1, 0.45, 0.95])
+@pytest.mark.parametrize(("radiance", "target"), [(1e-6, 0.1), (3e5, 0.95)])
 def test_pictures_of_one_radiance_get_the_exposure_of_the_formula(radiance: float, target: float) -> None:
     """(e · r)^(1/2.2) = t for e = t^2.2 / r."""
     found = pictures(np.full((2, 8, 8, 3), radiance)).exposure(target)
@@ -100,9 +99,7 @@ def test_what_is_lit_gets_the_target_if_that_is_enough(monkeypatch: pytest.Monke
     assert found.exposure == pytest.approx(0.45**2.2 / 0.5, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("film", "small"), [((64, 64), (64, 64)), ((256, 256), (64, 64)), ((1280, 720), (64, 32)), ((2048, 8), (64, 8))]
-)
+@pytest.mark.parametrize(("film", "small"), [((64, 64), (64, 64)), ((1280, 720), (64, 32)), ((2048, 8), (64, 8))])
 def test_large_films_are_rendered_small(film: tuple[int, int], small: tuple[int, int]) -> None:
     found = exposure.shrunk(cornell(width=film[0], height=film[1]), exposure.SIDE).film
     assert (found.width, found.height) == small

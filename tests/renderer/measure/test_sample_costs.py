@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from photonfarm.core.errors import SpecError
 from photonfarm.plan.sample_costs import SECONDS, SampleCosts, relative_variance
 from photonfarm.renderer.cli.measuring_verbs import scene_cost
 from photonfarm.renderer.scene import backend
@@ -46,15 +45,6 @@ def static(**view: Any) -> SceneSpec:
 
 
 # -------------------------------------------------------------------------------------------------------------- times
-
-
-def test_what_was_measured_of_the_room_is_positive_and_of_this_scene(room: LoadedScene) -> None:
-    costs = sample_costs(room, 3)
-    assert costs.scene_id == room.spec.scene_id
-    assert costs.configuration_s > 0
-    assert costs.view_s > costs.guides_s > 0
-    assert costs.pass_s + 4 * costs.spp_s > 0
-    assert 0.01 < costs.relative_variance < 100
 
 
 def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
@@ -123,7 +113,7 @@ def test_a_pass_of_more_samples_takes_the_seconds_that_were_predicted() -> None:
 
 @pytest.mark.parametrize(
     ("few_s", "many_s", "fixed_s", "sample_s"),
-    [(8.0, 20.0, 4.0, 0.5), (8.0, 32.0, 0.0, 1.0), (8.0, 44.0, 0.0, 1.5), (8.0, 7.0, 8.0, 0.0)],
+    [(8.0, 20.0, 4.0, 0.5), (8.0, 44.0, 0.0, 1.5), (8.0, 7.0, 8.0, 0.0)],
 )
 def test_neither_part_of_a_pass_is_below_zero(few_s: float, many_s: float, fixed_s: float, sample_s: float) -> None:
     assert line_through(8, few_s, 32, many_s) == (fixed_s, sample_s)
@@ -154,7 +144,8 @@ def test_a_static_scene_is_measured_in_different_views() -> None:
     costs = measure_costs(static(), frames=2)
     assert costs.configuration_s < 0.1  # nothing moves, and there are no photons
     assert costs.view_s > 0
-    assert costs.relative_variance > 0
+    assert costs.view_s > costs.guides_s > 0
+    assert 0.01 < costs.relative_variance < 100
 
 
 def test_views_that_show_nothing_have_no_noise_to_tell_of() -> None:
@@ -214,9 +205,3 @@ def test_a_folder_that_cannot_be_written_costs_but_a_line(tiny: Path, monkeypatc
     result = run(tiny, "--json")
     assert SampleCosts.read(result.stdout) == SOME
     assert str(tiny.parent / "cache") in result.stderr
-
-
-def test_a_spec_that_is_none_is_refused_as_by_every_verb(tmp_path: Path) -> None:
-    result = run("attic")
-    assert isinstance(result.exception, SpecError)
-    assert result.exception.exit_code == 3

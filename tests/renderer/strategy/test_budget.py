@@ -42,10 +42,10 @@ def chosen(seconds: float) -> list[Candidate]:
 
 
 def test_with_time_for_all_every_setting_is_compared_and_with_less_the_last_are_left_out() -> None:
-    """Each takes a second, and a third of the time is for them."""
+    """Each takes a second, and half of the time is for them."""
     assert set(chosen(100)) == set(CANDIDATES)
-    assert chosen(7) == [PLAIN, JOINED, CANDIDATES[0]]
-    assert chosen(5) == [PLAIN, JOINED]
+    assert chosen(5) == [PLAIN, JOINED, CANDIDATES[0]]
+    assert chosen(3.5) == [PLAIN, JOINED]
 
 
 def test_with_too_little_time_it_is_said_how_much_would_do() -> None:

@@ -164,7 +164,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             layout = Layout.of(lights.count)
             lights = lights.guide_with(StartGuide.neutral(layout), scene)
             views = 1 if places is None else len(places)
-            launch = effort.launch(views)
+            launch = Launch(views, 0, 1, 0, max(1, effort.light_paths // views), 0)
             options = self._options(launch, width * height)
             options = replace(options, light_ratio=dr.opaque(mi.Float, self.light_ratio))
             seeds = randomness.learning_seeds(seed & 0xFFFFFFFF, views)

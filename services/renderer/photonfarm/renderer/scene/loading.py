@@ -79,7 +79,12 @@ def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
     Shapes stay separate (`optimize=False`), as merged ones could not move. Raises SpecError for a file that is missing,
     that changed since the spec was read, or that Mitsuba or the integrator refuses.
     """
-    scene = _load_file(spec, beside) if spec.scene.file else _load_builtin(spec)
+    if spec.scene.file:
+        scene = _load_file(spec, beside)
+    else:
+        shapes = rooms.describe(str(spec.scene.builtin))
+        scene = mi.load_dict({"type": "scene", **shapes, **_describe_added_lights(spec)}, optimize=False)
+        dim(scene, spec)
     try:
         check_scene(scene, light_paths=bool(spec.transport.light_ratio or spec.photons.paths))
     except ValueError as error:
@@ -90,13 +95,6 @@ def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:
                 f"{spec.name}: mesh light {shape.id()!r} has smooth vertex normals, with which it cannot be sampled "
                 'without bias; give it <boolean name="face_normals" value="true"/>'
             )
-    return scene
-
-
-def _load_builtin(spec: SceneSpec) -> Any:
-    shapes = rooms.describe(str(spec.scene.builtin))
-    scene = mi.load_dict({"type": "scene", **shapes, **_describe_added_lights(spec)}, optimize=False)
-    dim(scene, spec)
     return scene
 
 

@@ -17,7 +17,7 @@ LEAST_TURNS, MOST_TURNS = 3, 60
 RANGE = 4
 """The larger over the smaller of the two numbers of samples that are timed."""
 
-COMPILING, REQUIRED = 0.35, 0.5
+COMPILING, REQUIRED = 0.5, 0.6
 """The largest shares of the time for compiling settings, and for compiling those that are always compared."""
 
 

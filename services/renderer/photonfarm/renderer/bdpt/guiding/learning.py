@@ -24,10 +24,9 @@ import numpy as np
 
 from photonfarm.renderer.bdpt.camera import ImageStack
 from photonfarm.renderer.bdpt.guiding.grid import SparseLanes
-from photonfarm.renderer.bdpt.guiding.starts import F64, Layout, StartGuide
+from photonfarm.renderer.bdpt.guiding.starts import F64, Layout, StartGuide, table_of
 from photonfarm.renderer.bdpt.guiding.tally import Totals, column_of, tiles_of
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, estimate_usefulness
-from photonfarm.renderer.bdpt.launches import Launch
 
 DEFAULT_SHARE = 0.35
 """The share of light paths that start as without a guide: no light is lost, and no density is below this part."""
@@ -92,10 +91,6 @@ class Effort:
         of_an_eye = 2 ** np.round(np.log2(np.clip(2 * light_ratio, 0.5 if connections else 2, 16)))
         return cls(eyes, int(eyes * of_an_eye))
 
-    def launch(self, images: int) -> Launch:
-        """The launch that learns from so many images."""
-        return Launch(images, 0, 1, 0, max(1, self.light_paths // images), 0)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LightGuide:
@@ -107,14 +102,7 @@ class LightGuide:
     @classmethod
     def of(cls, starts: StartGuide, table: F64 | None) -> Self:
         """The guide of these parts. Raises ValueError unless all of a table's [U] numbers are finite and above 0."""
-        if table is None:
-            return cls(starts, None)
-        if table.shape != (CELLS,) or not (np.isfinite(table).all() and (table > 0).all()):
-            raise ValueError(
-                f"bdpt: a table of usefulness has the shape {table.shape}; ({CELLS},) finite numbers above 0 are "
-                "required, or light would be lost"
-            )
-        return cls(starts, mi.Float(table.tolist()))
+        return cls(starts, None if table is None else table_of(table, CELLS, "table of usefulness"))
 
 
 def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Totals, lanes: SparseLanes) -> LightGuide:

@@ -25,6 +25,16 @@ MOST_CELLS = 1 << 14
 """The most cells of a table: more would learn little and cost memory."""
 
 
+def table_of(values: F64, count: int, what: str) -> mi.Float:
+    """So many values as device data. Raises ValueError unless all are finite and above 0."""
+    if values.shape != (count,) or not (np.isfinite(values).all() and (values > 0).all()):
+        raise ValueError(
+            f"bdpt: a {what} has the shape {values.shape}; ({count},) finite numbers above 0 are required, or light "
+            "would be lost"
+        )
+    return mi.Float(values.tolist())
+
+
 @dataclass(frozen=True, slots=True)
 class Layout:
     """How many cells a table has."""
@@ -64,12 +74,7 @@ class StartGuide:
     @classmethod
     def of(cls, layout: Layout, gain: F64) -> StartGuide:
         """A guide of gains [T]. Raises ValueError unless all are finite and above 0."""
-        if gain.shape != (layout.cells,) or not (np.isfinite(gain).all() and (gain > 0).all()):
-            raise ValueError(
-                f"bdpt: a guide's gains have the shape {gain.shape} and lie from {gain.min():g} to {gain.max():g}; "
-                f"({layout.cells},) finite numbers above 0 are required, or light would be lost"
-            )
-        return cls(layout, mi.Float(gain.tolist()))
+        return cls(layout, table_of(gain, layout.cells, "table of a guide's gains"))
 
     @classmethod
     def neutral(cls, layout: Layout) -> StartGuide:

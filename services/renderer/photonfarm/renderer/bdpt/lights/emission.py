@@ -166,7 +166,9 @@ def read_lights(scene: mi.Scene) -> Lights:
     weight = dr.select(kind == HIT_ONLY, 0, weight)
     selection = read_selection(pointers, ids, weight, bounding_box(scene)) if n > 1 else None
     emit_weight = dr.select(kind == EYE_ONLY, 0, weight if selection is None else selection.overall)
-    emit_cdf, emit = _normalise(emit_weight, n)
+    emit_cdf = dr.cumsum(emit_weight) if n > 1 else emit_weight
+    total = dr.gather(mi.Float, emit_cdf, mi.UInt32(n - 1))
+    emit = dr.select(total > 0, emit_weight / total, 0)
     axis, cos_cutoff = cones(parameters, emitters)
 
     emission = emit / (dr.two_pi * (1 - cos_cutoff))  # positions; π·R² for lights at infinity, A·π for areas
@@ -207,13 +209,6 @@ def _kind(emitter: mi.Emitter, shape: mi.Shape | None) -> int:
     if is_textured(emitter) and not (shape.is_mesh() or shape.class_name() == "Rectangle"):
         return HIT_ONLY  # Mitsuba's sampling of such a light does not know the surface's texture coordinates
     return AREA
-
-
-def _normalise(weight: mi.Float, n: int) -> tuple[mi.Float, mi.Float]:
-    """(running sum [N], probabilities [N]) of weights [N]. Weights that are all 0 have probabilities of 0."""
-    cdf = dr.cumsum(weight) if n > 1 else weight
-    total = dr.gather(mi.Float, cdf, mi.UInt32(n - 1))
-    return cdf, dr.select(total > 0, weight / total, 0)
 
 
 # ------------------------------------- Next event estimation (y₀ from x) -------------------------------------

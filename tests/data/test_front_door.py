@@ -142,7 +142,7 @@ def test_a_key_is_the_one_by_which_the_store_finds_the_sample(scene: Scene, tmp_
     assert sample.seeds == (seed_of(sample.key, "half A"), seed_of(sample.key, "half B"))
 
 
-@pytest.mark.parametrize("workers", [0, 2])
+@pytest.mark.parametrize("workers", [2])
 def test_five_lines_with_a_loader_of_spawned_processes(place: str | Path, workers: int) -> None:
     stored(place)
     scene = open_scene(place, "small")

@@ -13,10 +13,8 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
-from photonfarm.queue.connection import connect
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.renderer.worker.backpressure import TrainerPace
-from photonfarm.store import SceneStore, Store, store_status
+from photonfarm.store import SceneStore, Store
 
 
 @pytest.fixture
@@ -45,12 +43,6 @@ def test_a_worker_renders_what_is_whole_and_then_ends_with_the_error_of_what_is_
         worker.kill()
     assert whole.missing_jobs() == []
     assert f"scene {damaged.scene_id} is passed over" in log.read_text()
-
-
-def test_the_pace_of_the_trainer_is_that_of_the_scenes_that_can_be_read(
-    scenes: tuple[SceneStore, SceneStore], redis_server: EmbeddedRedis, tmp_path: Path
-) -> None:
-    assert TrainerPace(Store(tmp_path / "store"), connect(redis_server.url), 4.0).ahead() == {}
 
 
 def empty(marker: Path) -> None:
@@ -87,17 +79,6 @@ def test_the_status_counts_markers_that_cannot_be_read_names_one_and_shows_the_r
         assert "committed/000000000000.json" in about["marker_error"]
     else:
         assert re.search(rf"{scene.scene_id} +6/8 +3/4", result.stdout)
-
-
-def test_a_marker_that_a_repair_takes_back_during_status_is_no_damage(
-    scenes: tuple[SceneStore, SceneStore], analytic: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    _, whole = scenes
-    ShardRenderer(Store(tmp_path / "store"), worker="test", load=analytic.AnalyticScene.load).render(whole.scene_id, 0)
-    monkeypatch.setattr(SceneStore, "committed_jobs", lambda _: {0, 1})
-    (about,) = [status for status in store_status(Store(tmp_path / "store")) if status.scene_id == whole.scene_id]
-    assert (about.error, about.markers_unreadable, about.marker_error) == (None, 0, None)
-    assert about.size_bytes > 0
 
 
 @pytest.mark.parametrize("as_json", [False, True])

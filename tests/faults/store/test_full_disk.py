@@ -162,7 +162,7 @@ def test_a_commit_succeeds_as_soon_as_there_is_room_and_shows_nothing_before(
     assert check_store(Store(disk.folder), when="now").exit_code == 0
 
 
-@pytest.mark.parametrize("kind", ["pages", "files"])
+@pytest.mark.parametrize("kind", ["pages"])
 def test_a_plan_that_finds_no_room_is_not_there_and_is_made_once_there_is(
     analytic: ModuleType, disk: Disk, scene: SceneStore, kind: str
 ) -> None:
@@ -179,22 +179,7 @@ def test_a_plan_that_finds_no_room_is_not_there_and_is_made_once_there_is(
     assert (result.plan, result.new) == (1, 20)
 
 
-@pytest.mark.parametrize("kind", ["pages", "files"])
-def test_a_new_scene_that_finds_no_room_is_not_there(
-    analytic: ModuleType, disk: Disk, scene: SceneStore, kind: str
-) -> None:
-    disk.leave(kind, 0)
-    other = analytic.small_spec(points=17)
-    with pytest.raises(StoreError) as caught:
-        Store(disk.folder).add(other)
-    assert is_full(caught.value)
-    assert Store(disk.folder).scene_ids() == [scene.scene_id]
-    disk.make_room()
-    Store(disk.folder).add(other)
-    assert len(Store(disk.folder).scene_ids()) == 2
-
-
-@pytest.mark.parametrize("kind", ["pages", "files"])
+@pytest.mark.parametrize("kind", ["files"])
 def test_a_repair_that_finds_no_room_to_write_down_what_it_does_moves_nothing(
     analytic: ModuleType, disk: Disk, scene: SceneStore, kind: str
 ) -> None:
@@ -261,7 +246,7 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 """
 
 
-@pytest.mark.parametrize("pages", [0, 50], ids=["from the beginning", "after some jobs"])
+@pytest.mark.parametrize("pages", [50], ids=["after some jobs"])
 def test_a_worker_waits_for_a_full_disk_says_so_and_goes_on_and_no_job_fails(
     analytic: ModuleType,
     disk: Disk,
@@ -300,27 +285,6 @@ def test_a_worker_waits_for_a_full_disk_says_so_and_goes_on_and_no_job_fails(
     assert "starting again" not in log.read_text()
     assert "Traceback" not in log.read_text()
     assert parts(scene) == []
-
-
-def test_a_worker_at_a_read_only_store_ends_with_a_sentence_and_loses_nothing(
-    analytic: ModuleType, disk: Disk, scene: SceneStore, redis_server: EmbeddedRedis, tmp_path: Path
-) -> None:
-    render(analytic, scene, 0)
-    log = tmp_path / "log"
-    settings = {"child": analytic.command(), "log": log, "until_complete": True}
-    disk.read_only(True)
-    try:
-        with analytic.start_worker(disk.folder, redis_server.url, **settings) as running:
-            assert running.wait(120) == StoreError.exit_code
-        assert "Read-only file system" in log.read_text()
-        assert scene.committed_jobs() == {0}
-        assert len(read_all(scene)) == 2
-        assert queue_status(connect(redis_server.url)).failed == {}
-    finally:
-        disk.read_only(False)
-    with analytic.start_worker(disk.folder, redis_server.url, **settings) as running:
-        assert running.wait(120) == 0
-    assert scene.missing_jobs() == []
 
 
 def test_a_disk_that_becomes_read_only_ends_a_worker_that_is_at_work_and_loses_nothing(

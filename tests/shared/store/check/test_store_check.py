@@ -236,13 +236,6 @@ def test_data_without_a_marker_and_foreign_files_are_noted_and_left_alone(store:
     assert shard(scene, "depth", 1).exists()
 
 
-def test_a_marker_may_name_arrays_of_a_later_program(store: Store, scene: SceneStore) -> None:
-    about = json.loads(marker(scene, 0).read_text())
-    about["files"]["plans/000000/motion/c.0.0"] = {"size": 1, "crc32c": "00000000"}
-    marker(scene, 0).write_text(json.dumps(about))
-    assert found(checked(store)) == {}
-
-
 @pytest.mark.parametrize(
     "chunk",
     ["plans/000000/sample_pass/c.0", "plans/000000/view/c.0.0", "base/cloud/face/c.0", "base/geometry/faces/c.0.0"],

@@ -72,27 +72,6 @@ def test_equal_halves_that_come_out_equal_when_they_are_rendered_again_are_noted
     assert (noted(report), report.exit_code, report.scenes[0].set_aside) == ({"same-again": 6}, 0, ())
 
 
-def test_equal_halves_are_set_aside_again_unless_all_that_a_repair_had_moved_has_come_out_the_same(
-    store: Store, scene: SceneStore
-) -> None:
-    """Another fault of the same job; and files that a repair which was killed had not moved yet, and a worker kept."""
-
-    def change(given: Any, of: int = 0) -> None:
-        given.radiance[0][:] = outputs(scene, 0).radiance[of][0]
-
-    recommitted(scene, 0, change)
-    assert checked(store, repair=True).exit_code == 7
-    samples.commit(scene, 0, outputs(scene, 0))
-    recommitted(scene, 0, lambda given: change(given, 1))
-    assert found(checked(store)) == {"equal-halves": 1, "equal-samples": 2}
-
-    recommitted(scene, 0, change)
-    (aside,) = (Path(store.root) / "quarantine").rglob(shard(scene, "radiance").relative_to(store.root).name)
-    assert noted(checked(store)) == {"same-again": 1}
-    aside.unlink()
-    assert found(checked(store)) == {"equal-halves": 1}
-
-
 def test_a_row_that_a_late_writer_needs_float32_for_and_another_does_not_is_noted_and_left_alone(
     store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:

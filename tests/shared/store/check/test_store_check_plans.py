@@ -44,26 +44,12 @@ def test_damaged_inputs_of_a_plan_are_found_and_what_is_rendered_is_checked_all_
     assert not shard_or_none(scene, "depth", 1)
 
 
-def test_what_is_damaged_or_missing_of_a_plan_is_named(store: Store, scene: SceneStore) -> None:
-    (view,) = (scene.folder / "plans/000000/view").glob("c.0*")
-    flip(view, view.stat().st_size - 1)
-    with pytest.raises(CorruptError, match=r"\bview\b") as caught:
-        SceneStore(scene.storage, scene.scene_id).plans()
-    assert "b'" not in str(caught.value)
-    (scene.folder / "plans/000000/radiance/zarr.json").unlink()
-    (group,) = checked(store).scenes[0].groups
-    assert len([finding for finding in group.first if "radiance/" in str(finding.file)]) == 1
-
-
 @pytest.mark.parametrize(
     ("old", "new"),
     [
         ('"jobs": 3', '"jobs": 4'),
         ("radiance_exponent", "radiance_exponenu"),
-        ('"light_samples": 3', '"light_samples": 4'),
         ('"seed": 0', '"seed": 1'),
-        ('"generator"', '"Generator"'),
-        ('"parts": 2', '"parts": 3'),
         ('"depth/zarr.json": "', '"depth/zarr.json": "f'),
         ('"checksums"', '"Checksums"'),
     ],
@@ -118,14 +104,7 @@ def test_a_plan_whose_keys_are_not_those_of_its_content_is_found(store: Store, s
     assert found(checked(store)) == {"plan": 1}
 
 
-def test_a_plan_that_is_missing_among_others_is_found(store: Store, scene: SceneStore) -> None:
-    scene.plan(Request(modifications=6, views_per_modification=2))
-    (scene.folder / "plans/000000").rename(Path(store.root).with_name("gone"))
-    assert "plan" in found(checked(store))
-
-
-@pytest.mark.parametrize("gone", ["000000", "000001", "000002"])
-@pytest.mark.parametrize("what", ["folder", "zarr.json"])
+@pytest.mark.parametrize(("gone", "what"), [("000000", "zarr.json"), ("000001", "folder"), ("000002", "zarr.json")])
 def test_a_plan_that_is_lost_is_told_and_none_of_its_jobs_is_set_aside(
     store: Store, scene: SceneStore, gone: str, what: str
 ) -> None:
@@ -172,7 +151,7 @@ def test_a_lost_last_plan_can_be_given_up_by_moving_its_markers_and_its_folder_a
     assert (found(checked(store)), data(scene)) == ({}, clean)
 
 
-@pytest.mark.parametrize("version", [1, 2, 3, 4, 6, None])
+@pytest.mark.parametrize("version", [4, 6, None])
 def test_a_plan_of_another_version_is_refused_in_a_sentence_by_all_who_load_it(
     store: Store, scene: SceneStore, version: int | None
 ) -> None:
@@ -307,17 +286,6 @@ def test_a_damaged_file_of_a_plan_is_written_again_from_the_request(
 
 def flipped(content: bytes) -> bytes:
     return content[:-1] + bytes([content[-1] ^ 1])
-
-
-def test_several_damaged_plans_are_written_again_in_their_order(store: Store, planned_thrice: SceneStore) -> None:
-    scene, clean = planned_thrice, data(planned_thrice)
-    for number in range(3):
-        for name in ("view", "sample_view", "sample_pass"):
-            (path,) = (scene.folder / f"plans/{number:06d}/{name}").glob("c.0*")
-            flip(path, 3)
-    report = checked(store, repair=True)
-    assert (found(report), report.exit_code, data(scene) == clean) == ({"plan-inputs": 9}, 7, True)
-    assert len(report.scenes[0].set_aside) == 3
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,13 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import checked_store as stores
 import numpy as np
 import pytest
 
-from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.check import check
 from photonfarm.store.model.quarantine import Quarantine
 
 scene, outputs = stores.scene, stores.outputs
@@ -47,36 +44,6 @@ def test_repair_sets_damaged_jobs_aside_with_a_record_and_rendering_them_again_g
     commit_all(scene)
     assert data(scene) == clean
     assert found(checked(store, repair=True)) == {}
-
-
-def test_workers_render_again_what_a_repair_has_set_aside_bit_for_bit_and_with_it_the_base(
-    store: Store, analytic: ModuleType
-) -> None:
-    from photonfarm.renderer.jobs.render import ShardRenderer
-
-    scene = store.scene(store.plan(analytic.small_spec(), Request(modifications=8), shard_rows=4).scene_id)
-    worker = ShardRenderer(store, worker="worker", load=analytic.AnalyticScene.load)
-    for job in scene.missing_jobs():
-        worker.render(scene.scene_id, job)
-    clean = data(scene)
-    flip(shard(scene, "radiance", 1), 20)
-    flip(next((scene.folder / "base/cloud/normal").glob("c.*")), 20)
-    assert checked(store, repair=True).scenes[0].set_aside == ("job 1", "base")
-    for job in scene.missing_jobs():
-        worker.render(scene.scene_id, job)
-    assert (data(scene), found(checked(store))) == (clean, {})
-
-
-def test_every_repair_has_a_folder_of_its_own_and_nothing_in_it_is_ever_replaced(
-    store: Store, scene: SceneStore
-) -> None:
-    folders = []
-    for _ in range(3):
-        flip(shard(scene, "depth", 1), 20)
-        folders.append(checked(store, repair=True).quarantine)
-        commit_all(scene)
-    assert folders == ["quarantine/000000", "quarantine/000001", "quarantine/000002"]
-    assert all(list((Path(store.root) / folder).rglob("c.1.0.0")) for folder in folders)
 
 
 def test_a_reader_goes_on_through_a_repair_and_sees_the_samples_come_back(store: Store, scene: SceneStore) -> None:
@@ -170,28 +137,6 @@ def test_two_repairs_at_once_set_each_job_aside_once(store: Store, scene: SceneS
     assert len(list(Path(store.root).glob("quarantine/*/scenes/*/committed/*.json"))) == 3
     commit_all(scene)
     assert (data(scene), found(checked(store))) == (clean, {})
-
-
-def test_a_job_that_another_repair_has_set_aside_meanwhile_is_no_error(
-    store: Store, scene: SceneStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Halves in common are found when all jobs have been checked, and their markers are read only then."""
-
-    def change(given: Any) -> None:
-        given.radiance[8][0] = outputs(scene, 0).radiance[2][1]
-
-    def racing(*given: Any) -> Any:
-        equal = list(plain(*given))
-        monkeypatch.setattr(check, "find_equal_samples", plain)
-        assert checked(store, repair=True).scenes[0].set_aside == ("job 0", "job 2")
-        return equal
-
-    recommitted(scene, 2, change)
-    plain = check.find_equal_samples
-    monkeypatch.setattr(check, "find_equal_samples", racing)
-    report = checked(store, repair=True)
-    assert (found(report), report.scenes[0].set_aside) == ({"equal-samples": 2}, ())
-    assert scene.missing_jobs() == [0, 2]
 
 
 def test_a_damaged_job_stays_where_it_is_until_its_plan_is_whole(store: Store, scene: SceneStore) -> None:

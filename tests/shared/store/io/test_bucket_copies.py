@@ -1,11 +1,7 @@
 """A bucket that is gone, and commits past copies of its objects on this machine that are damaged."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import obstore
 import pytest
 import store_samples as samples
@@ -14,7 +10,6 @@ from obstore.store import from_url
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
-from photonfarm.store.format import markers
 
 
 @pytest.fixture
@@ -73,64 +68,3 @@ def test_nothing_of_a_bucket_that_was_emptied_is_taken_for_missing(url: str, sto
 
 
 # ------------------------------------------------------------------------------------------------------ damaged copies
-
-
-def index(copy: Path) -> None:
-    """A damage that is seen when the copy is opened."""
-    content = bytearray(copy.read_bytes())
-    content[-7] ^= 1
-    copy.write_bytes(content)
-
-
-def checksum_of_a_row(copy: Path) -> None:
-    """A damage that is seen when a row is read; until then the file's own checksum is another one."""
-    row_bytes = 2 * 8 * 8 * 3 * 2
-    content = bytearray(copy.read_bytes())
-    content[row_bytes + 1] ^= 1
-    copy.write_bytes(content)
-
-
-def damage(scene: SceneStore, harm: Callable[[Path], None]) -> None:
-    """Harm this machine's copy of the radiance of job 1."""
-    copy = scene.storage.local(f"{scene.name}/plans/000000/radiance/c.1.0.0.0.0")
-    harm(copy)
-
-
-def read(url: str, scene: SceneStore) -> dict[int, np.ndarray]:
-    reader = SceneReader(url, scene.scene_id)
-    return {row: reader.read(row).radiance for row in reader.refresh().tolist()}
-
-
-@pytest.mark.parametrize("harm", [index, checksum_of_a_row])
-def test_a_marker_is_not_taken_back_for_a_copy_that_is_damaged_on_this_machine(
-    url: str, scene: SceneStore, harm: Callable[[Path], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Another worker announces the files of ours before we do, and our copies of them rot."""
-    another, place = Store(url).scene(scene.scene_id), markers.place_marker
-
-    def meanwhile(*about: Any) -> bool:
-        monkeypatch.setattr(markers, "place_marker", place)
-        assert samples.commit(another, 1, samples.outputs(another, 1))
-        damage(scene, harm)
-        return place(*about)
-
-    monkeypatch.setattr(markers, "place_marker", meanwhile)
-    assert not samples.commit(scene, 1, samples.outputs(scene, 1))
-    assert scene.storage.names("quarantine") == []
-    assert scene.missing_jobs() == []
-    for row, radiance in samples.outputs(scene, 1).radiance.items():
-        np.testing.assert_array_equal(read(url, scene)[row], radiance)
-
-
-@pytest.mark.parametrize("harm", [index, checksum_of_a_row])
-def test_whole_files_of_a_dead_writer_are_kept_though_their_copies_on_this_machine_are_damaged(
-    url: str, scene: SceneStore, harm: Callable[[Path], None]
-) -> None:
-    theirs = samples.outputs(scene, 1)
-    assert samples.commit(scene, 1, theirs)
-    obstore.delete(objects_below(url)[0], markers.marker_name(scene.name, 1))
-    damage(scene, harm)
-    ours = {row: halves + 1 for row, halves in theirs.radiance.items()}
-    assert samples.commit(scene, 1, replace(theirs, radiance=ours))
-    for row, radiance in theirs.radiance.items():
-        np.testing.assert_array_equal(read(url, scene)[row], radiance)

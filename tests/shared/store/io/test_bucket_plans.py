@@ -8,10 +8,8 @@ import store_samples as samples
 from bucket_samples import planned
 
 from photonfarm.farm.join import join
-from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.check.check import check_store
-from photonfarm.store.model.withdrawal import withdraw
 
 
 class KilledError(Exception):
@@ -49,15 +47,3 @@ def test_a_folder_is_joined_into_a_bucket_and_goes_on_where_it_was_cut_off(url: 
         np.testing.assert_array_equal(a.radiance, b.radiance)
         np.testing.assert_array_equal(a.guides.direct, b.guides.direct)
     assert check_store(Store(url), when="now").exit_code == 0
-
-
-def test_a_plan_in_a_bucket_is_withdrawn_and_its_spec_replaced(url: str) -> None:
-    scene = planned(url, modifications=3)
-    samples.commit(scene, 0, samples.outputs(scene, 0))
-    done = withdraw(scene)
-    assert (done.samples, done.rendered) == (1, 2)
-    store = Store(url)
-    planned_again = store.plan(samples.small_spec(exposure=8.0), Request(modifications=3))
-    assert (planned_again.new, planned_again.known) == (1, 2)
-    spec = Store(url).scene(scene.scene_id).spec
-    assert (spec.exposure, spec.radiance_exponent) == (8.0, 0)

@@ -4,11 +4,9 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import bucket_samples
 import obstore
 import pytest
 import s3_server
-import store_samples as samples
 from obstore.store import from_url
 
 from photonfarm.store.format import markers
@@ -83,17 +81,6 @@ def test_what_a_repair_removes_is_seen_after_a_doubt_or_a_while(url: str) -> Non
     remove(url, 1)
     clock.now += WHOLE_S
     assert followed.look() == {0, 3, 4}
-
-
-def test_a_scene_can_be_asked_often_what_is_missing_and_how_far_it_is(url: str) -> None:
-    scene = bucket_samples.planned(url, modifications=4)
-    assert (scene.missing_jobs(followed=True), scene.progress(followed=True).committed_samples) == ([0, 1], 0)
-    for job in (1, 0):
-        assert samples.commit(scene, job, samples.outputs(scene, job))
-        assert scene.missing_jobs(followed=True) == scene.missing_jobs()
-        assert scene.progress(followed=True) == scene.progress()
-    remove(url, 1, scene.name)
-    assert (scene.missing_jobs(followed=True), scene.missing_jobs()) == ([], [1])
 
 
 def test_in_a_folder_every_look_sees_all(tmp_path: Path) -> None:

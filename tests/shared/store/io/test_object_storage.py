@@ -8,11 +8,8 @@ import numpy as np
 import obstore
 import pytest
 import store_samples as samples
-import zarr
-from obstore.store import from_url
-from zarr.storage import ObjectStore
 
-from photonfarm.core.errors import CorruptError, StoreError
+from photonfarm.core.errors import CorruptError
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, Store, store_status
 
@@ -45,22 +42,6 @@ def test_what_is_committed_reads_back_and_is_counted(place: str | Path) -> None:
     (status,) = store_status(Store(place))
     assert (status.samples_planned, status.samples_complete, status.jobs_committed) == (2, 2, 1)
     assert status.size_bytes == sum(scene.storage.size(f"{scene.name}/{name}") for name in scene.marker(0)["files"])
-
-
-def test_a_reader_waits_for_store_scene_plan_and_samples(place: str | Path) -> None:
-    spec = samples.small_spec()
-    reader = SceneReader(place, spec.scene_id)
-    assert reader.refresh().size == 0
-    store = Store(place, create=True)
-    assert (store.scenes(), reader.refresh().size) == ([], 0)
-    store.add(spec)
-    assert reader.refresh().size == 0
-    with pytest.raises(StoreError):
-        reader.base()
-    scene = planned(place)
-    assert reader.refresh().size == 0
-    samples.commit_all(scene)
-    assert reader.refresh().tolist() == [0]
 
 
 def test_racing_submitters_plan_every_sample_once(place: str | Path) -> None:
@@ -96,18 +77,6 @@ def test_racing_writers_leave_one_commit_that_its_marker_describes(place: str | 
         assert scene.storage.size(f"{scene.name}/{name}") == about["size"]
 
 
-def test_a_damaged_file_that_a_dead_writer_left_is_replaced(place: str | Path) -> None:
-    scene = planned(place, modifications=2)
-    part = scene.storage.part()
-    part.write_bytes(b"half a shard")
-    assert scene.storage.adopt(part, f"{scene.name}/plans/000000/radiance/c.0.0.0.0.0")
-    given = samples.outputs(scene, 0)
-    assert samples.commit(scene, 0, given)
-    reader = SceneReader(place, scene.scene_id)
-    reader.refresh()
-    np.testing.assert_array_equal(reader.read(1).radiance, given.radiance[1])
-
-
 def test_files_and_folders_can_be_set_aside_and_written_anew(place: str | Path) -> None:
     scene = planned(place)
     scene.write_base(*samples.base())
@@ -130,17 +99,6 @@ def test_files_and_folders_can_be_set_aside_and_written_anew(place: str | Path) 
 
 
 # ---------------------------------------------------------------------------------------------------------- the bucket
-
-
-def test_zarr_python_reads_a_plan_out_of_the_bucket(url: str) -> None:
-    scene = planned(url, modifications=2)
-    given = samples.outputs(scene, 0)
-    samples.commit(scene, 0, given)
-    bucket = from_url(f"{url}/{scene.name}/plans/000000", client_options={"allow_http": True})
-    plan = zarr.open_group(ObjectStore(bucket, read_only=True), mode="r")
-    assert {"radiance", "depth", "photon_power", "sample_key"} <= set(plan.array_keys())
-    np.testing.assert_array_equal(plan["radiance"][1].astype(np.float32), given.radiance[1])
-    np.testing.assert_array_equal(plan["depth"][:], np.stack([given.buffers[row].depth for row in (0, 1)]))
 
 
 def test_a_bucket_that_has_lost_the_store_s_document_or_a_spec_is_refused_and_told(url: str) -> None:

@@ -9,14 +9,10 @@ import numpy as np
 import pytest
 import store_samples as samples
 
-from photonfarm.core.errors import CorruptError
-from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.io import object_cache
 from photonfarm.store.io.objects import ObjectStorage
-from photonfarm.store.model.findings import Cause
-from photonfarm.store.read.find import Query, find_samples
 
 planned, put = bucket_samples.planned, bucket_samples.put
 
@@ -65,15 +61,7 @@ def the_index(path: Path) -> None:
     path.write_bytes(content)
 
 
-def the_end(path: Path) -> None:
-    path.write_bytes(path.read_bytes()[:-1])
-
-
-def all_of_it(path: Path) -> None:
-    path.write_bytes(bytes(path.stat().st_size))
-
-
-HARMS = (a_row, the_index, the_end, all_of_it)
+HARMS = (a_row, the_index)
 
 
 @pytest.fixture
@@ -125,59 +113,6 @@ def test_a_copy_that_is_damaged_on_this_machine_is_no_damage_of_the_store(
     assert (report.scenes[0].jobs, report.scenes[0].samples) == (2, 4), "none is counted twice"
     assert scene.missing_jobs() == []
     assert scene.storage.names("quarantine") == []
-
-
-@pytest.mark.parametrize("harm", HARMS[1:])
-def test_what_is_looked_up_is_there_though_its_copy_on_this_machine_is_damaged(
-    url: str, harmed: Callable[..., SceneStore], harm: Callable[[Path], None]
-) -> None:
-    scene = harmed(harm)
-    (sample,) = find_samples(Store(url), [scene.scene_id], Query.of(row=0)).samples
-    assert all(place.there for place in sample.places)
-
-
-def test_an_object_that_is_damaged_in_the_bucket_is_fetched_once_more_and_found(url: str) -> None:
-    scene = planned(url, modifications=4)
-    scene.write_base(*samples.base())
-    samples.commit_all(scene)
-    name = f"{scene.name}/plans/000000/radiance/c.0.0.0.0.0"
-    content = bytearray(scene.storage.read(name))
-    content[10] ^= 1
-    put(scene.storage, bytes(content), name, replace=True)
-    reader = SceneReader(url, scene.scene_id)
-    reader.refresh()
-    with pytest.raises(CorruptError):
-        reader.read(0)
-    report = check_store(Store(url), when="now", repair=True)
-    assert [group.cause for group in report.scenes[0].groups] == [Cause.CHECKSUM]
-    assert report.scenes[0].set_aside == ("job 0",)
-    assert scene.missing_jobs() == [0]
-
-
-def test_a_damaged_plan_in_the_bucket_is_written_again_from_its_request(url: str) -> None:
-    scene = planned(url, modifications=4)
-    scene.write_base(*samples.base())
-    samples.commit_all(scene)
-    name = f"{scene.name}/plans/000000/view/c.0.0"
-    whole = scene.storage.read(name)
-    put(scene.storage, whole[:-1] + bytes([whole[-1] ^ 1]), name, replace=True)
-    report = check_store(Store(url), when="now", repair=True)
-    assert (report.exit_code, [group.cause for group in report.scenes[0].groups]) == (7, [Cause.PLAN_INPUTS])
-    assert scene.storage.read(name) == whole
-    assert scene.storage.exists(f"{report.quarantine}/{name}")
-    assert check_store(Store(url), when="now").exit_code == 0
-
-
-def test_a_claim_is_completed_from_the_bucket_and_not_from_a_damaged_copy(url: str) -> None:
-    scene = planned(url, modifications=2)
-    claim, folder = f"{scene.name}/plans/000001.claim", f"{scene.name}/plans/000001"
-    scene.plan(Request(modifications=4))
-    all_of_it(scene.storage.local(claim))
-    scene.storage.move(f"{folder}/zarr.json", "aside")
-    part = scene.storage.part()
-    part.mkdir()
-    assert not scene.storage.adopt_folder(part, folder)
-    assert scene.storage.read(f"{folder}/zarr.json") == scene.storage.read("aside")
 
 
 def test_a_copy_that_fails_half_way_is_not_there(tmp_path: Path) -> None:

@@ -77,15 +77,6 @@ def test_two_writers_of_which_one_replaces_what_the_other_kept_announce_what_is_
         np.testing.assert_array_equal(reader.read(row).radiance, ours.radiance[row])
 
 
-def test_a_commit_that_meets_nobody_reads_nothing_back(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    scene.plan(Request(modifications=8))
-    local = scene.storage.local
-    read: list[str] = []
-    monkeypatch.setattr(scene.storage, "local", lambda name: read.append(name) or local(name))
-    assert samples.commit(scene, 1, samples.outputs(scene, 1))
-    assert read == []
-
-
 @pytest.fixture
 def another(scene: SceneStore) -> SceneStore:
     """The scene as another worker sees it, with a job 1 that is planned and not committed."""

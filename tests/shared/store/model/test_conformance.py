@@ -3,7 +3,6 @@
 import shutil
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -174,11 +173,3 @@ def test_the_example_of_the_page_reads_the_store(store: Store) -> None:
     assert len(lines) == 28 + 3 + 2
     assert not any("nan" in line for line in lines)
     assert sum(float(line.split()[-2]) > 1e6 for line in lines) == len(WIDE_ROWS)
-
-
-def test_tensorstore_is_needed_by_tests_only() -> None:
-    about = tomllib.loads((ROOT / "pyproject.toml").read_text())
-    extras = about["project"]["optional-dependencies"].values()
-    needed = [*about["project"]["dependencies"], *(name for extra in extras for name in extra)]
-    assert not [name for name in needed if name.startswith("tensorstore")]
-    assert "tensorstore" in about["dependency-groups"]["test"]

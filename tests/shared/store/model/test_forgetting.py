@@ -9,13 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import store_samples as samples
-from click.testing import CliRunner
 
-from photonfarm.cli.store_verbs import forget as verb
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.request import Request
-from photonfarm.queue.failures import count_failures, keep_failure
-from photonfarm.queue.job import job_name
 from photonfarm.store import JobWriter, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
@@ -133,14 +129,6 @@ def test_who_read_it_before_reads_nothing_of_what_is_planned_anew(
             reader.read(row)
 
 
-def test_its_failures_are_forgotten_and_those_of_others_are_not(store: Store, scene: SceneStore) -> None:
-    (other,) = (each for each in store.scenes() if each.scene_id != scene.scene_id)
-    for each in (scene, other):
-        keep_failure(store, job_name(each.scene_id, 0), "IncompleteError: no", worker="w1")
-    forget(Store(store.root), scene.scene_id)
-    assert count_failures(store) == {job_name(other.scene_id, 0): 1}
-
-
 @pytest.mark.parametrize("point", range(1, 12))
 def test_killed_at_any_point_nothing_half_is_taken_for_a_sample(store: Store, scene: SceneStore, point: int) -> None:
     clean = {row: samples.reader_of(scene).read(row).radiance for row in range(4)}
@@ -163,15 +151,3 @@ def test_killed_at_any_point_nothing_half_is_taken_for_a_sample(store: Store, sc
     samples.commit_all(again)
     assert samples.reader_of(again).rows.tolist() == [0, 1]
     assert check_store(opened, when="now").exit_code == 0
-
-
-def test_the_verb_asks_and_without_a_terminal_wants_yes(store: Store, scene: SceneStore) -> None:
-    arguments = ["--store", str(store.root), "--scene", "small"]
-    refused = CliRunner().invoke(verb, arguments)
-    assert refused.exit_code == 2
-    assert "of which 4 of 4 planned samples are rendered" in refused.output
-    assert "--yes is required" in refused.output
-    assert Store(store.root).has_scene(scene.scene_id)
-    done = CliRunner().invoke(verb, [*arguments, "--yes"])
-    assert done.exit_code == 0, done.output
-    assert f"scene {scene.scene_id} is forgotten, with 2 rendered jobs" in done.output

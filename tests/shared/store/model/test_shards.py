@@ -247,26 +247,6 @@ def test_a_read_that_the_disk_refuses_is_damage_and_names_the_file(
         Shard(path, array, SHARD_ROWS).read(0)
 
 
-def test_checksums_that_the_disk_refuses_are_damage(
-    noise: tuple[Path, ArraySchema, dict[int, Any]], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    path, array, _ = noise
-    shard = Shard(path, array, SHARD_ROWS)
-    monkeypatch.setattr(os, "preadv", lambda *_: (_ for _ in ()).throw(OSError(errno.EIO, "Input/output error")))
-    with pytest.raises(CorruptError):
-        shard.summary()
-
-
-def test_a_folder_in_place_of_a_file_is_damage(tmp_path: Path) -> None:
-    """A read that really fails."""
-    folder = tmp_path / "shard"
-    folder.mkdir()
-    for n in range(20):  # of more bytes than an index has
-        (folder / f"{n:0200d}").touch()
-    with pytest.raises(CorruptError):
-        Shard(folder, array_of("<f2", (2,), compressed=False), SHARD_ROWS)
-
-
 @pytest.mark.parametrize(("number", "raised"), [(errno.EIO, CorruptError), (errno.EMFILE, OSError)])
 def test_only_a_disk_makes_a_file_that_cannot_be_opened_damaged(
     noise: tuple[Path, ArraySchema, dict[int, Any]],

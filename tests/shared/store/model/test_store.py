@@ -1,6 +1,5 @@
 """What is committed comes back, whole or not at all, while the store grows."""
 
-import json
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -143,16 +142,6 @@ def test_a_job_is_committed_once_and_the_first_one_stays(scene: SceneStore) -> N
     assert {p: p.read_bytes() for p in scene.folder.rglob("*") if p.is_file()} == before
 
 
-def test_two_writers_of_one_job_leave_one_complete_job(scene: SceneStore) -> None:
-    """The second starts after the first has linked its files, but before its marker."""
-    assert samples.commit(scene, 0, samples.outputs(scene, 0))
-    marker = scene.folder / "committed/000000000000.json"
-    described = json.loads(marker.read_text())["files"]
-    marker.unlink()
-    assert samples.commit(scene, 0, samples.outputs(scene, 0))
-    assert json.loads(marker.read_text())["files"] == described
-
-
 def test_files_that_a_dead_writer_left_without_a_row_are_replaced(scene: SceneStore) -> None:
     """Its row 1 was to lie in radiance_wide; rendered again, it fits float16."""
     theirs, ours = samples.outputs(scene, 0), samples.outputs(scene, 0)
@@ -174,15 +163,6 @@ def test_a_whole_render_that_a_dead_writer_left_is_kept_and_described(scene: Sce
     assert samples.commit(scene, 0, samples.outputs(scene, 0))
     assert scene.marker(0)["files"] == files
     assert reader_of(scene).read(1).radiance[0, 0, 0, 0] == np.float32(1e9)
-
-
-def test_plans_are_loaded_once_by_a_store(store: Store, scene: SceneStore) -> None:
-    assert store.scene(scene.scene_id).plans()[0] is store.scenes()[0].plans()[0]
-
-
-def test_a_store_that_is_just_being_made_holds_no_scenes(store: Store) -> None:
-    looked_at = Store(store.root)
-    assert (looked_at.scenes(), looked_at.sweep()) == ([], 0)
 
 
 def test_a_marker_tells_the_files_and_the_figures(scene: SceneStore) -> None:
@@ -254,18 +234,6 @@ def test_a_scene_without_photons_stores_none(store: Store) -> None:
     assert not list(scene.folder.rglob("photon_*"))
     with pytest.raises(StoreError):
         reader_of(scene).read_photons(0)
-
-
-def test_photons_that_all_are_empty_slots_are_stored_as_such(scene: SceneStore) -> None:
-    given = samples.outputs(scene, 0)
-    for photons in given.photons.values():
-        for array in arrays_of(photons).values():
-            array[...] = 0
-        photons.bounce[...] = -1
-    samples.commit(scene, 0, given)
-    read = reader_of(scene).read_photons(0)
-    assert (read.bounce == -1).all()
-    assert (read.power == 0).all()
 
 
 def test_the_status_counts_samples_jobs_bytes_and_core_seconds(store: Store, scene: SceneStore) -> None:

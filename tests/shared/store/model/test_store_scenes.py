@@ -1,16 +1,13 @@
 """What is wrong with one scene of a store stays with it, and what is wrong with the store is told as that."""
 
 import logging
-import re
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 import store_samples as samples
-from click.testing import CliRunner
 
-from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
@@ -120,27 +117,6 @@ def test_what_is_no_scene_of_ours_among_the_scenes_is_ignored_by_all(store: Stor
     assert (report.exit_code, [about.scene_id for about in report.scenes]) == (0, [scene.scene_id])
 
 
-def test_status_tells_markers_of_jobs_that_no_plan_has(store: Store) -> None:
-    scene = planned(store)
-    scene.plan(Request(modifications=6))
-    samples.commit_all(scene)
-    words = ["status", "--store", str(store.root), "--redis", "redis://127.0.0.1:1/0"]
-    assert CliRunner().invoke(umbrella, words).exit_code == 0
-    shutil.rmtree(scene.folder / "plans/000001")
-    told = CliRunner().invoke(umbrella, words)
-    assert isinstance(told.exception, StoreError)
-    for said in (told.stdout, str(told.exception)):
-        assert "1 of 3 markers" in said
-    assert "3/2" in told.stdout
-
-
-def test_a_damaged_plan_s_error_says_what_mends_it(store: Store) -> None:
-    scene = planned(store)
-    flip(scene.folder / "plans/000000/view/c.0.0")
-    with pytest.raises(CorruptError, match="store check --repair"):
-        Store(store.root).scene(scene.scene_id).plans()
-
-
 def test_a_store_that_cannot_be_read_is_no_error_of_its_scenes(
     store: Store, redis_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -218,11 +194,6 @@ def test_nothing_of_a_store_that_is_gone_is_taken_for_missing(
     assert not store.root.exists() if go is removed else not list(store.root.iterdir())
 
 
-def test_a_store_without_scenes_or_temporary_files_is_there(store: Store) -> None:
-    shutil.rmtree(store.root / "tmp", ignore_errors=True)
-    assert (Store(store.root).scene_ids(), store_status(store), store.sweep()) == ([], [], 0)
-
-
 def test_scenes_without_the_store_s_document_are_refused_with_advice_and_never_adopted(store: Store) -> None:
     """A new document would have another id."""
     planned(store)
@@ -235,11 +206,3 @@ def test_scenes_without_the_store_s_document_are_refused_with_advice_and_never_a
     assert not document.exists()
     document.write_bytes(whole)
     assert Store(store.root, create=True).store_id == store.store_id
-
-
-@pytest.mark.parametrize("content", ["", "{}", "[]"])
-def test_a_format_file_that_is_empty_says_what_it_should_hold(store: Store, content: str) -> None:
-    (store.root / "photonfarm.json").write_text(content)
-    said = re.escape('{"format": "photonfarm store", "version": 5')
-    with pytest.raises(CorruptError, match=said):
-        Store(store.root)

@@ -1,15 +1,12 @@
 """What is planned and not rendered is withdrawn; what is rendered stays."""
 
 import json
-import shutil
 import threading
 
 import numpy as np
 import pytest
 import store_samples as samples
-from click.testing import CliRunner
 
-from photonfarm.cli.store_verbs import withdraw as verb
 from photonfarm.core.errors import CorruptError, SpecError
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
@@ -136,13 +133,6 @@ def test_without_a_number_it_is_the_last_plan_that_has_something_to_withdraw(sce
     assert (done.plan, done.samples, withdraw(scene).left) == (2, 1, "not rendered yet: none")
 
 
-def test_what_rendered_samples_of_a_later_plan_lean_on_stays_planned(scene: SceneStore) -> None:
-    scene.plan(TopUp.of("+8", ["rows=2-3"]))
-    assert samples.commit(scene, 4, samples.outputs(scene, 4))
-    done = withdraw(scene)
-    assert (done.plan, done.samples, done.kept) == (0, 2, 2)
-
-
 def test_rows_of_withdrawn_jobs_are_unused(scene: SceneStore) -> None:
     withdraw(scene)
     (plan,) = fresh(scene).plans()
@@ -157,14 +147,6 @@ def test_rows_of_withdrawn_jobs_are_unused(scene: SceneStore) -> None:
         fresh(scene).plans()
 
 
-def test_the_verb_says_what_it_has_done(scene: SceneStore) -> None:
-    said = CliRunner().invoke(verb, ["--store", str(scene.storage.where), "--scene", "small"])
-    assert said.exit_code == 0, said.output
-    assert "4 samples in 2 jobs are forgotten; 4 are rendered and stay" in said.output
-    again = CliRunner().invoke(verb, ["--store", str(scene.storage.where), "--scene", "small"])
-    assert "nothing is left to withdraw; 4 are rendered and stay" in again.output
-
-
 def test_processes_that_follow_see_each_withdrawal_of_a_plan(scene: SceneStore) -> None:
     reader, other = samples.reader_of(scene), fresh(scene)
     other.plans()
@@ -175,11 +157,3 @@ def test_processes_that_follow_see_each_withdrawal_of_a_plan(scene: SceneStore) 
         assert other.missing_jobs() == sorted({1, 3} - jobs)
     assert samples.commit(other, 1, samples.outputs(other, 1))
     assert reader.refresh().tolist() == [2, 3]
-
-
-def test_a_base_that_is_lost_is_written_by_a_job_that_is_left(scene: SceneStore) -> None:
-    withdraw(scene)
-    shutil.rmtree(scene.folder / "base")
-    report = check_store(Store(scene.storage.where), when="now", repair=True)
-    assert report.exit_code == 7
-    assert fresh(scene).missing_jobs() == [2]

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, StoreError
-from photonfarm.core.statistics import clean_error
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
 from photonfarm.store import SceneReader, SceneStore, Store
@@ -77,31 +76,6 @@ def test_what_float64_would_lose_between_a_huge_and_a_tiny_value_is_kept() -> No
     assert merged.m2[0, 0, 1] == truth(passes, 1)[1]
 
 
-def test_a_variance_far_below_the_mean_is_not_lost() -> None:
-    """Σx² − (Σx)²/n in float64 would be off by all of it: the values differ in the last bit of 24."""
-    passes = passes_of([16777215.0, 16777214.0, 16777215.0, 16777214.0])
-    assert moments_of(passes).merged().m2[0, 0, 1] == 1.0
-
-
-def test_an_image_of_many_blocks_agrees_with_numpy_to_its_own_rounding() -> None:
-    rng = np.random.default_rng(3)
-    passes = [rng.exponential(1, (2, 120, 160, 3)).astype(np.float16).astype(np.float32) for _ in range(4)]
-    merged, all_halves = moments_of(passes).merged(), np.concatenate(passes).astype(np.float64)
-    np.testing.assert_allclose(merged.mean, all_halves.mean(0), rtol=1e-14)
-    np.testing.assert_allclose(merged.standard_error, all_halves.std(0, ddof=1) / np.sqrt(8), rtol=1e-11)
-    np.testing.assert_allclose(merged.half_b, np.mean([p[1] for p in passes], axis=0, dtype=np.float64), rtol=1e-14)
-
-
-def test_the_merged_halves_are_two_independent_estimates_for_the_error_against_the_clean_image() -> None:
-    """Standard normal noise, 4 passes, 30 000 values: the error against the clean image is 0 ± σ²/4/√30000, 4 sigma."""
-    rng = np.random.default_rng(4)
-    merged = moments_of([rng.normal(5, 1, (2, 100, 100, 3)).astype(np.float32) for _ in range(4)]).merged()
-    clean = np.full((100, 100, 3), 5, np.float32)
-    bound = 4 * 0.25 / np.sqrt(30_000)
-    assert abs(clean_error(clean, merged.half_a, merged.half_b)) < bound
-    assert abs(clean_error(clean, merged.half_a, merged.half_a)) > bound
-
-
 def test_what_cannot_be_merged_is_refused() -> None:
     moments = moments_of(passes_of([1.0, 2.0]))
     not_finite, other_size = np.full((2, 1, 1, 3), np.inf, np.float32), np.zeros((2, 2, 1, 3), np.float32)
@@ -150,11 +124,6 @@ def test_passes_in_float16_and_in_float32_merge_alike(scene: SceneStore) -> None
     others = [samples.values(int(row), (2, 8, 8, 3)) for row in reader_of(scene).rows_of_view(1) if row != 1]
     assert_equal(merged, moments_of([row_values, *others]).merged())
     assert merged.half_a[2, 3, 1] > 2e8
-
-
-def test_a_view_without_a_complete_pass_is_a_store_error(scene: SceneStore) -> None:
-    with pytest.raises(StoreError):
-        merge_view(reader_of(scene), 1)
 
 
 def test_a_merged_view_is_written_and_read_back(scene: SceneStore, tmp_path: Path) -> None:

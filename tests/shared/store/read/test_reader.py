@@ -109,30 +109,6 @@ def test_rows_that_are_not_complete_are_refused_before_anything_is_read(source: 
     assert (memory.radiance == 7).all()
 
 
-def test_more_samples_than_there_is_memory_for_are_refused(source: SceneReader) -> None:
-    with pytest.raises(ValueError, match="batch of 2"):
-        source.read_batch([0, 1, 2], Batch.empty(source.spec, 2))
-
-
-def test_no_samples_are_an_empty_batch(source: SceneReader) -> None:
-    assert len(source.read_batch([])) == 0
-
-
-def test_a_bit_that_flips_while_batches_are_read_is_found(scene: SceneStore, source: SceneReader) -> None:
-    memory = Batch.empty(source.spec, 8)
-    for _ in range(3):
-        source.read_batch(range(8), memory)
-    for name in ("radiance", "depth"):
-        path = scene.storage.local(f"{scene.name}/plans/000000/{name}/c.0{'.0' * (4 if name == 'radiance' else 2)}")
-        whole = path.read_bytes()
-        with path.open("r+b") as file:
-            file.seek(40)
-            file.write(bytes([whole[40] ^ 4]))
-        with pytest.raises(CorruptError):
-            source.read_batch(range(8), memory)
-        path.write_bytes(whole)
-
-
 def test_no_more_files_stay_open_than_are_allowed(source: SceneReader, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(shards, "OPEN_SHARDS", 3)
     descriptors = Path("/proc/self/fd")

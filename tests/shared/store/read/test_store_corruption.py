@@ -93,19 +93,6 @@ def test_a_flipped_bit_in_the_base_is_found(scene: SceneStore) -> None:
     assert_is_found(scene, "base")
 
 
-def test_a_spec_that_was_changed_in_place_is_found(scene: SceneStore) -> None:
-    file = scene.folder / "spec.json"
-    file.write_text(file.read_text().replace('"half_spp": 4', '"half_spp": 5'))
-    assert_is_found(scene, r"spec\.json")
-
-
-def test_a_marker_of_a_job_that_no_plan_has_makes_nothing_complete(scene: SceneStore) -> None:
-    (scene.folder / "committed/000000000007.json").write_text("{}")
-    reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
-    assert reader.refresh().tolist() == [0, 1, 2, 3]
-    assert scene.missing_jobs() == []
-
-
 def test_files_without_a_marker_are_not_samples_and_damaged_ones_are_replaced_by_the_next_commit(
     scene: SceneStore,
 ) -> None:

@@ -4,8 +4,6 @@ import json
 import shlex
 import subprocess
 import sys
-import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ from click.testing import CliRunner
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import arrays_of
-from photonfarm.plan.request import PlannedRows, Request
+from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.read.find import Matches, Query, find_samples, scene_named
 
@@ -53,13 +51,6 @@ def present(scene: SceneStore) -> int:
     """A modification row whose object is there."""
     vectors = scene.plans()[0].rows.modification
     return int(np.flatnonzero(vectors[:, 0, 3] == 1)[-1])
-
-
-def test_without_a_condition_every_sample_is_found(store: Store, scene: SceneStore) -> None:
-    every = find(store)
-    assert every.count == 24
-    assert sorted(rows(every)) == [*range(24)]
-    assert (find(store, limit=5).count, len(find(store, limit=5).samples)) == (24, 5)
 
 
 def test_a_modification_is_found_by_its_vector_with_all_its_views_and_passes(store: Store, scene: SceneStore) -> None:
@@ -166,10 +157,6 @@ def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene:
     assert find_samples(store, [other.scene_id], Query()).count == 0
 
 
-def test_a_vector_for_another_number_of_objects_fits_nothing(store: Store, scene: SceneStore) -> None:
-    assert find(store, modification="0 0 0 1 0 0 0 1", tolerance=100).count == 0
-
-
 @pytest.mark.parametrize(
     "query",
     [
@@ -185,24 +172,6 @@ def test_a_vector_for_another_number_of_objects_fits_nothing(store: Store, scene
 def test_what_is_neither_key_nor_vector_is_refused(query: dict[str, str]) -> None:
     with pytest.raises(SpecError, match=f"--{next(iter(query))}"):
         Query.of(**query)
-
-
-def test_half_a_million_samples_are_searched_at_once(store: Store, scene: SceneStore) -> None:
-    """0.1 s here; one by one it would be 10."""
-    count, rng = 500_000, np.random.default_rng(0)
-    large = PlannedRows.empty(count, 1)
-    large.modification[:] = rng.random((count, 1, 4), np.float32)
-    large.modification[..., 3] = 1
-    large.view[:] = rng.random((count, 6), np.float32)
-    large.sample_modification[:] = large.sample_view[:] = np.arange(count)
-    large.sample_pass[:] = 0
-    large.sample_key[:] = rng.integers(0, 256, (count, 16), np.uint8)
-    scene._plans[:] = [replace(scene.plans()[0], request=Request(), jobs=count // 4, rows=large)]
-    scene.plans = lambda: scene._plans
-    began = time.process_time()
-    assert rows(find(store, modification=text(large.modification[123_456]), tolerance=0)) == [123_456]
-    assert rows(find(store, sample=large.sample_key[499_999].tobytes().hex())) == [499_999]
-    assert time.process_time() - began < 3
 
 
 def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: SceneStore) -> None:

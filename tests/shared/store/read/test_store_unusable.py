@@ -48,17 +48,6 @@ def test_a_disk_that_is_full_in_the_middle_is_a_store_error_and_leaves_no_trace(
     assert reader_of(scene).read(0).radiance.shape == (2, 8, 8, 3)
 
 
-def test_a_commit_that_the_disk_refuses_is_a_store_error_and_leaves_the_job_missing(scene: SceneStore) -> None:
-    given = samples.outputs(scene, 0)
-    scene.storage.local("tmp").rename(scene.folder / "elsewhere")
-    scene.storage.local("tmp").write_text("a file where the folder should be")
-    with pytest.raises(StoreError):
-        samples.commit(scene, 0, given)
-    scene.storage.local("tmp").unlink()
-    assert scene.missing_jobs() == [0, 1, 2]
-    assert samples.commit(scene, 0, given)
-
-
 def test_a_disk_that_turns_read_only_in_the_middle_of_a_job_is_a_store_error(
     scene: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,21 +63,6 @@ def test_a_disk_that_turns_read_only_in_the_middle_of_a_job_is_a_store_error(
             samples.commit(scene, 0, samples.outputs(scene, 0))
     assert scene.missing_jobs() == [0, 1, 2]
     assert samples.commit(scene, 0, samples.outputs(scene, 0))
-
-
-def test_a_leftover_file_on_a_bad_sector_is_replaced(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert samples.commit(scene, 0, samples.outputs(scene, 0))
-    (scene.folder / "committed/000000000000.json").unlink()
-    bad, preadv = (scene.folder / "plans/000000/radiance/c.0.0.0.0.0").stat().st_ino, os.preadv
-
-    def failing(descriptor: int, *rest: Any) -> int:
-        if os.fstat(descriptor).st_ino == bad:
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-        return preadv(descriptor, *rest)
-
-    monkeypatch.setattr(os, "preadv", failing)
-    assert samples.commit(scene, 0, samples.outputs(scene, 0))
-    assert reader_of(scene).read(0).row == 0
 
 
 # ------------------------------------------------------------------------------------------------- plans that are lost
@@ -136,33 +110,4 @@ def test_no_plan_takes_the_number_of_jobs_that_are_committed(store: Store, scene
     assert not (scene.folder / "plans/000001").exists()
 
 
-def test_a_plan_that_is_claimed_and_not_written_yet_is_not_there_yet(store: Store, scene: SceneStore) -> None:
-    """A plan may lie so in a bucket for a moment."""
-    (scene.folder / "plans/000001/view").mkdir(parents=True)
-    (scene.folder / "plans/000001.claim").write_bytes(b"")
-    (scene.folder / "plans/7").mkdir()  # not a plan's name
-    assert len(scene_of(store).plans()) == 1
-    assert reader_of(scene).planned == 10
-
-
 # ----------------------------------------------------------------------------------------------------------- sweeping
-
-
-def test_a_part_that_cannot_be_removed_is_left_alone_and_not_counted(
-    store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One of another user, say, whose folder is not ours to empty."""
-    theirs, ours = store.storage.part(), store.storage.part()
-    for part in (theirs, ours):
-        part.mkdir()
-        os.utime(part, (1, 1))
-    remove = shutil.rmtree
-
-    def refusing(path: Path, *rest: Any, **options: Any) -> None:
-        if path == theirs:
-            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-        remove(path, *rest, **options)
-
-    monkeypatch.setattr(shutil, "rmtree", refusing)
-    assert store.sweep() == 1
-    assert (theirs.exists(), ours.exists()) == (True, False)

@@ -13,9 +13,9 @@ from exports import BRIGHT, FORMATS, exported, planned, read, several
 
 from photonfarm.cli.main import main
 from photonfarm.data import Sample, open_scene
-from photonfarm.export.columns import format_ranges, parse_ranges, parse_rows
 from photonfarm.export.export import export_scene
 from photonfarm.export.folder import ExportRequest
+from photonfarm.export.snapshot import format_ranges, parse_ranges, parse_rows
 from photonfarm.store import SceneStore
 
 GUIDES = tuple(samples.guides(samples.small_spec(), 0).__dataclass_fields__)

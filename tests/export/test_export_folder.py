@@ -11,7 +11,7 @@ import store_samples as samples
 from exports import FORMATS, commit, exported, planned, read, several
 
 from photonfarm.core.errors import CorruptError, IncompleteError, SpecError, StoreError
-from photonfarm.export.columns import parse_rows
+from photonfarm.export.snapshot import parse_rows
 from photonfarm.store import SceneStore
 
 # --------------------------------------------------------------------------------------------- going on, and growing
@@ -37,7 +37,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(file.relative_to(folder)): b"" if file.suffix == ".npz" else file.read_bytes() for file in files}
 
 
-@pytest.mark.parametrize("to", ("webdataset", "exr"))
+@pytest.mark.parametrize("to", ["webdataset", "exr"])
 def test_a_killed_export_goes_on_and_ends_as_if_it_had_not_been_killed(
     scene: SceneStore, tmp_path: Path, to: str
 ) -> None:

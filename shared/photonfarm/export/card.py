@@ -13,9 +13,8 @@ from typing import Any
 from photonfarm.core.errors import store_errors
 from photonfarm.core.files import write_whole
 from photonfarm.core.formatting import format_markdown_table
-from photonfarm.export.columns import Column, Contents
 from photonfarm.export.folder import DATA, FormatName, Manifest
-from photonfarm.export.snapshot import Snapshot
+from photonfarm.export.snapshot import Column, Contents, Snapshot
 
 CARD = "README.md"
 

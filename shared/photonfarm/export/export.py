@@ -14,19 +14,21 @@ from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.export import card, folder
 from photonfarm.export.card import Exported
-from photonfarm.export.columns import (
+from photonfarm.export.folder import ExportRequest, ExportSettings, Files, Manifest, Part, SceneName
+from photonfarm.export.formats import Format, load_format
+from photonfarm.export.snapshot import (
     GUIDES,
     Column,
     Contents,
+    Snapshot,
+    Values,
+    describe_constants,
     format_ranges,
     list_columns,
     parse_buffers,
     parse_ranges,
     parse_rows,
 )
-from photonfarm.export.folder import ExportRequest, ExportSettings, Files, Manifest, Part, SceneName
-from photonfarm.export.formats import Format, load_format
-from photonfarm.export.snapshot import Snapshot, Values, describe_constants
 from photonfarm.store import Store
 from photonfarm.store.format.declarations import VERSION
 from photonfarm.store.read.find import scene_or_spec

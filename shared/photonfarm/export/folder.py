@@ -26,7 +26,7 @@ from photonfarm.core.files import write_whole
 from photonfarm.core.models import Frozen, sentences
 from photonfarm.core.records import arrays_of
 from photonfarm.data import Sample
-from photonfarm.export.columns import format_ranges, parse_rows
+from photonfarm.export.snapshot import format_ranges, parse_rows
 from photonfarm.plan.hold_out import HOLD_OUT
 
 FormatName = Literal["webdataset", "exr", "npz", "parquet"]

@@ -24,9 +24,16 @@ from photonfarm.core.archives import write_arrays, write_layers
 from photonfarm.core.errors import StoreError, store_errors
 from photonfarm.core.files import whole_file, write_whole
 from photonfarm.export.card import Exported, write_croissant
-from photonfarm.export.columns import HALVES, Column, Contents, parse_rows
 from photonfarm.export.folder import SAMPLES, FormatName
-from photonfarm.export.snapshot import Snapshot, Values, camera_to_world, select_facts
+from photonfarm.export.snapshot import (
+    HALVES,
+    Column,
+    Contents,
+    Values,
+    camera_to_world,
+    parse_rows,
+    select_facts,
+)
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -71,20 +78,16 @@ class TarShards(Format):
         arrays = [*contents.images, *contents.others]
         with store_errors("write a shard", file), whole_file(file) as part, tarfile.open(part, "w") as shard:
             for values in samples:
-                key = f"{values['row']:08d}"
+                files = {}
                 for column in arrays:
                     stream = io.BytesIO()
                     np.save(stream, values[column.name], allow_pickle=False)
-                    _add_file(shard, f"{key}.{column.name}.npy", stream.getvalue())
-                _add_file(
-                    shard, f"{key}.json", json.dumps(select_facts(values, contents.facts) | contents.about).encode()
-                )
-
-
-def _add_file(shard: tarfile.TarFile, name: str, content: bytes) -> None:
-    entry = tarfile.TarInfo(name)  # without time and owner: equal samples make equal shards
-    entry.size = len(content)
-    shard.addfile(entry, io.BytesIO(content))
+                    files[f"{column.name}.npy"] = stream.getvalue()
+                files["json"] = json.dumps(select_facts(values, contents.facts) | contents.about).encode()
+                for name, content in files.items():
+                    entry = tarfile.TarInfo(f"{values['row']:08d}.{name}")  # without time: equal samples, equal shards
+                    entry.size = len(content)
+                    shard.addfile(entry, io.BytesIO(content))
 
 
 class Exr(Format):
@@ -116,20 +119,19 @@ class Exr(Format):
         width, height = camera["width"], camera["height"]
         focal = {"fl_x": camera["focal_px"], "fl_y": camera["focal_px"], "cx": width / 2, "cy": height / 2}
         head = {"camera_model": "PINHOLE", "camera_angle_x": float(np.radians(camera["fov_deg"]))}
-        frames = [_describe_frame(exported.snapshot, row) for row in parse_rows(exported.manifest.rows)]
+        snapshot, frames = exported.snapshot, []
+        for row in parse_rows(exported.manifest.rows):
+            modification, view = snapshot.inputs(row)
+            frame = {
+                "file_path": f"{SAMPLES}/{row:08d}{Exr.SUFFIX}",
+                "transform_matrix": camera_to_world(view, snapshot.spec).tolist(),
+                "configuration_key": modification.key(snapshot.spec.radiance_id).hex(),
+                "split": snapshot.split_of(row),
+            }
+            frames.append(frame)
         document = {**head, **focal, "w": width, "h": height, "up": camera["up"], "frames": frames}
         with store_errors("write the cameras", exported.folder):
             write_whole(exported.folder / Exr.TRANSFORMS, json.dumps(document, indent=1) + "\n")
-
-
-def _describe_frame(snapshot: Snapshot, row: int) -> Values:
-    modification, view = snapshot.inputs(row)
-    return {
-        "file_path": f"{SAMPLES}/{row:08d}{Exr.SUFFIX}",
-        "transform_matrix": camera_to_world(view, snapshot.spec).tolist(),
-        "configuration_key": modification.key(snapshot.spec.radiance_id).hex(),
-        "split": snapshot.split_of(row),
-    }
 
 
 class Npz(Format):

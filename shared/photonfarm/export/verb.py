@@ -18,7 +18,7 @@ from photonfarm.core.waiting import format_span
 from photonfarm.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
-    from photonfarm.export.export import OnProgress, Result
+    from photonfarm.export.export import OnProgress
 
 EXTRAS = ("points", "photons", "visibility")
 
@@ -31,7 +31,7 @@ def _extras(ctx: click.Context, param: click.Parameter, text: str) -> tuple[str,
 
 
 def _rows(ctx: click.Context, param: click.Parameter, text: str) -> str:  # noqa: ARG001
-    from photonfarm.export.columns import parse_ranges
+    from photonfarm.export.snapshot import parse_ranges
 
     try:
         parse_ranges(text)
@@ -93,6 +93,7 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
 
     Exit codes: 0 exported, 7 no sample is complete, 4 store or folder, 3 what the scene does not have, 130 Ctrl-C.
     """
+    from photonfarm.cli.show import print_json  # numpy comes with it
     from photonfarm.export.export import export_scene
     from photonfarm.export.folder import ExportRequest
 
@@ -102,7 +103,12 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
     except KeyboardInterrupt:
         click.echo("stopped; the same command goes on from here", err=True)
         sys.exit(130)
-    print_result(result, as_json)
+    if as_json:
+        print_json(asdict(result))
+        return
+    shared = f", {result.configurations} configurations" if result.configurations else ""
+    size = f" in {result.new_files} files of {format_bytes(result.new_bytes)}" if result.new else ""
+    click.echo(f"{result.folder}: {result.samples} samples{shared}; {result.new} of them new{size}")
 
 
 LINE_S = 4.0
@@ -144,15 +150,3 @@ def show_progress() -> Iterator[tuple[Callable[[str], None], OnProgress]]:
             console.print(line, markup=False, highlight=False)
 
         yield say, show
-
-
-def print_result(result: Result, as_json: bool) -> None:
-    """Print what was written."""
-    from photonfarm.cli.show import print_json  # numpy comes with it
-
-    if as_json:
-        print_json(asdict(result))
-        return
-    shared = f", {result.configurations} configurations" if result.configurations else ""
-    size = f" in {result.new_files} files of {format_bytes(result.new_bytes)}" if result.new else ""
-    click.echo(f"{result.folder}: {result.samples} samples{shared}; {result.new} of them new{size}")

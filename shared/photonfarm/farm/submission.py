@@ -33,8 +33,7 @@ from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.model.lease import announce_work
 from photonfarm.store.model.plans import StoredPlan, content, load_all
 from photonfarm.store.model.scene_store import SCENES, stored_spec
-from photonfarm.store.read.find import scene_named
-from photonfarm.store.read.other_scenes import describe_scenes, find_same_radiance, note_first_plan
+from photonfarm.store.read.find import describe_scenes, find_same_radiance, note_first_plan, scene_named
 
 MOST_NAMED = 4096
 """The largest number of configurations that a message proposes."""

@@ -17,7 +17,7 @@ from photonfarm.renderer.jobs.repeat import repeat
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.read.other_scenes import find_same_radiance
+from photonfarm.store.read.find import find_same_radiance
 
 REQUEST = Request(modifications=3, views_per_modification=2)
 

@@ -20,7 +20,7 @@ from photonfarm.scene.spec_loading import load_spec, scene_folder
 from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.model.scene_store import list_scenes
-from photonfarm.store.read.other_scenes import describe_scenes
+from photonfarm.store.read.find import describe_scenes
 from photonfarm.trainer.runs.progress import RunProgress, follow_progress
 from photonfarm.trainer.runs.run_folder import lock_run, note_scene_folder, write_views
 from photonfarm.trainer.runs.settings import TrainSettings, make_settings

@@ -176,9 +176,15 @@ def discard(part: Path) -> None:
 
 def put_json(storage: Storage, document: dict[str, Any], name: str, *, replace: bool = False) -> bool:
     """Store a JSON document durably; False if the name was taken, which keeps the old document unless `replace`."""
+    content = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
+    return put_bytes(storage, content.encode(), name, replace=replace)
+
+
+def put_bytes(storage: Storage, content: bytes, name: str, *, replace: bool = False) -> bool:
+    """Store some bytes durably; False if the name was taken, which keeps the old ones unless `replace`."""
     part = storage.part()
     try:
-        part.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        part.write_bytes(content)
         placed = storage.adopt(part, name, replace=replace)
     finally:
         discard(part)

@@ -19,7 +19,7 @@ from typing import Any
 
 from photonfarm.core.errors import CorruptError, store_errors
 from photonfarm.store.format import markers
-from photonfarm.store.io.storage import Storage, discard, put_json, read_or_none
+from photonfarm.store.io.storage import Storage, put_bytes, put_json, read_or_none
 from photonfarm.store.model.findings import Finding
 
 QUARANTINE = "quarantine"
@@ -54,22 +54,20 @@ class Quarantine:
         """Set a scene's geometry and base point cloud aside, for the next job to write them; False if none is there."""
         folder = f"{scene}/base"
         with store_errors("set the base aside", self._storage.where):
-            if not self._storage.names(folder):
-                return False
-            self._record(f"base-{_id(scene)}", why, [folder], "the next job that is rendered writes it")
-            self._storage.move_folder(folder, f"{self._claimed()}/{folder}")
-            self._storage.settle([folder, f"{self._claimed()}/{folder}"])
-            return True
+            if is_there := bool(self._storage.names(folder)):
+                self._record(f"base-{_id(scene)}", why, [folder], "the next job that is rendered writes it")
+                self._storage.move_folder(folder, f"{self._claimed()}/{folder}")
+                self._storage.settle([folder, f"{self._claimed()}/{folder}"])
+            return is_there
 
     def spec(self, scene: str, why: Sequence[Finding]) -> bool:
         """Set a scene's spec aside, so that the next submission of it writes it; False if it is not there."""
         name = f"{scene}/spec.json"
         with store_errors("set the spec aside", self._storage.where):
-            if not self._storage.exists(name):
-                return False
-            self._record(f"spec-{_id(scene)}", why, [name], "`photonfarm submit` of the same spec writes it")
-            self._move([name])
-            return True
+            if is_there := self._storage.exists(name):
+                self._record(f"spec-{_id(scene)}", why, [name], "`photonfarm submit` of the same spec writes it")
+                self._move([name])
+            return is_there
 
     def rewrite(self, scene: str, plan: int, files: Mapping[str, Path], why: Sequence[Finding]) -> None:
         """Replace damaged files of a plan by new ones (parts); copies of the damaged ones are set aside first.
@@ -81,23 +79,12 @@ class Quarantine:
             there = [name for name, content in held.items() if content is not None]
             self._record(f"plan-{_id(scene)}-{plan}", why, there, "written again from the plan's request")
             for name, part in files.items():
-                content, copy = held[name], f"{self._claimed()}/{name}"
-                if content is not None:
-                    self._keep(content, copy)
-                    self._storage.settle([copy])
+                if (content := held[name]) is not None:
+                    put_bytes(self._storage, content, f"{self._claimed()}/{name}")
                 self._storage.adopt(part, name, replace=True)
             self._storage.settle(files)
 
     # -----------------------------------------------------------------------------------------------------------------
-
-    def _keep(self, content: bytes, name: str) -> None:
-        """Store a copy of damaged bytes."""
-        part = self._storage.part()
-        try:
-            part.write_bytes(content)
-            self._storage.adopt(part, name)
-        finally:
-            discard(part)
 
     def _claimed(self) -> str:
         """The folder of this repair; repairs of other scenes at the same time get others."""

@@ -14,7 +14,7 @@ from photonfarm.store import JobWriter, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
 from photonfarm.store.model.lease import announce_work
-from photonfarm.store.model.status import scene_status
+from photonfarm.store.model.store import scene_status
 from photonfarm.store.model.withdrawal import withdraw
 
 REQUEST = Request(modifications=8, views_per_modification=1)

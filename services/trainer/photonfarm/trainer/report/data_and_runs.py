@@ -18,7 +18,7 @@ from photonfarm.core.errors import IncompleteError
 from photonfarm.plan.request import UNUSED
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, SceneStatus, Store
-from photonfarm.store.model.status import scene_status
+from photonfarm.store.model.store import scene_status
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predictors.evaluation import (
     HeldOutErrors,

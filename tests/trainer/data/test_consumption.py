@@ -52,14 +52,6 @@ def test_what_is_used_is_told_again_and_again_each_sample_once(tmp_path: Path, m
             wait_for(100)
 
 
-def test_what_is_used_by_the_end_is_told_at_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "REPORT_S", 3600)
-    with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._report_use(server.url, made(tmp_path), SCENE_ID, print) as count:
-            count(120, 48)
-        assert read_consumed(connect(server.url), [SCENE_ID]) == {SCENE_ID: 48}
-
-
 def test_every_step_is_counted_and_what_a_run_had_that_goes_on(
     make_source: Callable[..., Any], tiny: Callable[..., TrainSettings], run: Path
 ) -> None:
@@ -132,13 +124,3 @@ def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene,
     assert (run / "tensorboard").is_dir() == (find_spec("tensorboard") is not None)
     with pytest.raises(IncompleteError):
         service.check(run)
-
-
-def test_a_store_that_comes_later_is_told_of(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(service, "REPORT_S", 0.01)
-    with EmbeddedRedis(tmp_path / "redis") as server:
-        with service._report_use(server.url, tmp_path / "store", SCENE_ID, print) as count:
-            count(1, 1)
-            time.sleep(0.1)
-            made(tmp_path)
-        assert read_consumed(connect(server.url), [SCENE_ID]) == {SCENE_ID: 1}

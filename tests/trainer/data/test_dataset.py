@@ -26,12 +26,6 @@ def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
     assert abs(len(sides[True]) - 25) <= 3 * np.sqrt(200 / 8 * 7 / 8), "binomial, 3 σ"
 
 
-def test_what_is_held_out_for_a_small_share_is_held_out_for_a_larger_one(make_source) -> None:
-    source = make_source(200)
-    small, large = (set(np.flatnonzero(rows_held_out(source, range(200), share))) for share in (1 / 16, 1 / 4))
-    assert small < large
-
-
 def test_a_static_scene_is_split_by_views(make_source) -> None:
     source = make_source(200, moving=False)
     held = sum(rows_held_out(source, range(200), 1 / 4))
@@ -94,15 +88,6 @@ def test_a_batch_holds_what_was_committed_exactly_also_where_float16_cannot(scen
         assert torch.equal(batch.target[1], torch.full((2, 16, 16, 3), 0.5 * scene.spec.exposure))
         assert torch.equal(batch.inputs.normal, torch.full((2, 16, 16, 3), 0.25))
         np.testing.assert_array_equal(batch.inputs.points.seen, [seen, seen])
-
-
-def test_batches_use_the_same_memory_again(make_source, tiny) -> None:
-    with Feed(make_source(6), tiny(prefetch=2)) as feed:
-        places = set()
-        for i in range(12):
-            feed.ask([i % 6])
-            places.add(feed.take().target.data_ptr())
-    assert len(places) == 3
 
 
 def test_an_error_of_the_source_reaches_the_one_who_takes(make_source, tiny) -> None:

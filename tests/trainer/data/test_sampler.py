@@ -35,18 +35,6 @@ def test_rows_that_arrive_late_are_drawn_more_often_but_not_alone() -> None:
     assert drawn[True] > 1.5 * drawn[False] > 0
 
 
-def test_with_a_large_catch_up_the_rows_drawn_least_often_come_first() -> None:
-    sampler = RoundSampler(seed=0, catch_up=1000)
-    sampler.add(range(4))
-    for _ in range(40):
-        sampler.draw(4)
-    sampler.add(range(4, 8))
-    for _ in range(50):
-        sampler.draw(4)
-    visits = sampler.state()["visits"]
-    assert visits.max() - visits.min() <= 2
-
-
 @pytest.mark.parametrize("rows", [4, 5, 40])
 def test_the_rows_of_a_batch_differ_where_there_are_enough(rows: int) -> None:
     sampler = RoundSampler(seed=1, catch_up=5)
@@ -55,12 +43,6 @@ def test_the_rows_of_a_batch_differ_where_there_are_enough(rows: int) -> None:
         sampler.draw(3)
     sampler.add([rows - 1])
     assert all(len(set(sampler.draw(4))) == 4 for _ in range(50))
-
-
-def test_fewer_rows_than_a_batch_are_drawn_repeatedly() -> None:
-    sampler = RoundSampler(seed=1, catch_up=2)
-    sampler.add([7, 9])
-    assert set(sampler.draw(5)) == {7, 9}
 
 
 def test_nothing_can_be_drawn_before_anything_arrives() -> None:

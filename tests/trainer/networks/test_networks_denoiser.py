@@ -6,11 +6,9 @@ import torch
 from read_batches import batch_of
 
 from photonfarm.core.statistics import Estimate, clean_error, clean_error_having_seen_a
-from photonfarm.trainer.data.batch import TrainingBatch, choose_kept_pixels
-from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.data.batch import choose_kept_pixels
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.inputs import Needs, SceneFrame
-from photonfarm.trainer.predictors.evaluation import measure, read_batches
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.runs.settings import NetworkSettings
 
 DENOISERS = {"denoise_1": 1, "denoise_4": 4, "denoise_16": 16, "denoise_32": 32, "denoise_64": 64}
@@ -93,20 +91,3 @@ def test_the_error_of_a_prediction_made_from_a_has_the_noise_removed() -> None:
     assert abs(difference.mean) < 3 * difference.standard_error
     assert difference.standard_error < 0.02 * np.mean(truth)
     assert abs(np.mean(naive)) > 0.2 * np.mean(truth)
-
-
-def test_a_predictor_that_is_not_trained_is_fed_what_it_needs_and_measured_like_a_network(make_source, tiny) -> None:
-    """The mean colour of the kept pixels everywhere, though the settings' network needs nothing of an image."""
-
-    def predict(batch: TrainingBatch) -> np.ndarray:
-        noisy = batch.inputs.noisy
-        mean = noisy.colour.sum(dim=(1, 2)) / noisy.kept.sum(dim=(1, 2))[:, None]
-        return mean[:, None, None].expand(-1, 16, 16, 3).numpy()
-
-    source = make_source(60)
-    with Feed(source, tiny(), needs=Needs(points=False, kept=4)) as feed:
-        found = measure(predict, read_batches(feed, range(60), 3))
-    constants = [source.clean(row).mean(axis=(0, 1)) for row in range(60)]
-    least = np.mean([np.mean((source.clean(row) - constants[row]) ** 2) for row in range(60)])
-    assert found.error.standard_error < 0.3 * least
-    assert -3 * found.error.standard_error < found.error.mean - least < 0.2 * least + 3 * found.error.standard_error

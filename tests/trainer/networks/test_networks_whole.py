@@ -1,8 +1,7 @@
 """The network of every architecture: what it sees and what it does not, order, weights."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,10 +10,7 @@ import torch
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.records import Photons, arrays_of
-from photonfarm.plan.request import Request
-from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
-from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, map_tensors
 from photonfarm.trainer.networks.network import Network
@@ -51,18 +47,6 @@ def same(one: torch.Tensor, other: torch.Tensor) -> None:
 
 def test_every_architecture_of_the_settings_is_registered() -> None:
     assert set(ARCHITECTURES) == set(get_args(Architecture))
-
-
-@pytest.mark.parametrize("architecture", EVERY)
-def test_channels_stay_last_in_memory_through_every_convolution(make_source, architecture: str) -> None:
-    source, seen = make_source(2, photons=64), []
-    made = network(source, architecture)
-    for layer in made.modules():
-        if isinstance(layer, torch.nn.Conv2d):
-            layer.register_forward_hook(lambda _, given, out: seen.extend([*given, out]))
-    image(made, batch_of(source, (0, 1), architecture).inputs)
-    assert len(seen) == 2 * 22
-    assert all(tensor.is_contiguous(memory_format=torch.channels_last) for tensor in seen)
 
 
 @pytest.mark.parametrize("architecture", EVERY)
@@ -154,35 +138,6 @@ def test_positions_come_with_sines_and_cosines_of_each_octave(make_source) -> No
     torch.testing.assert_close(network(source, octaves=0).coordinates(made.centre + made.scale * x), x)
 
 
-def test_the_logarithm_of_emission_lets_a_lamp_stand_out_beside_a_window(make_source) -> None:
-    source = make_source(1)
-    geometry, cloud = source.base()
-    emission = np.zeros_like(cloud.emission)
-    emission[0], emission[1] = 100.0, 1.0  # window, lamp
-    cloud = replace(cloud, emission=emission)
-
-    def lamp_over_window(kind: str) -> float:
-        chosen = NetworkSettings(width=4, emission=kind)
-        shown = SceneFrame.of(source.spec, geometry, cloud, chosen).appearance[:, 6:]
-        assert np.sqrt(np.mean(shown**2)) == pytest.approx(1)
-        return float(shown[1, 0] / shown[0, 0])
-
-    assert lamp_over_window("linear") == pytest.approx(0.01)
-    assert lamp_over_window("log") > 0.02
-
-
-def test_relative_maxima_are_zero_in_the_base_configuration_and_not_elsewhere(make_source) -> None:
-    source = make_source(2)
-    made, points = network(source, maxima="relative"), batch_of(source, (0, 1)).inputs.points
-    with torch.no_grad():
-        moved = made.point_features(points)[..., 32:]
-        points.position.copy_(made.base)
-        points.present.fill_(True)
-        unmoved = made.point_features(points)[..., 32:]
-    assert moved.abs().amax(dim=(1, 2)).min() > 1e-3
-    assert unmoved.abs().max() < 1e-6
-
-
 @pytest.mark.parametrize("maxima", ["absolute", "relative"])
 @pytest.mark.parametrize("architecture", WITH_POINTS)
 def test_the_order_of_points_and_photons_does_not_matter(make_source, architecture: str, maxima: str) -> None:
@@ -221,37 +176,6 @@ def test_points_that_are_flagged_as_absent_change_nothing_wherever_they_are(make
 
 
 @pytest.mark.parametrize("architecture", WITH_POINTS)
-def test_a_point_that_is_not_seen_is_in_no_pixel_of_what_is_projected(make_source, architecture: str) -> None:
-    """Other points may know of it, by the maximum over all; so its feature alone is spoilt, before the projection."""
-    source = make_source(2, photons=64)
-    made, inputs = network(source, architecture), batch_of(source, (0, 1), architecture).inputs
-    plain, project = made.further(inputs), made.project
-    hidden = [inputs.points.present & ~inputs.points.seen]
-    if inputs.photons is not None:
-        hidden.append(inputs.photons.present & ~inputs.photons.seen)
-    assert all(flags.sum() > 10 for flags in hidden)
-
-    def poisoned(features: torch.Tensor, position: torch.Tensor, *flags: Any) -> torch.Tensor:
-        (which,) = (those for those in hidden if those.shape == features.shape[:2])
-        return project(torch.where(which[..., None], torch.nan, features), position, *flags)
-
-    made.project = poisoned
-    assert all(torch.equal(one, other) for one, other in zip(made.further(inputs), plain, strict=True))
-
-
-def test_a_descriptor_of_a_point_that_is_not_seen_changes_nothing_without_light_transport(make_source) -> None:
-    source = make_source(2)
-    made, inputs = network(source, "feature_projection"), batch_of(source, (0, 1), "feature_projection").inputs
-    before = image(made, inputs)
-    unseen = ~inputs.points.seen.any(dim=0)
-    made.descriptor.data[unseen] = torch.nan
-    assert torch.equal(image(made, inputs), before)
-    made(inputs).square().sum().backward()
-    assert torch.all(made.descriptor.grad[unseen] == 0)
-    assert (made.descriptor.grad[~unseen] != 0).any(dim=1).all()
-
-
-@pytest.mark.parametrize("architecture", WITH_POINTS)
 def test_what_is_seen_decides_what_is_projected_and_depth_does_not(make_source, architecture: str) -> None:
     source = make_source(2, photons=64)
     made, inputs = network(source, architecture), batch_of(source, (0, 1), architecture).inputs
@@ -276,11 +200,6 @@ def test_without_any_present_point_there_is_an_image_and_a_gradient(make_source,
     assert all(torch.isfinite(p.grad).all() for p in made.parameters() if p.grad is not None)
 
 
-def test_points_beyond_those_used_are_left_out(make_source) -> None:
-    source = make_source(1, points=256)
-    assert network(source, points=100).descriptor.shape == (100, 32)
-
-
 def test_a_moved_point_takes_its_descriptor_along(make_source) -> None:
     """One point alone, before one camera: its descriptor is in the pixel where it is, and nowhere else."""
     source = make_source(1)
@@ -300,20 +219,6 @@ def test_a_moved_point_takes_its_descriptor_along(make_source) -> None:
 # -------------------------------------------------------------------------------------------------------------- photons
 
 
-def test_photons_reach_the_image_and_so_the_light_that_sent_them(make_source) -> None:
-    source = make_source(2, photons=64)
-    made, inputs = network(source, PHOTONS), batch_of(source, (0, 1), PHOTONS).inputs
-    before = image(made, inputs)
-    for name in ("position", "power"):
-        values = getattr(inputs.photons, name)
-        kept = values.clone()
-        values.mul_(0.5).add_(0.1)
-        assert not torch.equal(image(made, inputs), before), name
-        values.copy_(kept)
-    inputs.photons.present.fill_(False)
-    assert not torch.equal(image(made, inputs), before)
-
-
 def test_twice_as_many_photons_of_half_the_power_are_the_same_to_the_network(make_source) -> None:
     """Each one twice, as a scene with twice the paths stores it: power is over the number emitted."""
     once, twice = make_source(1, photons=64), make_source(1, photons=128)
@@ -329,27 +234,6 @@ def test_twice_as_many_photons_of_half_the_power_are_the_same_to_the_network(mak
         photons.seen.copy_(shown.photons.seen.repeat(1, times))  # in the view of `once`
         images.append(image(network(source, PHOTONS), replace(shown, photons=photons)))
     same(images[1], images[0])
-
-
-def test_photons_are_fed_as_the_store_has_them(make_source, commit, tiny, tmp_path: Path) -> None:
-    analytic = make_source(1, photons=32)
-    scene = Store(tmp_path / "store", create=True).add(analytic.spec)
-    scene.write_base(*analytic.base())
-    scene.plan(Request(modifications=2, views_per_modification=2), shard_rows=2)
-    for job in range(scene.jobs()):
-        commit(scene, job)
-    source = SceneReader(scene.storage.root, scene.scene_id)
-    with Feed(source, tiny(network=NetworkSettings(width=4, architecture=PHOTONS))) as feed:
-        feed.ask([3, 0])
-        batch = feed.take()
-        for place, row in enumerate((3, 0)):
-            for name, wanted in arrays_of(source.read_photons(row)).items():
-                np.testing.assert_array_equal(getattr(batch.inputs.photons, name)[place].numpy(), wanted)
-            seen = source.read(row).visibility.photons
-            np.testing.assert_array_equal(batch.inputs.photons.seen[place].numpy(), seen)
-            assert 0 < seen.sum() < 32
-        assert batch.inputs.photons.present.sum(dim=1).tolist() == [32, 32]  # the second hits of each are empty
-        assert not torch.equal(batch.inputs.photons.position[0], batch.inputs.photons.position[1])
 
 
 def test_a_scene_without_photons_is_refused_where_they_are_needed(make_source) -> None:

@@ -124,15 +124,3 @@ def test_what_is_gathered_is_the_light_of_diffuse_surfaces_and_the_image_before_
     image, clean = np.concatenate(found), np.concatenate(wanted)
     assert image.mean() == pytest.approx(clean.mean(), rel=0.05)
     assert np.mean((image - clean) ** 2) < 0.1 * np.mean(clean**2)
-
-
-def test_demodulation_is_of_what_is_learned_and_not_of_the_photon_map(make_source) -> None:
-    source = make_source(2, photons=256)
-    settings = NetworkSettings(width=4, architecture=ARCHITECTURE, demodulation=0.2)
-    network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
-    inputs = batch_of(source, (0, 1), NEEDS).inputs
-    with torch.no_grad():
-        further = network.further(inputs)
-        learned = network.synthesise(torch.cat([*further, network.image_space(inputs)], dim=-1))
-        known = network.photon_light(inputs)[1] * inputs.albedo
-        torch.testing.assert_close(network(inputs), learned * (inputs.albedo + 0.2) + known)

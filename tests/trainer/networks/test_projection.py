@@ -7,14 +7,10 @@ from typing import get_args
 import numpy as np
 import pytest
 import torch
-from read_batches import batch_of
 
 from photonfarm.scene.view import Camera, View
-from photonfarm.trainer.networks import build
-from photonfarm.trainer.networks.inputs import Needs, SceneFrame
-from photonfarm.trainer.networks.paper_networks import LightTransportLayer
 from photonfarm.trainer.networks.projection import Footprint, Optics, footprint, project_mean
-from photonfarm.trainer.runs.settings import NetworkSettings, Occlusion
+from photonfarm.trainer.runs.settings import Occlusion
 
 W, H, NEAR, FAR = 12, 8, 0.1, 20.0
 
@@ -93,58 +89,12 @@ def test_exact_looks_at_no_depth_and_the_other_rule_at_nothing_that_is_seen() ->
         assert not set(unseen.tolist()) & set(plain.tolist()) or rule != "exact"
 
 
-def one_view(*positions: tuple[float, float, float], depth: float = 0.0) -> tuple[torch.Tensor, ...]:
-    """Points before a camera at the origin, all of them seen, and a depth everywhere: the arguments of `footprint`."""
-    position, camera = torch.tensor([positions], dtype=torch.float64), torch.eye(3, 4, dtype=torch.float64)[None]
-    flags = torch.ones(1, len(positions), dtype=torch.bool)
-    return position, flags, flags, camera, torch.full((1, H, W), depth).double()
-
-
-def test_a_pixel_where_nothing_was_hit_occludes_nothing() -> None:
-    for depth, kept in ((0.0, 1), (2.0, 0)):
-        assert len(footprint(*one_view((0.1, 0.1, 15.0), depth=depth), optics("window")).point) == kept
-
-
-def test_points_behind_the_camera_are_dropped_though_they_would_land_in_the_image() -> None:
-    scene = one_view((0.0, 0.0, -3.0), (0.0, 0.0, 0.0), (0.0, 0.0, 3.0))
-    assert footprint(*scene, optics()).point.tolist() == [2]
-
-
-def test_points_off_the_image_are_dropped_though_they_are_seen() -> None:
-    edge = W / 2 / 7.3
-    scene = one_view((-edge, 0.0, 1.0), (-1.0001 * edge, 0.0, 1.0), (0.9999 * edge, 0.0, 1.0), (edge, 0.0, 1.0))
-    kept = footprint(*scene, optics())
-    assert kept.point.tolist() == [0, 2]
-    assert (kept.pixel % W).tolist() == [0, W - 1]
-
-
 def test_points_that_share_a_pixel_share_its_gradient() -> None:
     features = torch.randn(1, 5, 2, dtype=torch.float64, requires_grad=True)
     kept = Footprint(point=torch.tensor([0, 1, 3, 4]), pixel=torch.tensor([7, 7, 7, 20]))  # point 2 is dropped
     assert torch.autograd.gradcheck(lambda f: project_mean(f, kept, H, W), features)
     project_mean(features, kept, H, W).sum().backward()
     torch.testing.assert_close(features.grad[0, :, 0], torch.tensor([1 / 3, 1 / 3, 0, 1 / 3, 1]).double())
-
-
-def test_gradients_flow_through_light_transport_and_projection_to_weights_and_positions() -> None:
-    """Points are several to a pixel, some of them absent or hidden, which gradcheck compares by differences."""
-    _, scene = random_scene(4, batch=2, points=400)
-    position, present = scene[:2]
-    kept = footprint(*scene, optics())
-    assert torch.bincount(kept.pixel).max() > 1
-    torch.manual_seed(0)
-    layer = LightTransportLayer(2, 1).double()
-    for parameter in layer.parameters():
-        torch.nn.init.normal_(parameter, std=0.3)
-    chosen, names = [layer.preprocess.bias, layer.blocks[0].out.bias], ("preprocess.bias", "blocks.0.out.bias")
-    varying, fixed = position[..., :2].clone().requires_grad_(), torch.randn(400, 1, dtype=torch.float64)
-
-    def image(varying: torch.Tensor, *weights: torch.Tensor) -> torch.Tensor:
-        named = dict(zip(names, weights, strict=True))
-        features = torch.func.functional_call(layer, named, (varying, fixed, present))
-        return project_mean(features, kept, H, W)
-
-    assert torch.autograd.gradcheck(image, (varying, *chosen), fast_mode=True)
 
 
 @pytest.mark.parametrize("occlusion", get_args(Occlusion))
@@ -182,20 +132,6 @@ def test_the_points_kept_are_those_that_an_exact_ray_query_sees(make_source, occ
     recall, leak = right / seen, 1 - right / kept
     assert recall >= (0.9999 if occlusion == "exact" else 0.99), f"recall {recall:.4f}, leak {leak:.4f}"
     assert leak <= (0.0001 if occlusion == "exact" else 0.01), f"recall {recall:.4f}, leak {leak:.4f}"
-
-
-@pytest.mark.parametrize("occlusion", get_args(Occlusion))
-def test_a_network_projects_by_the_rule_that_is_set(make_source, occlusion: str) -> None:
-    source = make_source(1, size=64, points=4096)
-    settings = NetworkSettings(width=4, occlusion=occlusion, architecture="feature_projection")
-    network = build(settings, SceneFrame.of(source.spec, *source.base(), settings), 0)
-    inputs = batch_of(source, (0,), Needs()).inputs
-    (found,) = network.further(inputs)
-    points = inputs.points
-    view = inputs.world_to_camera, inputs.depth
-    kept = footprint(points.position, points.present, points.seen, *view, Optics.of(source.spec, occlusion))
-    wanted = project_mean(network.descriptor.expand(1, -1, -1), kept, 64, 64)
-    torch.testing.assert_close(found, wanted)
 
 
 def test_rays_and_focal_length_are_those_of_the_camera(make_source) -> None:

@@ -2,10 +2,8 @@
 
 import numpy as np
 import pytest
-from projection_oracle import first_met, in_image, sees, triangles
+from projection_oracle import first_met, in_image, sees
 
-from photonfarm.core.records import STATIC, Geometry
-from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import Camera, View
@@ -59,16 +57,6 @@ def test_it_meets_what_a_plain_loop_meets(spec: SceneSpec, camera: Camera) -> No
     assert 0.3 < (found < 1).mean() < 0.98
 
 
-def test_the_image_ends_at_its_outermost_pixels_and_at_the_near_and_the_far_plane(
-    spec: SceneSpec, camera: Camera
-) -> None:
-    x, y = 32 / camera.focal_px, 24 / camera.focal_px
-    inside = in_world(camera, (0.999 * x, 0.999 * y, 1), (-0.999 * x, -0.999 * y, 1), (0, 0, 0.501), (0, 0, 19.9))
-    outside = in_world(camera, (1.001 * x, 0, 1), (0, -1.001 * y, 1), (0, 0, 0.499), (0, 0, 20.1), (0, 0, -1))
-    assert in_image(camera, spec, inside).all()
-    assert not in_image(camera, spec, outside).any()
-
-
 def test_a_wall_hides_what_is_behind_it_but_not_itself_and_not_what_is_before_it(
     spec: SceneSpec, camera: Camera
 ) -> None:
@@ -77,25 +65,3 @@ def test_a_wall_hides_what_is_behind_it_but_not_itself_and_not_what_is_before_it
     assert sees(wall, camera, spec, position).tolist() == [True, True, True, False, False]
     nearer = in_world(camera, (-9, -9, 0.4), (9, -9, 0.4), (0, 9, 0.4))[None].astype(np.float64)
     assert sees(nearer, camera, spec, position).all(), "what is nearer than the near plane hides nothing"
-
-
-def test_a_line_through_an_edge_that_two_triangles_share_meets_them(spec: SceneSpec, camera: Camera) -> None:
-    corners = in_world(camera, (-3, -3, 4), (3, -3, 4), (3, 3, 4), (-3, 3, 4)).astype(np.float64)
-    square = corners[[[0, 1, 2], [0, 2, 3]]]
-    rng = np.random.default_rng(0)
-    along = corners[0] + rng.random((500, 1)) * (corners[2] - corners[0])  # points of the diagonal
-    behind = (camera.origin + 1.7 * (along - camera.origin)).astype(np.float32)
-    behind = behind[in_image(camera, spec, behind)]
-    assert len(behind) > 100
-    assert not sees(square, camera, spec, behind).any()
-
-
-def test_groups_are_where_the_modification_has_them_and_removed_ones_are_not_there() -> None:
-    vertices = np.arange(36, dtype=np.float32).reshape(12, 3)
-    faces = np.arange(12, dtype=np.uint32).reshape(4, 3)
-    geometry = Geometry(vertices, faces, np.array([0, 1, 2, 0], np.int32), np.array([STATIC, 0, 1], np.int16))
-    modification = Modification(np.array([[1, 2, 3], [5, 5, 5]], np.float32), np.array([True, False]))
-    found = triangles(geometry, modification)
-    np.testing.assert_array_equal(found, [vertices[0:3], vertices[3:6] + modification.translation[0], vertices[9:12]])
-    none = Modification(np.zeros((0, 3), np.float32), np.zeros(0, bool))
-    np.testing.assert_array_equal(triangles(geometry, none), vertices.reshape(4, 3, 3))

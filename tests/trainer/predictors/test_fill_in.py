@@ -35,13 +35,6 @@ def test_light_on_a_texture_comes_out_exact_where_the_light_is_constant(of: int)
     assert torch.allclose(fill_in(dropped(colour, of), albedo), colour, rtol=1e-4, atol=1e-6)
 
 
-def test_a_lamp_without_albedo_does_not_run_into_the_wall_beside_it() -> None:
-    albedo = torch.full((1, 32, 32, 3), 0.5)
-    albedo[:, 8:20, 8:20] = 0
-    colour = torch.where(albedo == 0, 100.0, 0.25)
-    assert torch.allclose(fill_in(dropped(colour, 4), albedo), colour, rtol=1e-4)
-
-
 def test_kept_pixels_stay_as_they_are_and_nothing_else_is_seen() -> None:
     albedo, colour = random(1, 16, 16, 3), 5 * random(1, 16, 16, 3, seed=2)
     noisy = dropped(colour, 4)
@@ -84,11 +77,3 @@ def test_one_kept_pixel_fills_a_whole_image_also_one_of_another_kind_and_none_le
     assert torch.allclose(filled[0], torch.tensor([1.0, 2.0, 3.0]).expand(8, 40, 3))
     assert torch.allclose(filled[1], torch.tensor([1.0, 2.0, 3.0]).expand(8, 40, 3))
     assert not filled[2].any()
-
-
-def test_what_an_image_is_filled_with_does_not_depend_on_its_batch() -> None:
-    albedo, noisy = random(3, 16, 16, 3), dropped(random(3, 16, 16, 3, seed=2), 16)
-    together = fill_in(noisy, albedo)
-    for i in range(3):
-        alone = fill_in(NoisyColour(noisy.colour[i : i + 1], noisy.kept[i : i + 1]), albedo[i : i + 1])
-        assert torch.allclose(alone[0], together[i], rtol=1e-5)

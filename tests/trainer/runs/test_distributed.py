@@ -76,7 +76,7 @@ def weights(run: Path) -> torch.Tensor:
     return torch.cat([w.flatten() for w in checkpoint.load(run / CHECKPOINT)["network"].values()])
 
 
-@pytest.mark.parametrize(("architecture", "batch"), [("light_transport", 4), ("light_transport", 3), ("denoise_4", 5)])
+@pytest.mark.parametrize(("architecture", "batch"), [("light_transport", 3), ("denoise_4", 5)])
 def test_two_processes_end_in_the_weights_of_one_with_the_joint_batch(
     make_source, tiny, run, tmp_path, architecture: str, batch: int
 ) -> None:
@@ -202,6 +202,7 @@ def test_an_error_of_rank_0_ends_the_others_and_that_of_all_ends_each(
     assert time.monotonic() - began < 60
 
 
+@pytest.mark.slow
 def test_a_rank_that_hangs_in_a_step_is_waited_for_by_far_less_than_one_that_has_nothing_to_say(
     make_source, tiny, run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,32 +225,6 @@ def test_a_rank_that_hangs_in_a_step_is_waited_for_by_far_less_than_one_that_has
 
     assert together(make, tiny(batch=4, checkpoint_every=1), run) == [IncompleteError.exit_code] * 2
     assert 0 < checkpoint.load(run / CHECKPOINT)["step"] < 12
-
-
-@pytest.mark.parametrize("lengths", [(3, 1), (4, 0)])
-def test_the_gradient_is_that_of_the_joint_batch_however_it_is_parted(tmp_path, lengths: tuple[int, int]) -> None:
-    x = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
-
-    def gradient(inputs: torch.Tensor) -> tuple[torch.nn.Linear, torch.Tensor]:
-        layer = torch.nn.Linear(3, 2)
-        with torch.no_grad():
-            layer.weight.fill_(0.5)
-            layer.bias.fill_(0.1)
-        loss = (layer(inputs) ** 2).mean() if len(inputs) else torch.zeros(())
-        if len(inputs):
-            torch.autograd.backward(loss)
-        return layer, loss
-
-    def target(group: Ranks) -> None:
-        own = torch.split(x, lengths)[group.rank]
-        layer, loss = gradient(own)
-        value = group.average(list(layer.parameters()), loss, len(own))
-        joint, expected = gradient(x)
-        assert value == pytest.approx(expected.item(), rel=1e-6)
-        torch.testing.assert_close(layer.weight.grad, joint.weight.grad)
-        torch.testing.assert_close(layer.bias.grad, joint.bias.grad)
-
-    assert in_both(target) == [0, 0]
 
 
 def test_the_gradient_is_torchs_own_to_the_bit_for_equal_parts_and_the_right_one_for_others() -> None:

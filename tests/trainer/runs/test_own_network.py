@@ -128,21 +128,6 @@ def test_every_loss_of_ours_is_found_unbiased_and_a_biased_one_is_refused(mine: 
 
 
 @pytest.mark.parametrize(
-    "loss",
-    [
-        pytest.param(lambda f, t: (f[:, None] - t).abs().mean(), id="l1"),
-        pytest.param(lambda f, t: ((f[:, None] - t).clamp(-1, 1) ** 2).mean(), id="clipped"),
-        pytest.param(lambda f, t: (torch.log1p(f[:, None]) - torch.log1p(t)).square().mean(), id="log"),
-        pytest.param(lambda f, t: ((f[:, None] - t) ** 2 / (t**2 + 0.05)).mean(), id="weighted by the target"),
-        pytest.param(lambda f, t: ((f[:, None] - t) ** 2 / (f[:, None] ** 2 + 0.05)).mean(), id="undetached weight"),
-        pytest.param(lambda f, t: (f.std() - t.mean(dim=1).std()) ** 2, id="contrast"),
-    ],
-)
-def test_losses_that_bias_are_found_out(loss) -> None:
-    assert not judge(loss).is_unbiased
-
-
-@pytest.mark.parametrize(
     ("name", "lacks"),
     [("{}:Nothing", "PerPixel"), ("{}:number", "torch.nn.Module"), ("no_such_module:Net", "no_such_module")],
 )
@@ -173,14 +158,3 @@ def test_an_error_in_a_users_network_is_one_sentence(
         train(store, Store(store).scenes()[0].spec.name, "run", max_steps=1, **settings)
     assert f"architecture = '{mine}_wrong:Wrong'" in str(refused.value)
     assert said in str(refused.value)
-
-
-def test_training_in_one_call_goes_on_where_the_command_line_left_off(mine: str, store: Path, tmp_path: Path) -> None:
-    settings = {"hold_out": 0.4, "batch": 2, "architecture": f"{mine}:PerPixel", "width": 4, "validate_every": 2}
-    pairs = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
-    assert photonfarm("train", "--store", store, "--run", "run", *pairs, "--steps", 2).exit_code == 0
-    run = train(store, Store(store).scenes()[0].spec.name, "run", max_steps=4, **settings)
-    assert run.settings.max_steps == 4
-    assert run.settings.network.architecture == f"{mine}:PerPixel"
-    with pytest.raises(SpecError, match="hold_outs"):
-        train(store, run.scene_id, "other", hold_outs=0.4)

@@ -36,14 +36,6 @@ def test_the_preset_paper_is_the_supplement_to_the_letter() -> None:
     assert settings.model_dump(include={*optimiser, *others}) == optimiser | others
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_what_is_asked_for_comes_before_what_a_preset_says(name: str) -> None:
-    found = make_preset(name, network={"architecture": "cnn"}, batch=5)
-    assert (found.network.architecture, found.batch) == ("cnn", 5)
-    assert found.network.width == make_preset(name).network.width
-    assert found.max_steps == make_preset(name).max_steps
-
-
 def test_values_that_are_not_allowed_are_refused() -> None:
     for named, network in (
         ("architecture", {"architecture": "transformer"}),
@@ -147,12 +139,6 @@ def test_what_is_done_instead_of_training_is_one_thing(flags: tuple[str, ...], t
     assert result.exit_code == 2
     assert all(flag in result.output for flag in flags)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_an_architecture_that_does_not_exist_is_refused_with_those_that_do() -> None:
-    found = CliRunner().invoke(umbrella, ["train", "--architecture", "gan"])
-    assert found.exit_code == 2
-    assert "light_transport_photons" in found.output
 
 
 def test_a_default_that_the_help_states_as_a_number_is_that_of_every_preset() -> None:

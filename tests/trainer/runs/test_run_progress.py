@@ -35,16 +35,6 @@ def test_phase_and_time_left_follow_the_session() -> None:
     assert "validates for 6 s" in progress.line()
 
 
-def test_the_last_line_is_of_the_last_step(run: Path) -> None:
-    said: list[str] = []
-    run.mkdir()
-    for samples in (0, 24):
-        progress = RunProgress(20, batch=4)
-        with follow_progress(progress, run, said.append):
-            progress.note_draws(4 * samples, samples)
-    assert said == ["step 24 (20 wanted), 24 samples have arrived"], "and none where nothing has arrived"
-
-
 def test_a_line_comes_every_five_seconds_and_others_read_the_file_meanwhile(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,12 +52,6 @@ def test_a_line_comes_every_five_seconds_and_others_read_the_file_meanwhile(
     assert len(said) >= 2
     assert not (run / PROGRESS).exists()
     assert RunFolder(run).look().phase is None
-
-
-def test_a_session_tells_its_phases(make_source, tiny, run: Path) -> None:
-    phases: list[str] = []
-    train(make_source(24), tiny(max_steps=3), run, Hooks(on_phase=phases.append))
-    assert {"start", "train", "validate", "save"} <= set(phases)
 
 
 def test_pictures_of_held_out_views_are_whole_name_their_rows_and_are_thinned_out(run: Path) -> None:

@@ -1,7 +1,6 @@
 """What TensorBoard reads of a run, by its own reader."""
 
 import io
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -67,22 +66,6 @@ def test_what_was_shown_after_the_checkpoint_is_taken_back_when_the_run_goes_on(
         trained(make_source(24), tiny(), run, broken)
     trained(make_source(24), tiny(), run)
     assert [e.step for e in accumulated(run).Scalars("error/held out")] == [0, 5, 10, 12]
-
-
-def test_what_was_shown_up_to_an_end_stays_when_the_run_goes_on(make_source, tiny, run) -> None:
-    for steps in (12, 12, 15):
-        trained(make_source(24), tiny(max_steps=steps), run)
-        time.sleep(1)  # event files are read by name, and their names order sessions of one process by the second
-    events = accumulated(run)
-    assert [e.step for e in events.Scalars("error/held out")] == [0, 5, 10, 12, 15]
-    assert [e.step for e in events.Images("held out/target above prediction")] == [0, 5, 10, 12, 15]
-
-
-def test_a_run_that_goes_back_shows_what_is_left_of_its_rate(make_source, tiny, run) -> None:
-    trained(make_source(48), tiny(learning_rate=0.05, max_steps=30), run)
-    halved = [r for r in run_folder.read_log(run / METRICS) if r["kind"] == "recovered"]
-    found = accumulated(run).Scalars("optimiser/rate factor")
-    assert [(e.step, e.value) for e in found] == [(r["step"], r["rate_factor"]) for r in halved] != []
 
 
 def test_without_tensorboard_nothing_is_written(run, monkeypatch: pytest.MonkeyPatch) -> None:

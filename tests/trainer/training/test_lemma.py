@@ -185,9 +185,9 @@ def test_noisy_targets_give_the_gradient_of_the_clean_image_for_every_weight_ten
 @pytest.mark.parametrize(
     ("architecture", "name"),
     [
-        ("guided", "linear"),
-        ("guided_transport", "relative"),
-        ("guided_photons", "relative"),
+        pytest.param("guided", "linear", marks=pytest.mark.slow),
+        pytest.param("guided_transport", "relative", marks=pytest.mark.slow),
+        pytest.param("guided_photons", "relative", marks=pytest.mark.slow),
         ("guided_transport_photons", "relative"),
     ],
 )

@@ -13,7 +13,7 @@ from photonfarm.trainer.predictors.evaluation import read_batches
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
-from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, make_preset
+from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import compute_rate
 from photonfarm.trainer.training.loop import train
@@ -30,13 +30,6 @@ def same(one: Weights, other: Weights) -> bool:
     return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
 
 
-@pytest.mark.parametrize("name", PRESETS)
-def test_presets_have_the_supplements_schedule_and_no_average(name: str) -> None:
-    settings = make_preset(name)
-    wanted = ("cosine", 0.99, True) if name == "small" else ("epochs", 0.0, name != "paper")
-    assert (settings.schedule, settings.average, settings.recover) == wanted
-
-
 def test_the_cosine_rises_in_equal_parts_and_falls_to_nothing_at_the_last_step() -> None:
     settings = TrainSettings(schedule="cosine", warm_up=0.1, max_steps=100, learning_rate=2.0, decay=0.1)
     rates = [compute_rate(step, settings) for step in range(101)]
@@ -47,13 +40,6 @@ def test_the_cosine_rises_in_equal_parts_and_falls_to_nothing_at_the_last_step()
     assert 0 < rates[99] < 1e-3
     assert rates[100] == 0
     assert all(np.diff(rates[10:]) < 0)
-
-
-@pytest.mark.parametrize(("warm_up", "first"), [(0.0, 1.0), (0.03, 1.0), (0.5, 0.2), (0.99, 1 / 9)])
-def test_the_first_step_is_never_of_rate_zero(warm_up: float, first: float) -> None:
-    settings = TrainSettings(schedule="cosine", warm_up=warm_up, max_steps=10, learning_rate=1.0)
-    assert compute_rate(0, settings) == pytest.approx(first)
-    assert compute_rate(9, settings) > 0
 
 
 def test_a_run_that_goes_on_with_more_steps_follows_the_schedule_of_these(make_source, tiny, run, monkeypatch) -> None:

@@ -76,11 +76,10 @@ def assert_same(one: Path, other: Path) -> None:
     "recipe",
     [
         {"optimiser": "adam"},
-        {"optimiser": "rmsprop"},
-        {"schedule": "cosine", "average": 0.99},
+        pytest.param({"optimiser": "rmsprop"}, marks=pytest.mark.slow),
         {"schedule": "cosine", "average": 0.99, "learning_rate": 0.3},
     ],
-    ids=["adam", "rmsprop", "cosine, averaged", "recovering"],
+    ids=["adam", "rmsprop", "averaged, recovering"],
 )
 def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
     make_source, tiny, run, tmp_path, recipe: dict[str, Any]
@@ -102,13 +101,14 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
 @pytest.mark.parametrize(
     ("call", "last", "step"),
     [
-        ("fsync", 3, None),  # an fsync of the file and one of the folder each: the good state of step 0 is written…
-        ("fsync", 5, None),  # …and the checkpoint of step 4
-        ("fsync", 7, 4),  # the good state of step 5…
+        # an fsync of the file and one of the folder each: the good state of step 0 is written…
+        pytest.param("fsync", 3, None, marks=pytest.mark.slow),
+        pytest.param("fsync", 5, None, marks=pytest.mark.slow),  # …and the checkpoint of step 4
+        pytest.param("fsync", 7, 4, marks=pytest.mark.slow),  # the good state of step 5…
         ("fsync", 9, 4),  # …and the checkpoint of step 8
-        ("replace", 5, 4),  # the good state is there, the checkpoint is not
+        pytest.param("replace", 5, 4, marks=pytest.mark.slow),  # the good state is there, the checkpoint is not
         ("replace", 6, 8),  # both are, and the good state does not yet replace the one before
-        ("replace", 7, 8),
+        pytest.param("replace", 7, 8, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_killed_while_it_writes_a_checkpoint_does_too(
@@ -159,7 +159,7 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_trains_on_all_of_it_howeve
             scene.plan(Request(modifications=20, seed=seed), shard_rows=4)
         for job in range(scene.jobs()):
             commit(scene, job)
-            time.sleep(0.25)
+            time.sleep(0.12)
 
     growing = threading.Thread(target=grow)
     growing.start()
@@ -230,10 +230,7 @@ def test_a_run_is_not_continued_on_a_store_of_other_plans(scene, analytic, commi
 @pytest.mark.parametrize(
     "architecture",
     [
-        "cnn",
-        "feature_projection",
         "light_transport_photons",
-        "guided_transport",
         "guided_transport_photons",
         "denoise_4",
     ],

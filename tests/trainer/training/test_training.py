@@ -21,7 +21,6 @@ from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.devices import describe_device, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
-from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.learner import DivergedError
 from photonfarm.trainer.training.loop import Hooks, stop_on_signals, train
 
@@ -166,17 +165,6 @@ def test_what_a_run_logged_up_to_its_end_stays_where_it_goes_on(make_source, tin
     assert [(r["kind"], r["step"]) for r in run_folder.read_log(run / METRICS)[len(longer) :]] == [("end", 15)]
 
 
-def test_a_run_that_begins_anew_keeps_nothing_of_an_older_log(make_source, tiny, run) -> None:
-    stop = threading.Event()
-    stop.set()
-    train(make_source(24), tiny(), run, Hooks(stop=stop))
-    train(make_source(24), tiny(max_steps=1), run)
-    (run / CHECKPOINT).unlink()
-    train(make_source(24), tiny(max_steps=1, seed=1), run)
-    told = [(r["kind"], r["step"]) for r in run_folder.read_log(run / METRICS)]
-    assert told == [("validation", 0), ("validation", 1), ("end", 1)]
-
-
 def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tiny, run, capsys) -> None:
     train(make_source(24), tiny(max_steps=5), run, Hooks(on_record=show.print_record))
     train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run, Hooks(on_record=show.print_record))
@@ -187,12 +175,6 @@ def test_what_may_change_is_told_and_logged_where_a_run_goes_on(make_source, tin
     assert capsys.readouterr().err.splitlines().count(said) == 1
     train(make_source(24), tiny(max_steps=7, learning_rate=1e-3), run)
     assert [r["kind"] for r in run_folder.read_log(run / METRICS)].count("changes") == 1
-
-
-def test_time_that_is_up_before_anything_is_held_out_leaves_a_checkpoint(make_source, tiny, run) -> None:
-    outcome = train(make_source(8, per_look=0), tiny(max_seconds=0.1), run)
-    assert (outcome.reason, outcome.last_error) == ("seconds", None)
-    assert checkpoint.load(run / CHECKPOINT)["step"] == 0
 
 
 def test_who_reads_the_log_while_it_is_cut_has_it_whole(tmp_path) -> None:
@@ -235,10 +217,3 @@ def test_the_service_says_which_scene_it_waits_for(scene, run) -> None:
     with pytest.raises(IncompleteError, match="nothing was trained"):
         service.run("cornell", store, run, "small", {"max_seconds": 0.3}, log=said.append, on_record=said.append)
     assert any(f"waiting for scene {load_spec('cornell').scene_id}" in str(line) for line in said)
-
-
-def test_the_rate_falls_by_one_percent_with_every_epoch_of_samples(make_source, tiny, run, monkeypatch) -> None:
-    monkeypatch.setattr(loop, "LOG_EVERY", 10)
-    train(make_source(24), tiny(max_steps=10, batch=2, epoch_samples=4), run)
-    (record,) = [r for r in run_folder.read_log(run / METRICS) if r["kind"] == "train"]
-    assert record["rate"] == pytest.approx(5e-4 * 0.99**4)  # steps 0…9 draw samples 0…19: at last epoch 4

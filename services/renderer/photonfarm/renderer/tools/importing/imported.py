@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, SubElement
 
+import mitsuba as mi
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -19,6 +20,12 @@ from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.changes import Changes
 
 Floats = NDArray[np.float64]
+Vector = tuple[float, float, float]
+
+_NOT_OF_AN_ID = re.compile(r"[\s.:/\\\"'<>&$]+")
+"""What Mitsuba or a path gives a meaning of its own."""
+
+ID_LENGTH = 64
 
 GAP, LEAST_GAP = 1e-4, 1e-5
 """The distance of the two sheets of a light that shines from both sides, as a share of its extent, and the least one,
@@ -109,8 +116,6 @@ def unit(vectors: Floats) -> Floats:
 
 def read_mesh(shape: Any) -> Mesh:
     """The mesh of a shape that Mitsuba has loaded."""
-    import mitsuba as mi
-
     vertices = np.array(shape.vertex_positions_buffer(), np.float64).reshape(-1, 3)
     faces = np.array(shape.faces_buffer(), np.uint32).reshape(-1, 3)
     normals, uv = None, None
@@ -130,8 +135,6 @@ def read_mesh(shape: Any) -> Mesh:
 
 def write_ply(mesh: Mesh, file: Path) -> Path:
     """Write a mesh, as Mitsuba writes it."""
-    import mitsuba as mi
-
     has = {"has_vertex_normals": mesh.normals is not None, "has_vertex_texcoords": mesh.uv is not None}
     made = mi.Mesh(file.stem, len(mesh.vertices), len(mesh.faces), **has)
     parameters = mi.traverse(made)
@@ -146,14 +149,6 @@ def write_ply(mesh: Mesh, file: Path) -> Path:
     file.parent.mkdir(parents=True, exist_ok=True)
     made.write_ply(str(file))
     return file
-
-
-Vector = tuple[float, float, float]
-
-_NOT_OF_AN_ID = re.compile(r"[\s.:/\\\"'<>&$]+")
-"""What Mitsuba or a path gives a meaning of its own."""
-
-ID_LENGTH = 64
 
 
 class Ids:

@@ -20,9 +20,6 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.tools.check import samples, shape_pictures
 from photonfarm.renderer.tools.check.findings import (
     CUT_AT_ALL,
-    INSIDE,
-    LEAST_SEEN,
-    MEANS,
     OUTSIDE,
     Finding,
     Measured,
@@ -107,16 +104,6 @@ def _choose_pictured(shapes: list[ShapeFacts], boxes: F32) -> list[int]:
     return order[:PICTURED]
 
 
-@dataclass(frozen=True, slots=True)
-class Fact:
-    """A number with what it says."""
-
-    name: str
-    value: str
-    note: str = ""
-    doubtful: bool = False
-
-
 def write(check: SceneCheck, lines: SpecLines, out: Path) -> None:
     """Write the page of a check to a file; raises StoreError where that cannot be."""
     write_page(out, page(check, lines))
@@ -143,36 +130,29 @@ def page(check: SceneCheck, lines: SpecLines) -> str:
         hues=[hue(number) for number in range(len(spec.groups))],
         groups=groups,
         shown=shown,
-        cameras=_camera_facts(check),
-        light=_light_facts(check),
+        facts_of_views=_list_facts(check),
         sections=_sections(check),
         limits={"outside": OUTSIDE, "cut": CUT_AT_ALL},
     )
 
 
-def _camera_facts(check: SceneCheck) -> list[Fact]:
-    cameras, points = check.measured.samples.cameras, check.spec.points
+def _list_facts(check: SceneCheck) -> list[tuple[str, str]]:
+    """What cameras stand in and see, and how bright that is."""
+    cameras, images, points = check.measured.samples.cameras, check.measured.samples.images, check.spec.points
     holders = ", ".join(name for name, _ in cameras.holders()[:3])
     median, low = np.percentile(cameras.seen, [50, 5])
+    better = images.exposure(TARGET)
     return [
-        Fact("stand inside objects", percent(cameras.inside_share), holders, cameras.inside_share >= INSIDE),
-        Fact("look through a wall from outside", percent(cameras.behind.mean()), "", bool(cameras.behind.any())),
-        Fact("see no surface", percent(cameras.nothing.mean()), "", bool(cameras.nothing.any())),
-        Fact(
-            "points that a view sees",
-            f"{median * points:.0f} of {points}",
-            f"5 % of views: below {low * points:.0f}",
-            bool(low < LEAST_SEEN),
+        ("cameras inside objects", f"{percent(cameras.inside_share)}{holders and f' ({holders})'}"),
+        ("cameras that look through a wall from outside", percent(cameras.behind.mean())),
+        ("cameras that see no surface", percent(cameras.nothing.mean())),
+        ("points that a view sees", f"{median * points:.0f} of {points}; 5 % of views: below {low * points:.0f}"),
+        (
+            "display mean",
+            f"{images.display_means(check.spec.exposure).mean():.2f}"
+            + ("" if better is None else f"; {TARGET:g} at exposure {better:.2g}"),
         ),
     ]
-
-
-def _light_facts(check: SceneCheck) -> list[Fact]:
-    images = check.measured.samples.images
-    mean = float(images.display_means(check.spec.exposure).mean())
-    better = images.exposure(TARGET)
-    note = "" if better is None else f"{TARGET:g} at exposure {better:.2g}"
-    return [Fact("display mean", f"{mean:.2f}", note, not MEANS[0] <= mean <= MEANS[1])]
 
 
 def _sections(check: SceneCheck) -> list[tuple[str, list[tuple[ShapeFacts, Picture]], list[ShapeFacts]]]:

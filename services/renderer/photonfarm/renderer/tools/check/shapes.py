@@ -26,25 +26,11 @@ from photonfarm.renderer.scene.surroundings import surroundings
 from photonfarm.scene.spec import Movable, SceneSpec, shape_ids
 from photonfarm.scene.spec_loading import load_spec, parse_spec
 
-_PLUGINS = {
-    "SmoothDiffuse": "diffuse",
-    "SmoothDielectric": "dielectric",
-    "ThinDielectric": "thindielectric",
-    "RoughDielectric": "roughdielectric",
-    "SmoothConductor": "conductor",
-    "RoughConductor": "roughconductor",
-    "SmoothPlastic": "plastic",
-    "RoughPlastic": "roughplastic",
-    "Principled": "principled",
-    "PrincipledThin": "principledthin",
-    "TwoSided": "twosided",
-    "MaskBSDF": "mask",
-    "BumpMap": "bumpmap",
-    "NormalMap": "normalmap",
-    "BlendBSDF": "blendbsdf",
-    "Null": "null",
-}
-"""Mitsuba's names of its material plugins, by the names of their classes."""
+_MATERIAL = re.compile(
+    r"\b(?:Smooth)?((?:Rough|Thin)?(?:Diffuse|Dielectric|Conductor|Plastic)|Principled(?:Thin)?|TwoSided|Mask|BumpMap|"
+    r"NormalMap|Blend|Null)(?:BSDF)?\["
+)
+"""How Mitsuba names materials, which are the names of their plugins but for these parts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,9 +117,7 @@ def _material(bsdf: Any) -> str:
     """The plugins of a BSDF and of those in it, each once, and its id if it has one."""
     if bsdf is None:
         return "none"
-    classes = re.findall(r"\b([A-Z]\w*)\[", str(bsdf))
-    plugins = dict.fromkeys(_PLUGINS[name] for name in classes if name in _PLUGINS)
-    kinds = "/".join(plugins) or bsdf.class_name()
+    kinds = "/".join(dict.fromkeys(name.lower() for name in _MATERIAL.findall(str(bsdf)))) or bsdf.class_name().lower()
     return f"{kinds} ({bsdf.id()})" if bsdf.id() else kinds
 
 

@@ -116,9 +116,12 @@ def slurm(
     for spec in named:
         for warning in filter(None, (*warnings(spec), hold_out_warning(spec.spec, store, request))):
             click.echo(f"warning: {warning}", err=True)
-        found = submit(spec, store, None, request, retry=retry, shard_rows=shard_rows, workers=asked.workers)
-        click.echo(f"scene {found.scene_id}: {found.planned} samples planned, {found.planned_before} before", err=True)
-        planned.append(found)
+        submission = submit(spec, store, None, request, retry=retry, shard_rows=shard_rows, workers=asked.workers)
+        click.echo(
+            f"scene {submission.scene_id}: {submission.planned} samples planned, {submission.planned_before} before",
+            err=True,
+        )
+        planned.append(submission)
     if queue_url is not None:
         from photonfarm.queue.connection import add_password
 

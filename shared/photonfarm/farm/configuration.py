@@ -26,7 +26,7 @@ def find_configuration(store: Store, scene: SceneStore, text: str | None) -> Mod
                 f"{groups} movable groups of {scene.spec.name}"
             )
         return Modification.from_vector(wanted.reshape(groups, 4))
-    found = find_samples(store, [scene.scene_id], query, limit=1).samples
-    if not found:
+    samples = find_samples(store, [scene.scene_id], query, limit=1).samples
+    if not samples:
         raise StoreError(f"--modification {text}: no plan of scene {scene.scene_id} has a configuration of this key")
-    return Modification.from_vector(np.array(found[0].modification, np.float32).reshape(groups, 4))
+    return Modification.from_vector(np.array(samples[0].modification, np.float32).reshape(groups, 4))

@@ -65,14 +65,14 @@ class Cards:
 
         Raises BackendError for a name that is none, and for a card that is not there or cannot render.
         """
-        found = NAMES.fullmatch(name)
-        if found is None:
+        match = NAMES.fullmatch(name)
+        if match is None:
             raise BackendError(f"device = {name!r}: must be {AUTO}, {CPU}, {CUDA} or {CUDA}:N")
         if name == CPU or (name == AUTO and self.trouble):
             return None
         if self.trouble:
             raise BackendError(f"device {name} cannot render here: {self.trouble}; --device {CPU} renders without")
-        number = int(found[1] or 0)
+        number = int(match[1] or 0)
         if number >= len(self.cards):
             there = ", ".join(f"{CUDA}:{card.number} ({card.name})" for card in self.cards)
             raise BackendError(f"device {name}: this machine has no such card; there is {there}")
@@ -103,8 +103,8 @@ def cards_here() -> Cards:
     command, environment = [sys.executable, "-m", __name__], {**os.environ, ORDER_VARIABLE: ORDER}
     try:
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=PROBE_S)
-        found = json.loads(done.stdout)
-        return Cards(**{**found, "cards": tuple(Card(**card) for card in found["cards"])})
+        document = json.loads(done.stdout)
+        return Cards(**{**document, "cards": tuple(Card(**card) for card in document["cards"])})
     except (subprocess.SubprocessError, ValueError, KeyError, TypeError) as error:
         return Cards(trouble=f"the NVIDIA driver did not list its cards ({' '.join(str(error).split())})")
 

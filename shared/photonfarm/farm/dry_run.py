@@ -74,28 +74,28 @@ def rehearse(
         new, known, extent = planned.new, planned.known, planned.extent
     of, cores = bytes_of_rows(spec), usable_cores()
     size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
-    found = DryRun(spec.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=cores)
+    counted = DryRun(spec.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=cores)
     if not (measure and new):
-        return found
+        return counted
     try:
         costs = costs_by_renderer(named.name, min(max(SHARE_S * new, LEAST_S), MOST_S))
     except BackendError as error:
         log(f"cost and time are not known: {error}")
-        return found
+        return counted
     spp, static = 2 * spec.transport.half_spp, not spec.groups
     core_s = costs.seconds(spp, configurations=extent.configurations, views=extent.views, samples=new)
-    found = replace(found, costs=costs, core_s=core_s, wall_s=core_s / cores)
+    counted = replace(counted, costs=costs, core_s=core_s, wall_s=core_s / cores)
     if known:
-        return found
+        return counted
     asked = Allocation(request.modifications, request.views_per_modification, request.passes, spp)
     if static:
         asked = replace(asked, modifications=asked.modifications * asked.views, views=1)
     reduction, better = CostModel.of(costs, static=static).improve(asked)
     if reduction < WORTH_A_CHANGE:
-        return replace(found, reduction=reduction)
+        return replace(counted, reduction=reduction)
     modifications, views = (None, None) if static else (better.modifications, better.views)
     suggestion = Suggestion(better.spp // 2, modifications, views, better.samples)
-    return replace(found, reduction=reduction, suggestion=suggestion)
+    return replace(counted, reduction=reduction, suggestion=suggestion)
 
 
 def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:

@@ -68,14 +68,14 @@ def _join_scene(target: Store, source: Store, there: SceneStore, on_progress: On
         return JoinedScene(there.scene_id, there.spec.name, 0, 0, 0, 0)
     here = target.scene(there.scene_id) if target.has_scene(there.scene_id) else target.add(there.spec)
     here.write_base(*reader.base())
-    found = there.plans()
-    content = plans.content(found)
+    stored_plans = there.plans()
+    content = plans.content(stored_plans)
 
     def wanted(known: PlannedContent) -> SamplesToPlan:
         return samples_to_join(content, reader.rows, known)
 
     joined = Joined(store=source.store_id, samples=len(reader.rows))
-    planned = here.plan(joined, usual_rows=found[0].shard_rows, samples=wanted)
+    planned = here.plan(joined, usual_rows=stored_plans[0].shard_rows, samples=wanted)
     copies = _Copies(reader, there)
     known = [(rows, copies.known(rows)) for rows in map(here.job_rows, here.missing_jobs())]
     whole = [rows for rows, count in known if count == len(rows.samples)]

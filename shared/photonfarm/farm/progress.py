@@ -43,17 +43,17 @@ class SceneProgress:
     @property
     def faults(self) -> list[str]:
         """Why the scene or some of its markers cannot be read, and that markers belong to no plan, in sentences."""
-        found, faults = self.status, []
-        if found.error:
-            faults.append(f"cannot be read: {found.error}")
-        if found.markers_unreadable:
+        status, faults = self.status, []
+        if status.error:
+            faults.append(f"cannot be read: {status.error}")
+        if status.markers_unreadable:
             faults.append(
-                f"{found.markers_unreadable} of {found.jobs_committed} markers cannot be read, and size, core time and "
-                f"redrawn leave them out: {found.marker_error}; `photonfarm store check` names each"
+                f"{status.markers_unreadable} of {status.jobs_committed} markers cannot be read, and size, core time "
+                f"and redrawn leave them out: {status.marker_error}; `photonfarm store check` names each"
             )
-        if found.markers_without_plan:
+        if status.markers_without_plan:
             faults.append(
-                f"{found.markers_without_plan} of {found.jobs_committed} markers are of jobs that no plan has; "
+                f"{status.markers_without_plan} of {status.jobs_committed} markers are of jobs that no plan has; "
                 "`photonfarm store check` reports whether the last plan is missing"
             )
         return faults
@@ -140,17 +140,17 @@ class FarmProgress:
 def _find_waits(farm: FarmProgress) -> Iterator[Wait]:
     """Yield why workers are idle, why jobs failed, and what trainers wait for."""
     names = {scene.status.scene_id: scene.status.name for scene in farm.scenes}
-    missing, found = farm.missing, farm.queue.status
-    if found is not None:
-        if missing and not found.workers and farm.running is None:
+    missing, status = farm.missing, farm.queue.status
+    if status is not None:
+        if missing and not status.workers and farm.running is None:
             how = "none is alive; `photonfarm work` starts one, which also queues them"
             yield Wait("no_worker", missing, f"{missing} samples wait for a worker: {how}")
-        for scene_id, reasons in found.left.items():
+        for scene_id, reasons in status.left.items():
             if scene_id in names:
-                left = f"left by {len(reasons)} of {found.workers} workers: {next(iter(reasons.values()))}"
+                left = f"left by {len(reasons)} of {status.workers} workers: {next(iter(reasons.values()))}"
                 yield Wait("scene_left", 1, f"{names[scene_id]}: {left}")
         paused: dict[str, list[str]] = {}
-        for worker, reason in found.paused.items():
+        for worker, reason in status.paused.items():
             paused.setdefault(reason, []).append(worker)
         for reason, workers in paused.items():
             who = f"worker {workers[0]} takes" if len(workers) == 1 else f"{len(workers)} workers take"

@@ -157,6 +157,6 @@ def server_binary() -> Path:
 
         return Path(get_binary_path())
     for name in ("valkey-server", "redis-server"):
-        if found := shutil.which(name):
-            return Path(found)
+        if binary := shutil.which(name):
+            return Path(binary)
     raise QueueError("no Redis server to embed: install photonfarm[redis], or a valkey-server or redis-server on PATH")

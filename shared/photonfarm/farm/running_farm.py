@@ -47,15 +47,15 @@ def announce(store: Store, *, redis_url: str, run: Path | None, web: str | None)
                 write_whole(file, json.dumps(asdict(farm)))
         yield
     finally:
-        if (found := _read(file)) is not None and found.process == os.getpid():
+        if (announced := _read(file)) is not None and announced.process == os.getpid():
             with contextlib.suppress(OSError):
                 file.unlink(missing_ok=True)
 
 
 def running_farm(store: Store) -> RunningFarm | None:
     """The farm that works on a store, if one of this user does on this machine."""
-    found = _read(_file(store))
-    return None if found is None or found.space != process_space() or is_gone(found.process) else found
+    farm = _read(_file(store))
+    return None if farm is None or farm.space != process_space() or is_gone(farm.process) else farm
 
 
 def _folder() -> Path:

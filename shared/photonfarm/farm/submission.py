@@ -108,8 +108,8 @@ def _least(request: Request, works: Callable[[Request], bool]) -> int | None:
     def of(modifications: int) -> bool:
         return works(request.model_copy(update={"modifications": modifications}))
 
-    found = bisect_left(among, True, lo=min(request.modifications, MOST_NAMED), key=of)
-    return found if found < MOST_NAMED else None
+    place = bisect_left(among, True, lo=min(request.modifications, MOST_NAMED), key=of)
+    return place if place < MOST_NAMED else None
 
 
 def _list_units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> set[Key]:

@@ -57,9 +57,9 @@ class TrainingProgress:
     def figures(self) -> str:
         """How long training still takes, and its last held-out error, each after a comma."""
         parts = [] if self.left_s is None else [f"{format_span(self.left_s)} left"]
-        if (found := self.validation) is not None:
-            error = format_estimate(found["error"], found["standard_error"])
-            parts.append(f"held-out error {error} on {format_count(found['held_out'], 'sample')}")
+        if (validation := self.validation) is not None:
+            error = format_estimate(validation["error"], validation["standard_error"])
+            parts.append(f"held-out error {error} on {format_count(validation['held_out'], 'sample')}")
         return "".join(f", {part}" for part in parts)
 
     @property
@@ -160,10 +160,10 @@ def check_run(run: Path, spec: SceneSpec, store: str | Path) -> None:
 def _record(line: bytes) -> dict[str, Any]:
     """A record of the log; empty for a line that is none."""
     try:
-        found = json.loads(line)
+        record = json.loads(line)
     except ValueError:
         return {}
-    return found if isinstance(found, dict) else {}
+    return record if isinstance(record, dict) else {}
 
 
 def _read_json(file: Path) -> dict[str, Any]:

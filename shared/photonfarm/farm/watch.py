@@ -194,12 +194,12 @@ def read_queue(store: Store, redis_url: str) -> QueueProgress:
     try:
         with redis_errors("asked"), connect(redis_url, only_s=ANSWER_S) as connection:
             check_served(connection, store)
-            found = queue_status(connection)
+            status = queue_status(connection)
     except QueueError as error:
         return QueueProgress(None, str(error), kept=group_causes(kept))
-    failed = {name: failure for name, failure in found.failed.items() if _is_missing(store, name)}
+    failed = {name: failure for name, failure in status.failed.items() if _is_missing(store, name)}
     unknown: dict[str, Failure] = {name: failure for name, failure in kept.items() if name not in failed}
-    return QueueProgress(found, causes=group_causes(failed), kept=group_causes(unknown))
+    return QueueProgress(status, causes=group_causes(failed), kept=group_causes(unknown))
 
 
 def _why_refused(redis_url: str) -> str | None:

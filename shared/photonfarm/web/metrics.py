@@ -139,7 +139,7 @@ def _measure_trainings(farm: FarmProgress) -> Iterator[Row]:
         ("trainer_heldout_standard_error", "standard_error", "The standard error of the held-out error."),
         ("trainer_heldout_samples", "held_out", "The samples that the last validation was on."),
     ):
-        yield name, "run", about, {of: found[key] for of, found in numbers.items() if _is_number(found.get(key))}
+        yield name, "run", about, {of: figures[key] for of, figures in numbers.items() if _is_number(figures.get(key))}
     spent = {
         (*of, _escape_text(activity)): seconds
         for of, training in runs.items()

@@ -132,12 +132,12 @@ class _SceneCheck:
             return self._report(None, totals, done)
         committed = markers.list_jobs(self._storage, self._name)
         scene = CheckedScene(self._storage, spec)
-        found = check_plans(scene)  # before the jobs, which need them
-        self._findings.add(found)
-        damaged = [finding for finding in found if finding.cause is Cause.PLAN_INPUTS]
+        findings = check_plans(scene)  # before the jobs, which need them
+        self._findings.add(findings)
+        damaged = [finding for finding in findings if finding.cause is Cause.PLAN_INPUTS]
         if self._quarantine and damaged:
             done += self._rewrite_plans(PlanRepair(scene, self._quarantine, joined_from), damaged)
-            self._findings.add(finding for finding in check_plans(scene) if finding not in found)
+            self._findings.add(finding for finding in check_plans(scene) if finding not in findings)
         self._findings.add(check_base(scene, committed))
         if scene.shard_rows is not None:
             self._check_jobs(scene, sorted(committed), totals, on_progress)
@@ -173,20 +173,20 @@ class _SceneCheck:
             for done in range(0, len(committed), AT_ONCE):
                 jobs = committed[done : done + AT_ONCE]
                 on_progress(scene.spec.name, done, len(committed), totals.size_bytes)
-                for job, (found, marker, read) in zip(jobs, threads.map(check, jobs), strict=True):
+                for job, (findings, marker, read) in zip(jobs, threads.map(check, jobs), strict=True):
                     totals.add(read)
-                    if found:
+                    if findings:
                         self._markers[job] = marker
-                        self._findings.add(self._tell_same(found))
+                        self._findings.add(self._tell_same(findings))
         on_progress(scene.spec.name, len(committed), len(committed), totals.size_bytes)
         self._findings.add(find_unplanned_files(scene))
         self._findings.add(self._tell_same(find_equal_samples(scene, totals)))
         if (halves := totals.halves.result()) is not None and not halves.passed:
             self._findings.add([scene.finding(Cause.HALVES_DIFFER, halves.in_words)])
 
-    def _tell_same(self, found: Iterable[Finding]) -> Iterator[Finding]:
+    def _tell_same(self, findings: Iterable[Finding]) -> Iterator[Finding]:
         """The findings, with another cause for equal halves that were equal again after being rendered again."""
-        for finding in found:
+        for finding in findings:
             equal = finding.cause in (Cause.EQUAL_HALVES, Cause.EQUAL_SAMPLES)
             same = equal and finding.job is not None and self._came_out_the_same(finding.job)
             yield replace(finding, cause=Cause.SAME_AGAIN) if same else finding

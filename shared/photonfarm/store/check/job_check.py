@@ -66,9 +66,9 @@ class _JobCheck:
         storage, name = self._scene.storage, self._marker_name
         try:
             marker = storage.read(name)
-            found = list(self._check(marker))
-            if not found or storage.read(name) == marker:
-                return found, marker, self._totals
+            findings = list(self._check(marker))
+            if not findings or storage.read(name) == marker:
+                return findings, marker, self._totals
         except FileNotFoundError:
             pass
         except OSError as error:

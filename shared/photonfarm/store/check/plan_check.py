@@ -81,24 +81,24 @@ class CheckedScene:
 def check_plans(scene: CheckedScene) -> list[Finding]:
     """What is wrong with the plans; the scene then has them, unless one is damaged."""
     scene.plans, scene.lost = None, set()
-    found: list[Finding] = []
+    findings: list[Finding] = []
     for number in range(plans.count(scene.storage, scene.name)):
         folder = plans.folder(scene.name, number)
         try:
-            found += _check_plan(scene, folder)
+            findings += _check_plan(scene, folder)
         except OSError as error:
-            found.append(scene.unreadable(folder, error))
-    if found:
-        return found
+            findings.append(scene.unreadable(folder, error))
+    if findings:
+        return findings
     try:
         there = plans.load_all(scene.storage, scene.name, [])
     except StoreError as error:
         return [scene.finding(Cause.PLAN, str(error))]
     inputs = plans.content(there)
-    found = list(_check_references(scene, there, inputs)) if there else []
-    if not found:
+    findings = list(_check_references(scene, there, inputs)) if there else []
+    if not findings:
         scene.plans = there
-    return found or (list(_check_keys(scene, there, inputs)) if there else [])
+    return findings or (list(_check_keys(scene, there, inputs)) if there else [])
 
 
 def _check_plan(scene: CheckedScene, folder: str) -> Iterator[Finding]:
@@ -140,10 +140,10 @@ def _describe_damage(storage: Storage, folder: str, group: Any, name: str, *, ma
     return "" if may_be_nan or values.dtype.kind != "f" or np.isfinite(values).all() else "is not finite"
 
 
-def _check_references(scene: CheckedScene, found: list[StoredPlan], inputs: PlannedContent) -> Iterator[Finding]:
+def _check_references(scene: CheckedScene, stored_plans: list[StoredPlan], inputs: PlannedContent) -> Iterator[Finding]:
     """Find rows and jobs out of sequence, and samples that refer to rows that hold nothing."""
     first_job = 0
-    for plan in found:
+    for plan in stored_plans:
         used = plan.rows.sample_modification != UNUSED
         wrong = used != (plan.rows.sample_view != UNUSED)
         for kind, references in (("modification", plan.rows.sample_modification), ("view", plan.rows.sample_view)):
@@ -155,17 +155,17 @@ def _check_references(scene: CheckedScene, found: list[StoredPlan], inputs: Plan
             row = plan.first_row + int(np.argmax(wrong))
             detail = f"{np.count_nonzero(wrong)} samples refer to rows that hold no modification or view"
             yield scene.finding(Cause.PLAN, detail, plan.folder, row=row)
-        if plan.first_job != first_job or plan.shard_rows != found[0].shard_rows:
+        if plan.first_job != first_job or plan.shard_rows != stored_plans[0].shard_rows:
             detail = f"begins at job {plan.first_job}; the plan before it ends at {first_job}"
             yield scene.finding(Cause.PLAN, detail, plan.folder)
         first_job = plan.end_job
 
 
-def _check_keys(scene: CheckedScene, found: list[StoredPlan], inputs: PlannedContent) -> Iterator[Finding]:
+def _check_keys(scene: CheckedScene, stored_plans: list[StoredPlan], inputs: PlannedContent) -> Iterator[Finding]:
     """Find samples whose content key does not match their content, or belongs to another sample as well."""
     modification, view = inputs.column("modification"), inputs.column("view")
     stored: list[bytes] = []
-    for plan in found:
+    for plan in stored_plans:
         rows = plan.rows
         used = np.flatnonzero(rows.sample_modification != UNUSED)
         contents = modification[rows.sample_modification[used]], view[rows.sample_view[used]]
@@ -237,9 +237,9 @@ def _find_wrong_index(geometry: Geometry, cloud: BasePointCloud, groups: int) ->
     return ""
 
 
-def jobs_to_render(found: list[StoredPlan]) -> set[int]:
+def jobs_to_render(stored_plans: list[StoredPlan]) -> set[int]:
     """All jobs of plans but the withdrawn ones."""
-    return {job for plan in found for job in plan.own_jobs if job not in plan.withdrawn}
+    return {job for plan in stored_plans for job in plan.own_jobs if job not in plan.withdrawn}
 
 
 # ---------------------------------------------------------------------------------------------------------- other files

@@ -59,7 +59,7 @@ class PlanRepair:
                 raise self._hopeless(folder, f"its request gives another {name} than is there")
         if not any(needed <= read.keys() for needed in SETTLED_BY):
             raise self._hopeless(folder, "too little of it can be read to tell that its request gives the same")
-        found = {str(finding.file).removeprefix(f"{folder}/").partition("/")[0] for finding in why}
+        damaged = {str(finding.file).removeprefix(f"{folder}/").partition("/")[0] for finding in why}
         built = self._storage.part()
         try:
             first_job, shard_rows = about.first_job, about.shard_rows
@@ -68,7 +68,7 @@ class PlanRepair:
             wrong = {
                 f"{folder}/{name}": path
                 for name, path in files.items()
-                if name.partition("/")[0] in found and self._differs(folder, name, path, about)
+                if name.partition("/")[0] in damaged and self._differs(folder, name, path, about)
             }
             self._quarantine.rewrite(self._scene.name, number, wrong, why)
         finally:

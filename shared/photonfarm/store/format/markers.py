@@ -111,7 +111,7 @@ def list_jobs(storage: Storage, scene: str) -> set[int]:
 
 def _parse_jobs(names: Iterable[str]) -> set[int]:
     """The jobs of those names in a folder of markers that are names of markers."""
-    return {int(found[1]) for name in names if (found := _NAME.fullmatch(name))}
+    return {int(match[1]) for name in names if (match := _NAME.fullmatch(name))}
 
 
 WHOLE_S = 600.0

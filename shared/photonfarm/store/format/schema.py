@@ -62,11 +62,11 @@ def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
 
 def bytes_of_rows(spec: SceneSpec) -> dict[RowKind, int]:
     """The stored bytes of one sample, one view and one modification, with inputs, uncompressed."""
-    found: dict[RowKind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
+    row_bytes: dict[RowKind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
     for name, array in output_arrays(spec).items():
         if name != "radiance_wide":  # few rows need it
-            found[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
-    return found
+            row_bytes[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
+    return row_bytes
 
 
 def bit_counts(spec: SceneSpec) -> dict[str, int]:

@@ -145,10 +145,10 @@ class ObjectStorage:
         """
         try:
             with os_errors(folder):
-                found = patiently(lambda: obstore.list_with_delimiter(self._objects, folder or None))
+                listing = patiently(lambda: obstore.list_with_delimiter(self._objects, folder or None))
         except FileNotFoundError:  # not even a bucket
-            found = {"common_prefixes": [], "objects": []}
-        paths = [*found["common_prefixes"], *(about["path"] for about in found["objects"])]
+            listing = {"common_prefixes": [], "objects": []}
+        paths = [*listing["common_prefixes"], *(about["path"] for about in listing["objects"])]
         if folder and not paths:  # the root is listed to see whether anything is there
             self.require()
         return [path.rpartition("/")[2] for path in paths]
@@ -275,10 +275,10 @@ class ObjectStorage:
             try:
                 obstore.put(objects, name, content, mode=mode, attributes={WRITER: writer}, use_multipart=False)
             except (AlreadyExistsError, PreconditionError):
-                found = self._writer(name)
-                if found == writer:
+                holder = self._writer(name)
+                if holder == writer:
                     return True
-                if found is not None and not replace:
+                if holder is not None and not replace:
                     return False
                 raise
             return True
@@ -299,10 +299,10 @@ class ObjectStorage:
     def _writer(self, name: str) -> str | None:
         """The id of the put that made an object, "" if it has none; None if there is no object."""
         try:
-            found = obstore.get(self._objects, name, options={"head": True})
+            answer = obstore.get(self._objects, name, options={"head": True})
         except FileNotFoundError:
             return None
-        return found.attributes.get(WRITER, "")
+        return answer.attributes.get(WRITER, "")
 
     # --------------------------------------------------------------------------------------------------------- sweeping
 

@@ -230,12 +230,12 @@ class JobWriter:
 
     def _summaries(self) -> dict[str, dict[str, Any]]:
         """The size and checksum of each file that is there, by array; unreadable ones are left out."""
-        found = {}
+        summaries = {}
         for name in self._arrays:
             if self._storage.exists(self._file(name)):
                 with contextlib.suppress(CorruptError):
-                    found[name] = self._look(name, Shard.summary)
-        return found
+                    summaries[name] = self._look(name, Shard.summary)
+        return summaries
 
     def _is_marker_right(self, clock: Clock) -> bool:
         """Whether the job's marker, ours or not, matches the files that are there; one that does not is set aside.

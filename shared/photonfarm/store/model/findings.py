@@ -160,9 +160,9 @@ class Findings:
         self._first: dict[Cause, list[Finding]] = {}
         self.jobs: dict[int, list[Finding]] = {}  # to be rendered again, each with its first reasons
 
-    def add(self, found: Iterable[Finding]) -> None:
+    def add(self, more: Iterable[Finding]) -> None:
         """Add findings."""
-        for finding in found:
+        for finding in more:
             self._count[finding.cause] += 1
             _keep(self._first.setdefault(finding.cause, []), finding, NAMED)
             if finding.job is not None and finding.cause.remedy is Remedy.RENDER:

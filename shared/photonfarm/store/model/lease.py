@@ -56,8 +56,8 @@ def read_leases(storage: Storage) -> dict[str, str]:
     """Sentences that somebody has a scene for itself, by scene id; costs one listing. Raises StoreError."""
     with store_errors("look for leases", storage.where):
         ids = [name.removesuffix(".json") for name in storage.names(LEASES) if name.endswith(".json")]
-        found = {scene_id: _holder(storage, scene_id) for scene_id in sorted(ids)}
-    return {scene_id: f"{holder} has it for itself" for scene_id, holder in found.items() if holder is not None}
+        holders = {scene_id: _holder(storage, scene_id) for scene_id in sorted(ids)}
+    return {scene_id: f"{holder} has it for itself" for scene_id, holder in holders.items() if holder is not None}
 
 
 @contextmanager
@@ -131,14 +131,14 @@ def _remove_dead(storage: Storage, scene_id: str) -> None:
 
 def _others_at_work(storage: Storage, scene_id: str) -> list[str]:
     """Who is at work in a scene, in words; what the dead have left is removed."""
-    folder, found = f"{LEASES}/{scene_id}", []
+    folder, others = f"{LEASES}/{scene_id}", []
     with store_errors("look who is at work in the scene", storage.where):
         for name in sorted(storage.names(folder)):
             if (who := _owner(storage, f"{folder}/{name}")) is not None:
-                found.append(who)
+                others.append(who)
             else:
                 storage.delete(f"{folder}/{name}")
-    return found
+    return others
 
 
 def _holder(storage: Storage, scene_id: str) -> str | None:

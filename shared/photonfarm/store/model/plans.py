@@ -213,11 +213,11 @@ def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: i
         times = sum(name.startswith(FORGOTTEN) for name in names)
         kept = [plan for plan in loaded if plan.forgotten == times]
         end = _counted(storage, scene, names, len(kept)) if until is None else until
-        found = kept + [replace(_load(storage, scene, n), forgotten=times) for n in range(len(kept), end)]
-        for number, plan in enumerate(found):
+        all_plans = kept + [replace(_load(storage, scene, n), forgotten=times) for n in range(len(kept), end)]
+        for number, plan in enumerate(all_plans):
             if markers.withdrawn_file(plan.folder).rpartition("/")[2] in names:
-                found[number] = _without(storage, scene, plan, markers.read_withdrawn(storage, plan.folder))
-        return found
+                all_plans[number] = _without(storage, scene, plan, markers.read_withdrawn(storage, plan.folder))
+        return all_plans
 
 
 def _without(storage: Storage, scene: str, plan: StoredPlan, jobs: frozenset[int]) -> StoredPlan:
@@ -243,12 +243,12 @@ def count(storage: Storage, scene: str) -> int:
 def _counted(storage: Storage, scene: str, names: list[str], loaded: int) -> int:
     """The number of plans by the names in their folder; the first `loaded` are known to be there."""
     numbers = [name for name in names if name.isascii() and name.isdecimal()]
-    found = max((int(name) + 1 for name in numbers if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
-    if found <= loaded:
+    count = max((int(name) + 1 for name in numbers if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
+    if count <= loaded:
         return loaded
-    last = folder(scene, found - 1)
+    last = folder(scene, count - 1)
     is_being_written = not storage.exists(f"{last}/zarr.json") and storage.exists(f"{last}.claim")
-    return found - 1 if is_being_written else found
+    return count - 1 if is_being_written else count
 
 
 def _load(storage: Storage, scene: str, number: int) -> StoredPlan:

@@ -112,9 +112,9 @@ class SceneStore:
         """
         while True:
             last = max(markers.list_jobs(self.storage, self.name), default=-1)
-            found = self.plans()  # after the markers: each one's plan is there by now
-            rows_per_job = self._shard_rows(found, shard_rows, usual_rows)
-            first_job = found[-1].end_job if found else 0
+            stored_plans = self.plans()  # after the markers: each one's plan is there by now
+            rows_per_job = self._shard_rows(stored_plans, shard_rows, usual_rows)
+            first_job = stored_plans[-1].end_job if stored_plans else 0
             if last >= first_job:
                 raise CorruptError(
                     f"{self.storage.where}/{markers.marker_name(self.name, last)}: no plan has this job, and a new "
@@ -122,17 +122,17 @@ class SceneStore:
                 )
             numbers = {"first_job": first_job, "shard_rows": rows_per_job}
             if samples is None:
-                expansion = plans.expand_again(self.spec, request, found, **numbers)
+                expansion = plans.expand_again(self.spec, request, stored_plans, **numbers)
             else:
-                expansion = expand_samples(samples(plans.content(found)), **numbers)
+                expansion = expand_samples(samples(plans.content(stored_plans)), **numbers)
             result = PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
             if expansion.rows is None or dry_run:
                 return result
             with store_errors("write a plan", self.storage.where), self._building() as built:
                 plans.build(built, self.spec, request, expansion.rows, **numbers, halves_from=halves_from)
-                if self.storage.adopt_folder(built, plans.folder(self.name, len(found))):
+                if self.storage.adopt_folder(built, plans.folder(self.name, len(stored_plans))):
                     jobs = len(expansion.rows.sample_pass) // rows_per_job
-                    return replace(result, plan=len(found), jobs=jobs)
+                    return replace(result, plan=len(stored_plans), jobs=jobs)
 
     @contextlib.contextmanager
     def _building(self) -> Iterator[Path]:
@@ -143,17 +143,17 @@ class SceneStore:
         finally:
             shutil.rmtree(built, ignore_errors=True)
 
-    def _shard_rows(self, found: list[StoredPlan], wanted: int | None, usual: int) -> int:
+    def _shard_rows(self, stored_plans: list[StoredPlan], wanted: int | None, usual: int) -> int:
         if wanted is not None and not 1 <= wanted <= MAX_SHARD_ROWS:
             raise SpecError(f"shard_rows = {wanted}: 1 to {MAX_SHARD_ROWS} samples per job are allowed")
-        if not found:
+        if not stored_plans:
             return wanted or usual
-        if wanted not in (None, found[0].shard_rows):
+        if wanted not in (None, stored_plans[0].shard_rows):
             raise SpecError(
-                f"shard_rows = {wanted}: scene {self.scene_id} has {found[0].shard_rows} samples per job, fixed by its "
-                "first plan; leave the setting out"
+                f"shard_rows = {wanted}: scene {self.scene_id} has {stored_plans[0].shard_rows} samples per job, "
+                "fixed by its first plan; leave the setting out"
             )
-        return found[0].shard_rows
+        return stored_plans[0].shard_rows
 
     # ------------------------------------------------------------------------------------------------------------- jobs
 
@@ -165,8 +165,8 @@ class SceneStore:
 
     def jobs(self) -> int:
         """The number of planned jobs; they are numbered from 0."""
-        found = self.plans()
-        return found[-1].end_job if found else 0
+        stored_plans = self.plans()
+        return stored_plans[-1].end_job if stored_plans else 0
 
     def committed_jobs(self) -> set[int]:
         """The jobs that have their marker."""
@@ -193,8 +193,8 @@ class SceneStore:
 
     def is_forgotten(self, rows: JobRows) -> bool:
         """Whether the scene was forgotten since a job was planned with these rows; it may be planned anew."""
-        found = self.plans()
-        return not found or found[0].forgotten != rows.plan.forgotten
+        stored_plans = self.plans()
+        return not stored_plans or stored_plans[0].forgotten != rows.plan.forgotten
 
     def is_still_to_do(self, rows: JobRows) -> bool:
         """Whether a job is to do, and planned with these rows still."""
@@ -215,11 +215,11 @@ class SceneStore:
         (`FollowedMarkers`).
         """
         committed = self._followed.look() if followed else self.committed_jobs()
-        found = self.plans()
-        complete = plans.complete_rows(found, committed)
-        further = [plan for plan in found if isinstance(plan.request, TopUp)]
+        stored_plans = self.plans()
+        complete = plans.complete_rows(stored_plans, committed)
+        further = [plan for plan in stored_plans if isinstance(plan.request, TopUp)]
         return Progress(
-            planned_samples=sum(plan.samples for plan in found),
+            planned_samples=sum(plan.samples for plan in stored_plans),
             committed_samples=int(np.count_nonzero(complete)),
             planned_passes=sum(plan.samples for plan in further),
             committed_passes=sum(int(np.count_nonzero(complete[p.first_row : p.end_row])) for p in further),

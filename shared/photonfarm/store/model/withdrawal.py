@@ -53,12 +53,16 @@ def withdraw(scene: SceneStore, number: int | None = None, *, on_wait: OnWait = 
 
 
 def _withdraw(scene: SceneStore, number: int | None) -> Withdrawal:
-    found, committed = scene.plans(), scene.committed_jobs()
-    if not found or (number is not None and number >= len(found)):
-        there = f"the last one is {len(found) - 1}; {_left(found, committed)}" if found else "nothing is planned"
+    stored_plans, committed = scene.plans(), scene.committed_jobs()
+    if not stored_plans or (number is not None and number >= len(stored_plans)):
+        there = (
+            f"the last one is {len(stored_plans) - 1}; {_left(stored_plans, committed)}"
+            if stored_plans
+            else "nothing is planned"
+        )
         raise SpecError(f"scene {scene.scene_id} ({scene.spec.name}): has no plan {number or 0}; {there}")
-    for plan in reversed(found) if number is None else [found[number]]:
-        jobs = _withdrawable(scene, found, plan, committed)
+    for plan in reversed(stored_plans) if number is None else [stored_plans[number]]:
+        jobs = _withdrawable(scene, stored_plans, plan, committed)
         if jobs:
             markers.write_withdrawn(scene.storage, plan.folder, plan.withdrawn | jobs)
             break
@@ -73,31 +77,31 @@ def _withdraw(scene: SceneStore, number: int | None) -> Withdrawal:
         forgotten,
         rendered,
         sum(samples.values()) - rendered - forgotten,
-        _left(found, committed | jobs),
+        _left(stored_plans, committed | jobs),
     )
 
 
-def _left(found: list[StoredPlan], done: set[int]) -> str:
+def _left(stored_plans: list[StoredPlan], done: set[int]) -> str:
     """What is planned in other jobs than those that are done, in words."""
-    jobs = {plan.number: set(range(plan.first_job, plan.end_job)) - done for plan in found}
-    samples = {plan.number: sum(map(plan.samples_in, jobs[plan.number])) for plan in found}
+    jobs = {plan.number: set(range(plan.first_job, plan.end_job)) - done for plan in stored_plans}
+    samples = {plan.number: sum(map(plan.samples_in, jobs[plan.number])) for plan in stored_plans}
     left = ", ".join(f"{count} samples of plan {number}" for number, count in samples.items() if count)
     return f"not rendered yet: {left or 'none'}"
 
 
-def _withdrawable(scene: SceneStore, found: list[StoredPlan], plan: StoredPlan, committed: set[int]) -> set[int]:
+def _withdrawable(scene: SceneStore, stored_plans: list[StoredPlan], plan: StoredPlan, committed: set[int]) -> set[int]:
     """The jobs of a plan that can be withdrawn: not committed, and no sample that stays refers to their rows."""
     jobs = set(range(plan.first_job, plan.end_job)) - committed - plan.withdrawn
     while True:
         leant_on: set[int] = set()
-        for other in found[plan.number :]:
+        for other in stored_plans[plan.number :]:
             own, referred = _references(other)
             leaning = ~np.isin(own, list(jobs)) & np.isin(referred, list(jobs)).any(axis=1)
             leant_on = jobs & set(referred[leaning].ravel().tolist())
             if other.number > plan.number and not committed.issuperset(own[leaning].tolist()):
                 of = f"plan {plan.number} of scene {scene.scene_id} ({scene.spec.name})"
                 why = f"plan {other.number} has samples of its views or configurations"
-                first = f"withdraw plan {other.number} first; {_left(found, committed)}"
+                first = f"withdraw plan {other.number} first; {_left(stored_plans, committed)}"
                 raise SpecError(f"{of}: {why}; {first}")
             if leant_on:
                 break

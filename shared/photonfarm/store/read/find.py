@@ -85,17 +85,17 @@ class Matches:
 def scene_named(store: Store, text: str) -> str:
     """The id of a scene, given its id, the beginning of its id, or its name; StoreError unless exactly one fits."""
     ids = store.scene_ids()
-    found = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
-    found = found or [each for each in ids if name_of(store, each) == text]
-    if len(found) > 1 and all(name_of(store, each) == text for each in found):
-        apart = tell_apart(store, found)
-        raise StoreError(f"{store.storage.where}: {len(found)} scenes have the name {text!r}: {apart}; give an id")
-    if len(found) != 1:
-        held = f"{len(found)} scenes have" if found else "no scene has"
-        each_named = ", ".join(f"{each} ({name_of(store, each) or 'unreadable'})" for each in found or ids)
+    matching = [each for each in ids if each == text] or [each for each in ids if text and each.startswith(text)]
+    matching = matching or [each for each in ids if name_of(store, each) == text]
+    if len(matching) > 1 and all(name_of(store, each) == text for each in matching):
+        apart = tell_apart(store, matching)
+        raise StoreError(f"{store.storage.where}: {len(matching)} scenes have the name {text!r}: {apart}; give an id")
+    if len(matching) != 1:
+        held = f"{len(matching)} scenes have" if matching else "no scene has"
+        each_named = ", ".join(f"{each} ({name_of(store, each) or 'unreadable'})" for each in matching or ids)
         known = f"give one of the ids {each_named}" if ids else "the store has no scenes yet"
         raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
-    return found[0]
+    return matching[0]
 
 
 def is_spec_file(named: str) -> bool:
@@ -119,18 +119,18 @@ def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit:
 
     A scene whose number of movable groups differs from the query's vector has no match. Raises StoreError.
     """
-    found = [(index, SceneMatch(store.scene(scene_id), query)) for index, scene_id in enumerate(scene_ids)]
+    matches = [(index, SceneMatch(store.scene(scene_id), query)) for index, scene_id in enumerate(scene_ids)]
     order = sorted(
         (
             (float(d), index, int(row), match)
-            for index, match in found
+            for index, match in matches
             for row, d in zip(match.rows[:limit], match.distance[:limit], strict=True)
         ),
         key=lambda entry: entry[:3],
     )
-    nearest = [match.nearest for _, match in found if match.nearest is not None]
+    nearest = [match.nearest for _, match in matches if match.nearest is not None]
     described = tuple(match.describe(row, distance) for distance, _, row, match in order[:limit])
-    return Matches(sum(len(match.rows) for _, match in found), described, min(nearest, default=None))
+    return Matches(sum(len(match.rows) for _, match in matches), described, min(nearest, default=None))
 
 
 F64 = NDArray[np.float64]
@@ -268,7 +268,7 @@ class SceneMatch:
         )
 
     def _places(self, rows: dict[str, int]) -> list[Place]:
-        found = []
+        places = []
         for name, array in schema.output_arrays(self._scene.spec).items():
             row = rows[array.kind]
             plan = plans.plan_of(self._plans, row)
@@ -276,10 +276,10 @@ class SceneMatch:
             file = plan.shard(name, array, job)
             there = self._is_there(file, array, chunk, plan.shard_rows)
             if there or name != "radiance_wide":  # few samples need that one
-                found.append(Place(name, file, chunk, row - plan.first_row, there))
-        if any(place.array == "radiance_wide" for place in found):  # and those have nothing in `radiance`
-            found = [place for place in found if place.array != "radiance" or place.there]
-        return found
+                places.append(Place(name, file, chunk, row - plan.first_row, there))
+        if any(place.array == "radiance_wide" for place in places):  # and those have nothing in `radiance`
+            places = [place for place in places if place.array != "radiance" or place.there]
+        return places
 
     def _is_there(self, file: str, array: schema.ArraySchema, chunk: int, shard_rows: int) -> bool:
         storage = self._scene.storage
@@ -351,10 +351,10 @@ def tell_apart(store: Store, scene_ids: Sequence[str]) -> str:
 def describe_samples(scene: SceneStore) -> str:
     """How many samples of a scene are complete, in words."""
     try:
-        found = scene.progress()
+        progress = scene.progress()
     except StoreError:
         return "its plans cannot be read"
-    return f"{found.committed_samples} of {found.planned_samples} samples complete"
+    return f"{progress.committed_samples} of {progress.planned_samples} samples complete"
 
 
 def describe_differences(there: SceneSpec, here: SceneSpec) -> str:

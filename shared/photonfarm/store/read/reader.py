@@ -126,10 +126,10 @@ class SceneReader:
         return np.flatnonzero(complete & ~before)
 
     def _load_plans(self) -> None:
-        known, found = self._plans, plans.load_all(self._storage, self._name, self._plans)
-        if known and (not found or found[0].forgotten != known[0].forgotten):
+        known, loaded = self._plans, plans.load_all(self._storage, self._name, self._plans)
+        if known and (not loaded or loaded[0].forgotten != known[0].forgotten):
             raise self._forgotten()
-        self._plans = found
+        self._plans = loaded
         if self._plans != known:
             self._committed = set()  # complete rows are to be counted again
             inputs = plans.content(self._plans)

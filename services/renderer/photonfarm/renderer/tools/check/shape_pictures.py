@@ -85,8 +85,14 @@ def draw_shape(vertices: F32, faces: NDArray[np.uint32], projection: Projection,
     It takes a scene of its own, in which a ray's triangle is found without Mitsuba's shapes: Dr.Jit traces the code of
     all that are loaded whenever one of them is asked.
     """
+    mesh = mi.Mesh("alone", len(vertices), len(faces))
+    parameters = mi.traverse(mesh)
+    parameters["vertex_positions"] = floats(vertices)
+    parameters["faces"] = integers(faces)
+    parameters.update()
+    scene = mi.load_dict({"type": "scene", "alone": mesh})
     origin, size = projection.rays(width)
-    hit = _scene_of(vertices, faces).ray_intersect_preliminary(_rays_along(projection, origin))
+    hit = scene.ray_intersect_preliminary(_rays_along(projection, origin))
     met, face = np.isfinite(np.array(hit.t)), np.array(hit.prim_index)
     corners = vertices[faces[np.where(met, face, 0)]].astype(np.float64)
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -98,29 +104,15 @@ def _rays_along(projection: Projection, origin: F32) -> Any:
     return mi.Ray3f(o=points(origin), d=mi.Vector3f(*map(float, projection.forward)))
 
 
-def _scene_of(vertices: F32, faces: NDArray[np.uint32]) -> Any:
-    mesh = mi.Mesh("alone", len(vertices), len(faces))
-    parameters = mi.traverse(mesh)
-    parameters["vertex_positions"] = floats(vertices)
-    parameters["faces"] = integers(faces)
-    parameters.update()
-    return mi.load_dict({"type": "scene", "alone": mesh})
-
-
 def _shade(number: NDArray[np.int64], facing: NDArray[Any], colours: F32) -> Picture:
     """Shapes' colours, darker where a surface (H, W) is seen at an angle; outlines where shapes meet."""
     shade = 0.55 + 0.45 * np.abs(facing)
     picture = np.where(number[..., None] == NOTHING, PAPER, 255 * shade[..., None] * colours[number])
-    picture[_edges(number)] *= OUTLINE
-    return np.round(picture.clip(0, 255)).astype(np.uint8)
-
-
-def _edges(number: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Where the pixel to the right or below shows another shape, (H, W)."""
-    edges = np.zeros(number.shape, np.bool_)
+    edges = np.zeros(number.shape, np.bool_)  # where the pixel to the right or below shows another shape
     edges[:, :-1] |= number[:, :-1] != number[:, 1:]
     edges[:-1] |= number[:-1] != number[1:]
-    return edges
+    picture[edges] *= OUTLINE
+    return np.round(picture.clip(0, 255)).astype(np.uint8)
 
 
 def shape_colours(scene: Any, geometry: Geometry) -> F32:

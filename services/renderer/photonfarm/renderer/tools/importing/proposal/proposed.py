@@ -155,10 +155,14 @@ def propose(scene: Any, frame: Frame, camera: Points | None, objects: Mapping[st
     for number, thing in enumerate(things):
         moves[thing.pieces] = number
     views = _around(surfaces.main(), frame, camera)
-    plan, movables = None, []
+    plan, movables = None, list[Movable]()
     if not room.is_stage:
         plan = FloorPlan.of(pieces, room, moves < 0, surfaces.lights)
-        movables = [_movable(thing, plan) for thing in things]
+        for thing in things:  # flat in height, and clear of all that does not move
+            at = thing.at
+            place = _place(plan, at[:2], thing.size[:2], thing.low[2], thing.high[2], hangs=thing.hangs)
+            low, high = (np.array([*corner, at[2]]) for corner in place or (at[:2], at[:2]))
+            movables.append(Movable(thing, Box(low, high)))
         origin = _origin(plan, scene, frame)
         views.insert(0, View(origin, _look_at(movables, room, origin)))
     light = _light(scene, frame, room, views[0].origin, plan)
@@ -236,14 +240,6 @@ def _place(
         bottom += clear
     free = plan.free(bottom, top, size / 2, room.high[2] if hangs else room.floor) & ~plan.blocks(lights, size / 2)
     return plan.box_around(free, middle, RANGE * room.size[:2])
-
-
-def _movable(thing: Thing, plan: FloorPlan) -> Movable:
-    """Where a thing may be: flat in height, and clear of all that does not move."""
-    at = thing.at
-    place = _place(plan, at[:2], thing.size[:2], thing.low[2], thing.high[2], hangs=thing.hangs)
-    low, high = (np.array([*corner, at[2]]) for corner in place or (at[:2], at[:2]))
-    return Movable(thing, Box(low, high))
 
 
 def _origin(plan: FloorPlan, scene: Any, frame: Frame) -> Box:

@@ -87,7 +87,8 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
         predict = run.predictor(feed.spec, feed.base, device)
     shown = {"prediction": (image := predict(batch)[0]), "target": batch.target[0].mean(dim=0).numpy()}
     files = tuple(out / f"{name}.png" for name in shown)
-    _make_folder(out)
+    with store_errors("make the folder of the pictures", out):
+        out.mkdir(parents=True, exist_ok=True)
     for file, pixels in zip(files, shown.values(), strict=True):
         write_png(enlarge(pixels), file)
     (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
@@ -135,7 +136,8 @@ def show_frames(
     source = _open_source(store, run)
     _check_frames(run, frames, source.spec)
     predict = run.predictor(source.spec, source.base(), device)
-    _make_folder(out)
+    with store_errors("make the folder of the pictures", out):
+        out.mkdir(parents=True, exist_ok=True)
     files = [out / f"frame-{i:04}.png" for i in range(len(frames))]
     seconds = 0.0
     frame_batches = _read_frames(run, frames, source)
@@ -203,11 +205,6 @@ def _open_source(store: str | Path, run: TrainedRun) -> SceneReader:
     source = run.source(Store(store).root)
     _ = source.spec  # which says what is there instead
     return source
-
-
-def _make_folder(folder: Path) -> None:
-    with store_errors("make the folder of the pictures", folder):
-        folder.mkdir(parents=True, exist_ok=True)
 
 
 def write_gif(pictures: Sequence[Path], file: Path, fps: float) -> None:

@@ -22,7 +22,7 @@ from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.model.scene_store import list_scenes
 from photonfarm.store.read.find import describe_scenes
 from photonfarm.trainer.runs.progress import RunProgress, follow_progress
-from photonfarm.trainer.runs.run_folder import lock_run, note_scene_folder, write_views
+from photonfarm.trainer.runs.run_folder import INITIAL, lock_run, note_scene_folder, write_views
 from photonfarm.trainer.runs.settings import TrainSettings, make_settings
 from photonfarm.trainer.runs.user_code import name_in_errors
 
@@ -233,13 +233,11 @@ def _find_spec(spec: str | None, store: str | Path) -> SceneSpec:
 
 def _read_beginning(folder: Path) -> tuple[str | None, float | None]:
     """The scene that a run was begun on, and its exposure then; None for a new run."""
-    from photonfarm.trainer.runs import checkpoint
-    from photonfarm.trainer.runs.run_folder import INITIAL
+    from photonfarm.trainer.runs import checkpoint  # loads torch
 
-    begun = folder / INITIAL
-    if not begun.exists():
+    if not (folder / INITIAL).exists():
         return None, None
-    state = checkpoint.load(begun)
+    state = checkpoint.load(folder / INITIAL)
     return str(state["scene_id"]), float(state["exposure"])
 
 

@@ -45,11 +45,7 @@ ARCHITECTURES: dict[str, NetworkKind] = {
     "guided_transport_photons": NetworkKind(
         partial(Guided, transport=LitPoints, photons=True), Needs(photons=True, guides=True)
     ),
-    "denoise_1": NetworkKind(Denoiser, Needs(points=False, kept=1)),
-    "denoise_4": NetworkKind(Denoiser, Needs(points=False, kept=4)),
-    "denoise_16": NetworkKind(Denoiser, Needs(points=False, kept=16)),
-    "denoise_32": NetworkKind(Denoiser, Needs(points=False, kept=32)),
-    "denoise_64": NetworkKind(Denoiser, Needs(points=False, kept=64)),
+    **{f"denoise_{kept}": NetworkKind(Denoiser, Needs(points=False, kept=kept)) for kept in (1, 4, 16, 32, 64)},
 }
 
 

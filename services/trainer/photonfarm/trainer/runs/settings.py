@@ -81,21 +81,9 @@ def refuse_biasing(settings: Any) -> Any:
 
 
 Occlusion = Literal["exact", "window"]
-Architecture = Literal[
-    "cnn",
-    "feature_projection",
-    "light_transport",
-    "light_transport_photons",  # of the paper
-    "guided",
-    "guided_transport",
-    "guided_photons",
-    "guided_transport_photons",  # ours, given the guides of a view
-    "denoise_1",
-    "denoise_4",
-    "denoise_16",
-    "denoise_32",
-    "denoise_64",
-]
+PaperNetwork = Literal["cnn", "feature_projection", "light_transport", "light_transport_photons"]
+GuidedNetwork = Literal["guided", "guided_transport", "guided_photons", "guided_transport_photons"]  # ours
+Architecture = Literal[PaperNetwork, GuidedNetwork, "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64"]
 Precision = Literal["float32", "tf32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
 EmissionScale = Literal["linear", "log"]

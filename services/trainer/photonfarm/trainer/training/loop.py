@@ -310,7 +310,8 @@ class Session:
             self._stream.ask_again()
         self._validated = self._step
         if self._settings.recover:
-            self._compare(now)
+            self._compared = compare(now, self._best)
+            self._best = now.state() if self._compared.is_best else self._best
         elif not now.is_finite:
             raise DivergedError(f"the held-out error of step {self._step} is {now.held_out.error.mean}")
         if now.is_finite:
@@ -331,11 +332,6 @@ class Session:
             **self._counts(),
         )
         self._seconds_logged = seconds
-
-    def _compare(self, now: Validation) -> None:
-        self._compared = compare(now, self._best)
-        if self._compared.is_best:
-            self._best = now.state()
 
     def _keep_or_go_back(self) -> None:
         """Keep the state after the last validation, or go back, in all processes."""
@@ -377,16 +373,12 @@ class Session:
             rate_factor=self._learner.rate_factor,
         )
 
-    def _used(self) -> tuple[int, int]:
-        """The number of draws so far, and of arrived samples."""
-        return self._step * self._settings.batch, len(self._stream.arrived)
-
     def _report_draws(self) -> None:
         if self._hooks.on_draws is not None:
-            self._hooks.on_draws(*self._used())
+            self._hooks.on_draws(self._step * self._settings.batch, len(self._stream.arrived))
 
     def _counts(self) -> dict[str, Any]:
-        draws, samples = self._used()
+        draws, samples = self._step * self._settings.batch, len(self._stream.arrived)
         ahead = round(divide_by_used(samples, draws), 3)
         seconds = {k: round(v, 3) for k, v in self._watch.seconds.items()}
         return {"draws": draws, "samples": samples, "samples_per_used": ahead, "seconds": seconds}

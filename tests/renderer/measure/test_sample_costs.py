@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -70,7 +69,6 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     rendered: list[tuple[Any, ...]] = []
     monkeypatch.setattr(room, "base", lambda: (None, cloud))
     monkeypatch.setattr(backend, "work_s", lambda: clock[0])
-    monkeypatch.setattr(measuring, "time", SimpleNamespace(monotonic=lambda: clock[0]))
     monkeypatch.setattr(room, "apply", configured)
     monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))

@@ -152,12 +152,3 @@ def report(store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, 
         figures = write_report(store, list(dict.fromkeys(runs)), out, on_progress=on_progress, timed=not untimed, **how)
     click.echo(figures["verdict"], err=True)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")
-
-
-def __getattr__(name: str) -> Any:
-    """Find `infer` for installations whose entry points still name it here."""
-    if name != "infer":
-        raise AttributeError(name)
-    from photonfarm.predict.verb import infer
-
-    return infer

@@ -2,8 +2,7 @@
 
 Redis is disposable: every job in it can be derived again from plans and markers. Our keys, beside RQ's:
 
-rq:photonfarm:worker:<name>             what a worker tells of itself, for seconds
-rq:photonfarm:workers                   the names of all workers
+rq:worker:<name>, field photonfarm      what a worker tells of itself
 rq:photonfarm:reconcile                 lock of the process that fills the queue
 rq:photonfarm:looked:<scene id, or all> what the last look at the store found, for seconds
 rq:photonfarm:store                     the id of the store that this Redis serves, while it is in use

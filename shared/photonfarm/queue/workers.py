@@ -1,7 +1,7 @@
-"""Workers as they tell of themselves, each in a JSON document: who is alive, doing what, and why idle.
+"""Workers as they tell of themselves, in the hash that RQ has for each: who is alive, doing what, and why idle.
 
-Redis drops a document by its own clock unless it is written again. What it says is for people, and no decision depends
-on it but whether a name is taken.
+Redis drops a hash by its own clock unless it is written again. Beside RQ's fields it has one of ours, a JSON document;
+what it says is for people, and no decision depends on it but whether a name is taken.
 
 A Redis serves one store at a time, as its workers take any queued job: a worker for another store would drop the jobs
 that it does not know. So every process that queues or works registers its store, and is refused while another store is
@@ -15,8 +15,10 @@ from __future__ import annotations
 
 import json
 import os
+import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from itertools import count
 
 from redis import Redis
@@ -25,11 +27,15 @@ from redis.client import Pipeline
 from photonfarm.core.errors import QueueError
 from photonfarm.core.processes import is_gone, process_space
 from photonfarm.queue.connection import redis_errors
-from photonfarm.queue.job import STARTED_KEY
+from photonfarm.queue.job import QUEUE, STARTED_KEY
 from photonfarm.store import Store
 
-WORKER, WORKERS = "rq:photonfarm:worker:", "rq:photonfarm:workers"
-"""How the key of a worker's report begins, and the set of all workers' names."""
+WORKER = "rq:worker:"
+ALL_WORKERS, WORKERS = "rq:workers", f"rq:workers:{QUEUE}"
+"""RQ's sets of the keys of all workers, and of those of our queue."""
+
+REPORT = "photonfarm"
+"""The field of the hash that is ours."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +64,7 @@ class WorkerReport:
 
     @classmethod
     def of(cls, text: bytes | str) -> WorkerReport:
-        """The report that a worker has written."""
+        """The report in a worker's hash."""
         report = json.loads(text)
         return cls(**report | {"doing": Activity(**report["doing"]) if report["doing"] else None})
 
@@ -77,34 +83,55 @@ def take_name(connection: Redis, wanted: str, *, ttl_s: float) -> str:
     """Take a name for a worker of this process: this one, or with a number behind it while another worker has it."""
     for number in count(1):
         name = wanted if number == 1 else f"{wanted}-{number}"
-        written = connection.get(WORKER + name)
+        written = connection.hget(WORKER + name, REPORT)
         if written is not None and WorkerReport.of(written).has_ended:
             bury(connection, name)
-        if connection.set(WORKER + name, json.dumps(asdict(WorkerReport())), nx=True, px=int(1000 * ttl_s)):
-            connection.sadd(WORKERS, name)
+        if connection.hsetnx(WORKER + name, REPORT, json.dumps(asdict(WorkerReport()))):
+            with connection.pipeline() as pipeline:
+                beat(pipeline, name, WorkerReport(), ttl_s=ttl_s)
+                pipeline.execute()
             return name
     raise AssertionError  # count() does not end
 
 
 def beat(pipeline: Pipeline, name: str, report: WorkerReport, *, ttl_s: float) -> None:
     """Write that a worker is alive, and what it tells; all of it, as Redis may have lost it."""
-    pipeline.set(WORKER + name, json.dumps(asdict(report)), px=int(1000 * ttl_s))
-    pipeline.sadd(WORKERS, name)
+    key, now = WORKER + name, datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S.%fZ")
+    known = {
+        "last_heartbeat": now,
+        "queues": QUEUE,
+        "pid": report.process,
+        "hostname": socket.gethostname(),
+        "state": "busy" if report.doing else "idle",
+        REPORT: json.dumps(asdict(report)),
+    }
+    pipeline.hsetnx(key, "birth", now)
+    pipeline.hset(key, mapping=known)  # type: ignore[arg-type]
+    pipeline.pexpire(key, int(1000 * ttl_s))
+    for workers in (ALL_WORKERS, WORKERS):
+        pipeline.sadd(workers, key)
 
 
 def bury(connection: Redis, name: str) -> None:
     """Remove a worker."""
-    connection.delete(WORKER + name)
-    connection.srem(WORKERS, name)
+    with connection.pipeline() as pipeline:
+        pipeline.delete(WORKER + name)
+        for workers in (ALL_WORKERS, WORKERS):
+            pipeline.srem(workers, WORKER + name)
+        pipeline.execute()
 
 
 def read_workers(connection: Redis) -> dict[str, WorkerReport]:
     """The workers that are alive, by name; those of this machine only if their process is. Forgets the others."""
-    names = sorted(decode_text(name) for name in connection.smembers(WORKERS))
-    texts = connection.mget([WORKER + name for name in names]) if names else []
+    names = sorted(decode_text(key).removeprefix(WORKER) for key in connection.smembers(WORKERS))
+    with connection.pipeline(transaction=False) as pipeline:
+        for name in names:
+            pipeline.hget(WORKER + name, REPORT)
+        texts = pipeline.execute()
     reports = {name: WorkerReport.of(text) for name, text in zip(names, texts, strict=True) if text is not None}
-    if ended := set(names) - reports.keys():
-        connection.srem(WORKERS, *ended)
+    for name in names:
+        if name not in reports:
+            bury(connection, name)
     return {name: report for name, report in reports.items() if not report.has_ended}
 
 

@@ -9,7 +9,9 @@ from pathlib import Path
 import pytest
 import queue_samples
 import redis
+from rq import Worker
 
+from photonfarm.queue.job import QUEUE
 from photonfarm.queue.reconciliation import reconcile
 from photonfarm.queue.rq_adapter import QueueStatus, queue_status
 from photonfarm.queue.workers import (
@@ -92,6 +94,8 @@ def test_workers_are_told_of_as_rq_does_for_a_time_and_again_after_redis_lost_th
     for _ in range(2):
         told(connection, "a:b", report)
         assert 0 < connection.pttl(f"{WORKER}a:b") <= 60_000
+        (worker,) = Worker.all(connection)
+        assert (worker.name, worker.pid, worker.queue_names()) == ("a:b", os.getpid(), [QUEUE])
         status = queue_status(connection)
         assert (status.workers, status.paused, status.left) == (
             1,

@@ -37,14 +37,16 @@ def parse(path: Path) -> Located:
         if isinstance(element, Located):
             element.line = parser.CurrentLineNumber
 
-    def refuse(*_: object) -> None:
+    def refuse(*entity: str | bool | None) -> None:  # its name first, its file fifth; nothing for a whole DOCTYPE
+        file = f"{entity[4]}" if entity and entity[4] else "…"
+        what = f"entity {entity[0]!r} of file {file!r}, which stands" if entity else "a DOCTYPE, whose entities stand"
         raise ParseError(
-            f"line {parser.CurrentLineNumber}: has a DOCTYPE, whose entities stand for content that is not read; "
-            'write <include filename="…"/> in their place, or the content itself'
+            f"line {parser.CurrentLineNumber}: has {what} for content that is not read; "
+            f'write <include filename="{file}"/> where it is named, or the content itself'
         )
 
     parser.StartElementHandler, parser.EndElementHandler = start, builder.end
-    parser.StartDoctypeDeclHandler = refuse
+    parser.EntityDeclHandler = parser.EndDoctypeDeclHandler = refuse
     try:
         parser.Parse(path.read_bytes(), True)
     except expat.ExpatError as error:

@@ -82,13 +82,14 @@ def _place(lamp: Any, place: str) -> None:
 
 
 def _add_nodes(tree: Any, nodes: dict[str, Any]) -> None:
-    """Set the inputs of a tree's first shader: values, or `[type of node, its first input]`."""
+    """Set the inputs of a tree's first shader: values, or `[type of node, its first inputs]`."""
     shader = next(node for node in tree.nodes if node.type in ("EMISSION", "BACKGROUND"))
     for name, value in nodes.items():
         if isinstance(value, list) and isinstance(value[0], str):
             node = tree.nodes.new(value[0])
-            if len(value) > 1:
-                (node.inputs[0] if node.inputs else node.outputs[0]).default_value = value[1]
+            for part, number in zip(node.inputs or node.outputs, value[1:], strict=False):
+                if isinstance(number, (int, float)):
+                    part.default_value = number
             tree.links.new(node.outputs[0], shader.inputs[name])
         else:
             shader.inputs[name].default_value = value

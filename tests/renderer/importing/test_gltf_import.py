@@ -179,7 +179,11 @@ def test_the_units_of_blenders_lamps_are_said(gltf: Any, quad: Quad, read: Read)
 def test_what_has_no_effect_on_a_still_picture_is_no_loss(gltf: Any, quad: Quad, read: Read) -> None:
     gltf.document |= {"animations": [{}, {}], "extensionsUsed": ["EXT_unused"]}
     gltf.document["extensionsRequired"] = ["KHR_materials_variants"]
-    neutral = {"KHR_materials_clearcoat": {"clearcoatFactor": 0}, "KHR_xmp_json_ld": {}, "KHR_materials_specular": {}}
+    neutral: dict[str, Any] = {"KHR_xmp_json_ld": {}, "KHR_materials_specular": {}, "KHR_materials_sheen": {}}
+    neutral |= {
+        "KHR_materials_clearcoat": {"clearcoatFactor": 0},
+        "KHR_materials_anisotropy": {"anisotropyStrength": 0},
+    }
     changes = list(read(quad(extensions=neutral, occlusionTexture={"index": 0})).changes)
     assert {change.effect for change in changes} == {None}
     assert {change.name for change in changes} == {"animations", "KHR_xmp_json_ld", "occlusionTexture"}
@@ -260,6 +264,16 @@ def test_normal_maps_keep_their_upper_side_where_images_are_mirrored(
         for y, value in ((0.5**0.5, 0.2515), (-(0.5**0.5), 0)):
             lit = si.bsdf().eval(mi.BSDFContext(), si, si.to_local(mi.Vector3f(0, y, 0.5**0.5)))
             assert np.array(lit).ravel()[0] == pytest.approx(value, abs=3e-3)
+
+
+@pytest.mark.parametrize(("tangent", "lost"), [([1, 0, 0, 1], []), ([0, 1, 0, 1], [("colour", "TANGENT")])])
+def test_tangents_that_are_turned_against_the_texture_are_said(
+    gltf: Any, quad: Quad, read: Read, tangent: list[float], lost: Any
+) -> None:
+    quad(normalTexture=gltf.image(FOUR, "four.png"))
+    attributes = gltf.document["meshes"][0]["primitives"][0]["attributes"]
+    attributes["TANGENT"] = gltf.array(np.tile(np.array([tangent], "<f4"), (4, 1)), "VEC4")
+    assert losses(read(gltf.write())) == lost
 
 
 def test_grey_of_16_bits_has_its_value(case: Callable[[str], Path], loaded: Loaded) -> None:

@@ -105,6 +105,10 @@ def test_textures_take_an_image_that_is_read_times_its_factor_or_the_factor_alon
     scene, made = loaded(gltf.write())
     assert losses(scene) == [("colour", "KHR_texture_basisu")]
     assert colour_at(made, 0.25, 0.75) == [0.25, 1, 1]
+    gltf.document["textures"][0] = {"source": 0, "extensions": {"EXT_texture_avif": {"source": 1}}}
+    scene, _ = loaded(gltf.write())
+    assert losses(scene) == []
+    assert "EXT_texture_avif" in [change.name for change in scene.changes]
 
 
 def test_roughness_is_the_green_channel_and_metallic_the_blue_one_raw_and_times_their_factors(
@@ -220,6 +224,7 @@ def test_what_is_masked_away_by_its_factor_is_not_there(gltf: Any, quad: Quad, r
         (np.outer([0, 255, 255, 0], [1, 1, 1]).astype("|u1"), "VEC3", False, []),
         (np.outer([0, 1, 1, 0], [1, 1, 1]).astype("<f4"), "VEC3", True, ["COLOR_0"]),
         (np.array([[1, 1, 1, 0], [1, 1, 1, 1]] * 2, "<f4"), "VEC4", False, ["COLOR_0"]),
+        (np.full((4, 4), 0.5, "<f4"), "VEC4", True, []),
         (np.ones((4, 4), "<f4"), "VEC4", True, []),
     ],
 )
@@ -267,9 +272,32 @@ def test_a_clear_coat_is_carried_over_with_its_images(gltf: Any, quad: Quad, loa
     assert losses(scene) == []
 
 
-def test_the_colour_and_gloss_of_the_old_model_stay_with_a_loss(quad: Quad, read: Read) -> None:
-    gloss = {"diffuseFactor": [0.5, 0.25, 0.125, 1], "specularFactor": [0.9, 0.6, 0.3], "glossinessFactor": 0.75}
+@pytest.mark.parametrize(
+    ("diffuse", "specular", "base", "metal"),
+    [
+        ([0.5, 0.25, 0.125], [0.04, 0.04, 0.04], [0.5, 0.25, 0.125], 0),  # a dielectric as metallic-roughness has it
+        ([0, 0, 0], [0.9, 0.6, 0.3], [0.9, 0.6, 0.3], 1),  # a metal
+    ],
+)
+def test_specular_glossiness_becomes_metal_and_roughness(
+    quad: Quad, read: Read, diffuse: Any, specular: Any, base: Any, metal: float
+) -> None:
+    gloss = {"diffuseFactor": [*diffuse, 1], "specularFactor": specular, "glossinessFactor": 0.75}
     scene = read(quad(extensions={"KHR_materials_pbrSpecularGlossiness": gloss}))
-    made = {part.get("name"): part.get("value") for part in of_type(scene.root, "principled")}
-    assert (made["base_color"], made["metallic"], made["roughness"]) == ("0.5, 0.25, 0.125", "0", "0.25")
-    assert losses(scene) == [("colour", "KHR_materials_pbrSpecularGlossiness")]
+    made = {part.get("name"): part.get("value") or "" for part in of_type(scene.root, "principled")}
+    assert [float(part) for part in made["base_color"].split(",")] == pytest.approx(base, abs=2e-3)
+    assert float(made["metallic"]) == pytest.approx(metal, abs=2e-3)
+    assert float(made["roughness"]) == pytest.approx(0.25)
+    assert losses(scene) == []
+
+
+def test_images_of_unlike_size_are_joined_texel_by_texel(gltf: Any, quad: Quad, loaded: Loaded) -> None:
+    leaf = gltf.image(np.dstack([FOUR, np.array([[0, 100], [200, 255]])]), "leaf.png")
+    glow = gltf.image(np.full((3, 5, 3), 255), "glow.png")
+    surface = {"baseColorTexture": leaf, "metallicFactor": 0}
+    scene, made = loaded(
+        quad(pbrMetallicRoughness=surface, alphaMode="MASK", emissiveFactor=[1, 1, 1], emissiveTexture=glow)
+    )
+    si = look_down(made, mi.Float([0.1, 0.9, 0.1, 0.9]), mi.Float([5 / 6, 5 / 6, 1 / 6, 1 / 6]))
+    assert np.array(si.emitter(made).eval(si))[1].tolist() == pytest.approx([0, 0, 1, 1], abs=1e-3)
+    assert losses(scene) == []

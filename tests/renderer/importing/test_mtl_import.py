@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import mitsuba as mi
 import numpy as np
 import pytest
 from imported_scenes import (
@@ -18,6 +20,7 @@ from imported_scenes import (
     Write,
     area,
     emission,
+    hit,
     lost,
     opacity,
     reflectance,
@@ -28,7 +31,7 @@ from PIL import Image
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import images
 
-LOST = ("Pr", "map_Pm", "map_Bump", "norm", "map_Tr")
+LOST = ("map_Bump", "norm", "map_Tr", "Pr")
 
 
 @pytest.mark.parametrize(
@@ -38,6 +41,8 @@ LOST = ("Pr", "map_Pm", "map_Bump", "norm", "map_Tr")
         ("Kd .5 .5 .5\nKs .5 .5 .5\nNs 98\nillum 2", ["RoughPlastic", "alpha = [0.141"]),
         ("Kd .5 .5 .5\nKs .5 .5 .5\nNs 6\nillum 2", ["Principled", "roughness: UniformSpectrum[value=[0.707"]),
         ("Kd 1 1 1\nd 0.1\nNi 1.4\nillum 4", ["ThinDielectric", "eta = [1.39"]),
+        ("Kd .5 .5 .5\nPr .3\nPm 1", ["Principled", "roughness: UniformSpectrum[value=[0.3", "metallic"]),
+        ("Kd .5 .5 .5\nmap_Pr -s 2 2 four.png\nmap_Pm none.png", ["Principled", "roughness: Bitmap", "metallic: Bit"]),
         ("Kd .5 .5 .5\nd 0.8", ["Mask", "0.8"]),
         ("Kd .5 .5 .5\nmap_d four.png", ["Mask", "Bitmap"]),
     ],
@@ -119,7 +124,10 @@ def test_colours_in_each_form_are_read(
         ("map_Kd -mm 0 2 four.png", {"map_Kd -mm": "colour"}),
         ("map_Ke -o .5 0 four.png\nmap_d four.png", {"map_Ke": "light"}),
         ("map_Ks x.png\nrefl -type sphere x.png", {"map_Ks": "colour", "refl": "colour"}),
-        ("Pr .5\nmap_Pm x.png\nmap_Bump four.png\nnorm x.png\nmap_Tr x.png", dict.fromkeys(LOST, "colour")),
+        ("Pr 1.7\nmap_Bump four.png\nnorm x.png\nmap_Tr x.png", dict.fromkeys(LOST, "colour")),
+        ("map_Bump -bm 0.5 four.png", {"map_Bump": "colour"}),
+        ("Ks .5 .1 .1\nPr .3\nPm 1\nPs 1\nPc 1\nPcr .1\naniso 0\nanisor 0", {}),
+        ("map_Kd -s on -o 0 off four.png", {"map_Kd -s": "colour", "map_Kd -o": "colour"}),
         ("disp x.png", {"disp": "geometry"}),
         ("illum 10", {"illum 10": "colour"}),
         ("bogus 1", {"bogus": "colour"}),
@@ -141,6 +149,7 @@ def test_statements_of_materials_are_carried_over_or_said(
         ("d 0.5\nTf 0 0 0", "Tf: is black where black is not meant"),
         ("illum 11", "illum 11: is lit as by model 2"),
         ("illum 4\nd 0\nKe 1 1 1", "Ke shines in full"),
+        ("Pr 0.3\nmap_Pr four.png", "Pr: is left out beside its image"),
         ("illum 4\nd 0\nNi 1", "Ni 1: is no index of what refracts, and is taken for 1.01"),
     ],
 )
@@ -264,3 +273,37 @@ def test_surfaces_shine_as_far_as_they_are_opaque(
     for side in (5, -5):
         assert emission(made, 0.25, 0.75, side) == pytest.approx(expected, rel=0.01, abs=0.01)
     assert not lost(scene)
+
+
+def scattered(made: Any, *light: float) -> float:
+    """What of light from a direction the square at (0.4, 0.3) sends upwards."""
+    si = hit(made, 0.4, 0.3)
+    towards = si.to_local(mi.Vector3f(*(part / float(np.linalg.norm(light)) for part in light)))
+    return float(np.array(si.bsdf().eval(mi.BSDFContext(), si, towards)).ravel()[0])
+
+
+NORMALS = {"right": (0.5, 0, 0.75**0.5), "up": (0, 0.5, 0.75**0.5)}
+
+
+@pytest.mark.parametrize("lean", NORMALS)
+@pytest.mark.parametrize(
+    ("uv", "signs"),
+    [
+        ("vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n", (1, 1)),
+        ("vt 1 0\nvt 0 0\nvt 0 1\nvt 1 1\n", (-1, 1)),
+        ("vt 0 1\nvt 1 1\nvt 1 0\nvt 0 0\n", (1, -1)),
+    ],
+)
+def test_normal_maps_lean_as_they_lie_also_mirrored(
+    tmp_path: Path, write_obj: Write, obj: Obj, loaded: Loaded, lean: str, uv: str, signs: tuple[int, int]
+) -> None:
+    values = np.round(np.array(NORMALS[lean]) * 127.5 + 127.5).astype(np.uint8)
+    Image.fromarray(np.tile(values, (4, 4, 1))).save(tmp_path / "n.png")
+    for line in ("norm n.png", "map_Bump -bm 1.0 n.png"):
+        write_obj("", f"newmtl it\nKd 1 1 1\n{line}")
+        scene, made = loaded(obj(f"mtllib it.mtl\n{FOUR_V}{uv}usemtl it\nf 1/1 2/2 3/3 4/4"))
+        axis = np.array([1, 0]) if lean == "right" else np.array([0, 1])
+        towards = axis * np.array(signs)
+        assert scattered(made, *towards.tolist(), 1.0) == pytest.approx(0.304, abs=0.003)
+        assert scattered(made, *(-towards).tolist(), 1.0) == pytest.approx(0.081, abs=0.003)
+        assert not lost(scene)

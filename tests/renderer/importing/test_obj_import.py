@@ -89,9 +89,9 @@ def test_a_wall_with_an_opening_keeps_it_and_its_side(
     assert np.sign(np.ravel(hit(made, 0.5, 0.6, 50).n)[2]) == turn
 
 
-def test_faces_and_statements_that_have_no_surface_are_said(obj: Obj, read: Read) -> None:
+def test_faces_that_cross_themselves_and_what_has_no_surface_are_said(obj: Obj, read: Read) -> None:
     scene = read(obj("v 0 0 0\nv 1 1 0\nv 1 0 0\nv 0 1 0\nf 1 2 3 4\nf 1 2 3\nf 1 2\np 1\nl 1 2"))
-    for text in ("fewer than three corners", "(line 7)", "line 8", "line 9"):
+    for text in ("cross themselves", "(line 5)", "fewer than three corners", "(line 7)", "line 8", "line 9"):
         assert text in said(scene)
     assert not lost(scene)
 
@@ -176,16 +176,38 @@ def test_groups_are_owners_where_there_are_no_objects(obj: Obj, read: Read) -> N
 
 
 @pytest.mark.parametrize(
-    ("text", "name"),
+    ("state", "normal"), [("s 1", (0, 0.5**0.5, 0.5**0.5)), ("s off", (0, 0, 1)), ("s 0", (0, 0, 1)), ("", (0, 0, 1))]
+)
+def test_smoothing_groups_make_the_normals_that_are_missing(
+    obj: Obj, loaded: Loaded, state: str, normal: tuple[float, ...]
+) -> None:
+    _, made = loaded(obj(f"{FOUR_V}v 0 0 1\nv 1 0 1\n{state}\nf 1 2 3 4\nf 2 1 5 6"))
+    assert np.ravel(hit(made, 0.5, 1e-4).sh_frame.n) == pytest.approx(normal, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("colour", "material", "expected"),
     [
-        ("v 0 0 0 1 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3", "v"),
-        ("v 0 0 0 1\nv 1 0 0 1 1 1\nv 0 1 0\nf 1 2 3", ""),  # a weight of free-form surfaces; white
-        (f"{FOUR_V}s 1\nf 1 2 3 4", "s"),
-        (f"{FOUR_V}s off\nf 1 2 3 4\ns 0\nf 1 2 3", ""),
-        (f"{FOUR_V}vn 0 0 1\ns 1\nf 1//1 2//1 3//1", ""),
+        ("0.5 0 0", "", (0.214, 0, 0)),  # colours are sRGB
+        ("255 0 0", "", (1, 0, 0)),
+        ("1 1 1", "newmtl it\nKd .5 .2 .1\nTr 1", (0.5, 0.2, 0.1)),
+        ("0.5 1 1", "newmtl it\nKd .5 .5 .5\nKs .5 .5 .5", (0.107, 0.5, 0.5)),
+        ("1 0 0", "newmtl it\nmap_Kd four.png", (0, 0, 1)),
+        ("1", "", (0.7, 0.7, 0.7)),  # a weight of free-form surfaces
     ],
 )
-def test_colours_of_vertices_and_smoothing_groups_without_normals_are_losses(
-    obj: Obj, read: Read, text: str, name: str
+def test_colours_of_vertices_are_those_of_the_surface(
+    write_obj: Write, obj: Obj, loaded: Loaded, colour: str, material: str, expected: tuple[float, ...]
 ) -> None:
-    assert lost(read(obj(text))) == ({name: "colour"} if name else {})
+    write_obj("", material or "newmtl no")
+    points = "".join(f"v {x} {y} 0 {colour}\nvt {x} {y}\n" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    scene, made = loaded(obj(f"mtllib it.mtl\n{points}{'usemtl it' if material else ''}\nf 1/1 2/2 3/3 4/4"))
+    assert reflectance(made, 0.25, 0.25) == pytest.approx(expected, abs=1e-3)
+    assert not lost(scene)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"), [("v 0 0 0 1 0", "v"), ("#MRGB ff00ff00\nv 0 0 0", "#MRGB"), ("#MRGB ffffffff\nv 0 0 0", "")]
+)
+def test_colours_of_vertices_that_are_not_read_are_said(obj: Obj, read: Read, text: str, name: str) -> None:
+    assert lost(read(obj(f"{text}\nv 1 0 0\nv 0 1 0\nf 1 2 3"))) == ({name: "colour"} if name else {})

@@ -14,7 +14,7 @@ from xml.etree.ElementTree import Element, SubElement
 import numpy as np
 
 from photonfarm.renderer.tools.importing import elements, images
-from photonfarm.renderer.tools.importing.changes import Changes
+from photonfarm.renderer.tools.importing.changes import Changes, Effect
 
 _COLOURS = ("base_color", "reflectance", "diffuse_reflectance")  # the properties that may be images of colour
 _MOST_PADDING = 8192  # texels by which an image grows where it is clamped along one axis alone
@@ -105,6 +105,16 @@ class Writer:
         values = np.take(values, texels.clip(0, size - 1), axis=1 - axis)
         return values, replace(lie, rows=tuple(rows), wraps=(other, other))
 
+    def join(self, one: Map, other: Map, effect: Effect, name: str) -> tuple[images.Image, images.Image, Lie | None]:
+        """The values of two properties at the same texels, and how these lie; the mean of what lies differently."""
+        if one.lie and other.lie and one.lie != other.lie:
+            meaning = "lies unlike the image that it is joined with, whose mean is taken"
+            self.changes.lose(effect, name, meaning, self.place)
+            other = Map(other.values.mean(axis=(0, 1), keepdims=True))
+        size = np.maximum(one.values.shape[:2], other.values.shape[:2])  # each is stretched to it
+        texels = [np.ix_(*(np.arange(size[i]) * of.values.shape[i] // size[i] for i in (0, 1))) for of in (one, other)]
+        return one.values[texels[0]], other.values[texels[1]], one.lie or other.lie
+
     def put_layers(self, top: Element, opacity: Map | None, normals: Map | None, *, passes: bool = False) -> Element:
         """Put what lies above a material; the place of the material, two-sided unless it `passes` light."""
         if opacity is not None:
@@ -120,6 +130,21 @@ class Writer:
             top = SubElement(top, "bsdf")
         return top
 
+    def normals(self, part: Map, strength: float, name: str, *, mirrored: bool, of_all: bool = False) -> Map:
+        """A normal map of a strength, of x and y or `of_all` of what turns a normal.
+
+        Mitsuba's frame is right-handed where images lie mirrored, too.
+        """
+        (a, b, _), (c, d, _) = (part.lie or Lie()).rows
+        if b or c or min(a, d) < 0:
+            self.note("turns or mirrors the image, and not the directions in it", name)
+        if strength == 1 and not mirrored:
+            return part
+        vectors = (2 * part.values - 1) * np.array([strength, -strength if mirrored else strength, 1], np.float32)
+        if of_all:
+            vectors[..., 2] = 1 + strength * (vectors[..., 2] - 1)
+        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.lie)
+
     def put_surface(self, place: Element, plugin: str, parts: Mapping[str, Map], *, painted: bool = False) -> None:
         """Put a material by its properties; that of a `painted` mesh has the colours of its vertices."""
         place.set("type", plugin)
@@ -133,12 +158,8 @@ class Writer:
     def light(self, glow: Map, opacity: Map | None, name: str) -> Element | None:
         """What a surface emits, if anything: Mitsuba's lights shine where their material lets light through."""
         if opacity is not None and glow.values.any():
-            lies = {(part.lie, part.values.shape[:2]) for part in (glow, opacity) if part.lie}
-            if len(lies) > 1:
-                meaning = "lies unlike the image of opacity, or has another size; the mean opacity is taken"
-                self.changes.lose("light", name, meaning, self.place)
-                opacity = Map(opacity.values.mean(axis=(0, 1), keepdims=True))
-            glow = Map(glow.values * opacity.values, glow.lie or opacity.lie)
+            values, alpha, lie = self.join(glow, opacity, "light", name)
+            glow = Map(values * alpha, lie)
         if glow.values.max() <= 0:
             return None
         emitter = Element("emitter", type="area")

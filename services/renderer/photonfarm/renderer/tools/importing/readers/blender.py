@@ -23,7 +23,7 @@ import numpy as np
 
 from photonfarm.core.errors import BackendError, SpecError
 from photonfarm.core.waiting import Log
-from photonfarm.renderer.tools.importing import elements
+from photonfarm.renderer.tools.importing import elements, images
 from photonfarm.renderer.tools.importing.elements import WIDEST, Profile, put_cones
 from photonfarm.renderer.tools.importing.imported import Floats, ImportedScene, unit
 from photonfarm.renderer.tools.importing.readers import gltf
@@ -44,7 +44,7 @@ PARTS = 16
 """Spots with a radius, and areas of a small spread, become so many spots, which have no extent in Mitsuba."""
 
 SHARP = math.radians(1.0)
-"""A sun that is wider is said to lose its soft shadows."""
+"""A sun that is no wider is one direction; a wider one is a disc of the sky."""
 
 _SCRIPT = Path(__file__).with_name("blender_export.py")
 
@@ -108,6 +108,7 @@ class Lamps:
 
     def __init__(self, scene: ImportedScene, scratch: Path) -> None:
         self._scene, self._scratch = scene, scratch
+        self._discs: list[tuple[Floats, Floats, float]] = []  # suns: direction, irradiance, sine of the half angle
 
     def put(self, lamp: Lamp) -> None:
         """Add a lamp: the numbers that Blender has of it, its `strength` as a colour, and its `matrix` in its world."""
@@ -119,7 +120,8 @@ class Lamps:
             kinds[lamp["kind"]](lamp, np.maximum(strength, 0), matrix)
 
     def put_sky(self, sky: list[float] | str) -> None:
-        """Surround the scene by a radiance, or by an image of all directions with Blender's +y in the middle."""
+        """Surround the scene by a radiance, or by an image of all directions with Blender's +y in the middle; last."""
+        sky = self._draw_discs(sky) if self._discs else sky
         if isinstance(sky, str):
             image = self._emitter("envmap", "sky")
             elements.put_value(image, "filename", sky)
@@ -127,12 +129,26 @@ class Lamps:
         elif max(sky) > 0:
             elements.put_value(self._emitter("constant", "sky"), "radiance", sky)
 
+    def _draw_discs(self, sky: list[float] | str) -> str:
+        """An image of a sky with the discs of suns, each with its irradiance."""
+        light = images.decode(Path(sky).read_bytes(), sky, raw=True)[..., :3] if isinstance(sky, str) else sky
+        height, width = 1024, 2048
+        values = np.broadcast_to(light, (height, width, 3)).astype(np.float64)
+        down = (np.arange(height) + 0.5)[:, None] * math.pi / height
+        along = (np.arange(width) + 0.5) * 2 * math.pi / width
+        for (x, y, z), flux, sine in self._discs:
+            cosine = y * np.cos(down) + np.sin(down) * (z * np.cos(along) - x * np.sin(along))
+            disc = cosine >= math.sqrt(1 - sine**2)
+            values[disc] += flux / (disc * cosine * np.sin(down)).sum() * height * width / (2 * math.pi**2)
+        return str(images.save_radiance(values.astype(np.float32), self._scratch / "sky.exr"))
+
     def _put_sun(self, lamp: Lamp, strength: Floats, matrix: Floats) -> None:
         sine = math.sin(min(lamp["angle"], math.pi) / 2)
-        if lamp["angle"] > SHARP:
-            self._scene.changes.lose("light", "angle", "shadows of suns are sharp here", f"lamp {lamp['name']!r}")
-        sun = self._emitter("directional", lamp["name"])
         flux = strength * (math.pi * sine**2 if sine and not lamp["normalize"] else 1.0)
+        if lamp["angle"] > SHARP:
+            self._discs.append((_frame(matrix)[:, 2], flux, sine))
+            return
+        sun = self._emitter("directional", lamp["name"])
         elements.put_value(sun, "irradiance", flux.tolist())
         _place(sun, _frame(matrix) * TURN)
 

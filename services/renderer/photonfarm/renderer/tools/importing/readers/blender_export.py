@@ -34,6 +34,9 @@ _SEEN = {"visible_camera": True, **_LIT, "is_holdout": False, "is_shadow_catcher
 
 _OF_LAMPS = ("normalize", "shadow_soft_size", "angle", "spot_size", "spot_blend", "shape", "size", "size_y", "spread")
 
+_MIXES = (("RGBA", "MIX"), ("RGBA", "MULTIPLY"), ("FLOAT", "MIX"))
+"""The types of mix nodes of lamps whose values are known."""
+
 SKY = (2048, 1024)
 """The size of an image of the sky; the sun of a sky is three of its pixels across."""
 
@@ -175,17 +178,47 @@ def _lamp(drawn: Any, matrix: list[list[float]]) -> dict[str, Any]:
 def _colour_of_nodes(tree: Any, place: str) -> list[float]:
     """The colour that a lamp's nodes multiply its own by, without what varies."""
     output = tree.get_output_node("CYCLES") if tree else None
-    shader = source(output.inputs["Surface"]) if output else None
-    if shader is None:
-        return [0.0, 0.0, 0.0]
-    if shader.type != "EMISSION":
+    return _emission(source(output.inputs["Surface"]), place) if output else [0.0, 0.0, 0.0]
+
+
+def _emission(shader: Any, place: str) -> list[float]:
+    """What a shader of a lamp emits, or several that are added or mixed."""
+    kind = shader.type if shader else ""
+    if kind == "EMISSION":
+        colour, strength = (_constant(shader.inputs[name], place) for name in ("Color", "Strength"))
+        return [part * strength[0] for part in colour]
+    if kind in ("ADD_SHADER", "MIX_SHADER"):
+        one, other = (_emission(source(part), place) for part in list(shader.inputs)[-2:])
+        share = _constant(shader.inputs[0], place)[0] if kind == "MIX_SHADER" else 0.5
+        scale = 1 if kind == "MIX_SHADER" else 2
+        return [scale * ((1 - share) * a + share * b) for a, b in zip(one, other, strict=True)]
+    if shader is not None:
         say("light", shader.bl_label, "is not carried over", place)
         return [1.0, 1.0, 1.0]
-    for name in ("Color", "Strength"):
-        if (node := source(shader.inputs[name])) is not None:
-            say("light", node.bl_label, f"{node.name!r} is not carried over", place)
-    strength = shader.inputs["Strength"].default_value
-    return [part * strength for part in shader.inputs["Color"].default_value[:3]]
+    return [0.0, 0.0, 0.0]
+
+
+def _constant(part: Any, place: str) -> list[float]:
+    """The value of an input as three numbers; that of two which are mixed or multiplied, too."""
+    node = source(part)
+    kind = node.type if node else ""
+    if kind == "BLACKBODY" and not node.inputs[0].is_linked:
+        lamp = bpy.data.lights.new("", "POINT")
+        lamp.temperature = node.inputs[0].default_value
+        return list(lamp.temperature_color)
+    if kind == "MIX" and (node.data_type, node.blend_type) in _MIXES:
+        share, one, other = (_constant(each, place) for each in node.inputs if each.enabled)
+        if node.blend_type == "MULTIPLY":
+            other = [a * b for a, b in zip(one, other, strict=True)]
+        return [a + share[0] * (b - a) for a, b in zip(one, other, strict=True)]
+    if kind in ("RGB", "VALUE"):
+        part = node.outputs[0]
+    elif kind == "LIGHT_FALLOFF" and part.links[0].from_socket == node.outputs[0]:
+        part = node.inputs["Strength"]
+    elif node is not None:
+        say("light", node.bl_label, f"{node.name!r} is not carried over", place)
+    value = part.default_value
+    return list(value)[:3] if part.type == "RGBA" else [value] * 3
 
 
 def _sky(world: Any, file: str) -> list[float] | str:

@@ -12,12 +12,13 @@ DULL: dict[str, Any] = {"Roughness": 1.0, "Specular IOR Level": 0.0}
 
 _BLACK = {**DULL, "Base Color": (0, 0, 0, 1)}
 _ROUGH = {"Color": "Base Color", "Base Color": "Base Color", "Roughness": "Roughness", "Normal": "Normal"}
+_LIGHT = {"Color": "Emission Color", "Strength": "Emission Strength"}
 _SHADERS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     "BSDF_DIFFUSE": ({"Color": "Base Color", "Normal": "Normal"}, DULL),
     **dict.fromkeys(("BSDF_GLOSSY", "BSDF_METALLIC"), (_ROUGH, {"Metallic": 1.0})),
     "BSDF_GLASS": ({**_ROUGH, "IOR": "IOR"}, {"Transmission Weight": 1.0}),
     "BSDF_TRANSPARENT": ({"Color": "Base Color"}, {**DULL, "Alpha": 0.0}),
-    "EMISSION": ({"Color": "Emission Color", "Strength": "Emission Strength"}, _BLACK),
+    "EMISSION": (_LIGHT, _BLACK),
     "": ({}, _BLACK),
 }
 """The shaders that the Principled BSDF can stand for: which input becomes which of its own, and its other values."""
@@ -71,23 +72,12 @@ def source(part: Any) -> Any:
 
 
 def _make_principled(tree: Any, node: Any, lose: Lose) -> Any:
-    """The Principled BSDF that does what a shader does, as far as one can; of two that are mixed, the heavier."""
+    """The Principled BSDF that does what a shader does, as far as one can."""
     kind = node.type if node else ""
     if kind == "BSDF_PRINCIPLED":
         return node
     if kind in ("MIX_SHADER", "ADD_SHADER"):
-        one, other = (source(part) for part in list(node.inputs)[-2:])
-        share = node.inputs[0]
-        if kind == "MIX_SHADER" and one is not None and one.type == "BSDF_TRANSPARENT":  # which is opacity
-            _say_tint(one, lose)
-            made = _make_principled(tree, other, lose)
-            if made.inputs["Alpha"].default_value < 1 or made.inputs["Alpha"].is_linked:
-                lose("colour", "Alpha", "of what is mixed with something transparent is not carried over")
-            _give(share, made.inputs["Alpha"])
-            return made
-        effect = "light" if "EMISSION" in [each.type for each in (one, other) if each] else "colour"
-        lose(effect, node.bl_label, "only the heavier of its two shaders is carried over; bake it to images to keep it")
-        return _make_principled(tree, other if kind == "MIX_SHADER" and share.default_value > 0.5 else one, lose)
+        return _mix(tree, node, lose)
     if kind not in _SHADERS:
         lose("colour", node.bl_label, "became diffuse; bake it to images to keep it")
     takes, values = _SHADERS.get(kind, _SHADERS["BSDF_DIFFUSE"])
@@ -101,6 +91,32 @@ def _make_principled(tree: Any, node: Any, lose: Lose) -> Any:
             lose("colour", part.name, f"of {node.bl_label} is not carried over")
     if kind == "BSDF_TRANSPARENT":
         _say_tint(node, lose)
+    return made
+
+
+def _mix(tree: Any, node: Any, lose: Lose) -> Any:
+    """One shader for two: opacity for one that is transparent, the light of one that emits; else the heavier."""
+    pair = [source(part) for part in list(node.inputs)[-2:]]
+    kinds = [part.type if part else "" for part in pair]
+    adds, share = node.type == "ADD_SHADER", node.inputs[0]
+    special = "EMISSION" if adds else "BSDF_TRANSPARENT"
+    place = kinds.index(special) if special in kinds else -1
+    if place < 0 or (place == 1 and not adds and share.is_linked):
+        effect = "light" if "EMISSION" in kinds else "colour"
+        lose(effect, node.bl_label, "only the heavier of its two shaders is carried over; bake it to images to keep it")
+        return _make_principled(tree, pair[not adds and share.default_value > 0.5], lose)
+    made = _make_principled(tree, pair[1 - place], lose)
+    if adds:
+        if made.inputs["Emission Strength"].default_value > 0 or made.inputs["Emission Strength"].is_linked:
+            lose("light", node.bl_label, "only one of its two lights is carried over")
+        for name, ours in _LIGHT.items():
+            _give(pair[place].inputs[name], made.inputs[ours])
+    else:
+        _say_tint(pair[place], lose)
+        if made.inputs["Alpha"].default_value < 1 or made.inputs["Alpha"].is_linked:
+            lose("colour", "Alpha", "of what is mixed with something transparent is not carried over")
+        _give(share, made.inputs["Alpha"])
+        made.inputs["Alpha"].default_value = abs(place - share.default_value)
     return made
 
 

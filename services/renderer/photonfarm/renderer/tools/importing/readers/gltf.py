@@ -25,6 +25,11 @@ from photonfarm.renderer.tools.importing.readers.gltf_materials import Look, Mat
 OBJECT_SHARE = 0.34
 """A node is an object as a whole up to this share of all meshes; above, it is a folder of objects."""
 
+_ONE_COLOUR = 2e-3  # colours of vertices that differ by no more are one colour
+_UNNAMED = (0.8, 0.8, 0.8, 1.0)  # the colour of what has neither a material nor colours of vertices
+_ASKEW = 0.5  # tangents whose cosine with the images' own ones is below this are others
+_MANY_ASKEW = 0.1  # the share of faces that is many
+
 _LIGHTS, _INSTANCES = "KHR_lights_punctual", "EXT_mesh_gpu_instancing"
 _OF_BLENDER = (
     "lamps are in candela and lux, as glTF has them; Blender writes them 683 times as bright as surfaces that shine; "
@@ -189,13 +194,15 @@ class _Reader:
         mesh = mesh.transform(matrix)
         if mesh.uv is None or "normalTexture" not in self.materials.entry(material):
             return [(mesh, look)]
-        a, b, c = mesh.uv[mesh.faces].swapaxes(0, 1)
-        areas = (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]  # v is downwards
+        along, areas = _lie_of_images(mesh, mesh.uv)
         mirrored = areas > 0
-        if "TANGENT" in values:
-            sides = values["TANGENT"][mesh.faces, 3].sum(axis=1) * np.linalg.det(matrix[:3, :3])
-            if (sides * areas > 0).any():
-                self.scene.changes.lose("colour", "TANGENT", "normal maps lie by texture coordinates alone", place)
+        if (tangents := values.get("TANGENT")) is not None:
+            mirrored = tangents[mesh.faces, 3].sum(axis=1) * np.linalg.det(matrix[:3, :3]) < 0
+            given = (tangents[:, :3] @ matrix[:3, :3].T)[mesh.faces].sum(axis=1)
+            lengths = np.linalg.norm(along, axis=1) * np.linalg.norm(given, axis=1)
+            if ((along * given).sum(axis=1) < _ASKEW * lengths).sum() > _MANY_ASKEW * len(lengths):
+                meaning = "normal maps lie by their texture coordinates alone"
+                self.scene.changes.lose("colour", "TANGENT", meaning, place)
         parts = [(mesh.part(mirrored == side), look._replace(mirrored=side)) for side in (False, True)]
         return [part for part in parts if len(part[0].faces)]
 
@@ -228,22 +235,28 @@ class _Reader:
         return values[first]
 
     def _colour(self, mesh: Mesh, colours: Floats | None, number: int | None, place: str) -> _Piece:
-        """A mesh with its colours of vertices, which multiply a plain one of the material, and its material."""
-        if number is None and colours is None:
+        """A mesh with its colours of vertices, if they differ, or a material with their one colour."""
+        if colours is None or not len(mesh.faces):
+            if number is not None:
+                return mesh, Look(number)
             self.scene.changes.note("what has no material is light grey", place)
-        if colours is None or (colours == 1).all():
-            return mesh, Look(number)
+            return mesh, Look(None, tint=_UNNAMED)
+        used = colours[np.unique(mesh.faces)]
+        used = np.column_stack([used, np.ones((len(used), 4 - used.shape[1]))])
+        mean, same = np.round(used.mean(axis=0), 4).tolist(), np.ptp(used, axis=0) <= _ONE_COLOUR
         entry = self.materials.entry(number)
-        surface = entry.get("pbrMetallicRoughness", {})
-        if (colours[:, 3:] < 1).any() and entry.get("alphaMode", "OPAQUE") != "OPAQUE":
-            self.scene.changes.lose("colour", "COLOR_0", "vertices have no opacity of their own", place)
-        if surface.get("baseColorTexture") is not None:
-            self.scene.changes.lose("colour", "COLOR_0", "colours of vertices are left out beside an image", place)
-            return mesh, Look(number)
-        factor = numbers(surface, "baseColorFactor", (1, 1, 1, 1))[:3] if number is not None else 1.0
-        return replace(mesh, attributes={"vertex_color": (colours[:, :3] * factor).clip(0, 1)}), Look(
-            number, painted=True
-        )
+        if not same[3] and entry.get("alphaMode", "OPAQUE") != "OPAQUE":
+            self.scene.changes.lose("colour", "COLOR_0", "the alpha of vertices is their mean", place)
+        if same[:3].all():
+            return mesh, Look(number, tint=tuple(mean))
+        look, surface = Look(number, tint=(1.0, 1.0, 1.0, mean[3])), entry.get("pbrMetallicRoughness", {})
+        if "baseColorTexture" in surface:
+            meaning = "colours of vertices multiply a plain colour of metallic-roughness alone, and are left out"
+            self.scene.changes.lose("colour", "COLOR_0", meaning, place)
+            return mesh, look
+        factor = numbers(surface, "baseColorFactor", (1, 1, 1, 1))[:3]
+        painted = {"vertex_color": (colours[:, :3] * factor).clip(0, 1)}
+        return replace(mesh, attributes=painted), look._replace(painted=True)
 
     def _put_light(self, light: Node, matrix: Floats) -> None:
         """Candela and lux are taken as radiometric units, as emissive strength is, so that all lights agree."""
@@ -292,3 +305,14 @@ def _matrix(node: Node) -> Floats:
         raise ValueError("rotation is 0, 0, 0, 0, which is no rotation")
     made[:3, :3] = Rotation.from_quat(turn).as_matrix() * scale
     return made
+
+
+def _lie_of_images(mesh: Mesh, uv: Floats) -> tuple[Floats, Floats]:
+    """How images lie on faces: the direction in which u grows (F, 3), and their signed areas (F,).
+
+    The area is negative where an image, whose v is downwards, is not mirrored.
+    """
+    a, b = (mesh.vertices[mesh.faces[:, i]] - mesh.vertices[mesh.faces[:, 0]] for i in (1, 2))
+    c, d = (uv[mesh.faces[:, i]] - uv[mesh.faces[:, 0]] for i in (1, 2))
+    area = c[:, :1] * d[:, 1:] - c[:, 1:] * d[:, :1]
+    return np.sign(area) * (a * d[:, 1:] - b * c[:, 1:]), area[:, 0]

@@ -26,7 +26,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _READ = re.compile(
     "EXT_(mesh_gpu_instancing|texture_avif|texture_webp)|MSFT_texture_dds"
     "|KHR_(lights_punctual|mesh_quantization|node_visibility|texture_transform)"
-    "|KHR_materials_(clearcoat|emissive_strength|ior|specular|transmission|volume)"
+    "|KHR_materials_(clearcoat|emissive_strength|ior|pbrSpecularGlossiness|specular|transmission|volume)"
 )
 """The extensions that are carried over; what of one is not is said where it is read."""
 
@@ -38,6 +38,15 @@ _HARMLESS = re.compile(
 
 _COMPRESSED = re.compile("(EXT|KHR)_meshopt_compression|KHR_draco_mesh_compression|KHR_texture_basisu")
 """Those that may have the same data uncompressed beside them, which is read then."""
+
+_ZEROS = {
+    "KHR_materials_anisotropy": "anisotropyStrength",
+    "KHR_materials_diffuse_transmission": "diffuseTransmissionFactor",
+    "KHR_materials_dispersion": "dispersion",
+    "KHR_materials_iridescence": "iridescenceFactor",
+    "KHR_materials_sheen": "sheenColorFactor",
+}
+"""Extensions of materials, and what of them is 0, or is not there, where they have no effect."""
 
 _EFFECTS: dict[str, Effect] = {
     **dict.fromkeys(("images", "materials", "samplers", "textures"), "colour"),
@@ -91,9 +100,11 @@ class GltfFile:
 
     def _report(self, entry: Node, effect: Effect, place: str) -> None:
         """Say which extensions of an entry, and of all in it, are not carried over."""
-        for name in entry.get("extensions", {}):
+        for name, value in entry.get("extensions", {}).items():
             if _HARMLESS.fullmatch(name):
                 self.changes.note("leaves a picture of what is shown first as it is", place, name=name)
+            elif name in _ZEROS and not np.any(value.get(_ZEROS[name], 0)):
+                continue
             elif not _READ.fullmatch(name) and not _COMPRESSED.fullmatch(name):
                 self.changes.lose("light" if "light" in name else effect, name, "is not carried over", place)
         for key, value in entry.items():

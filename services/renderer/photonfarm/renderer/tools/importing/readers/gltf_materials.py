@@ -39,8 +39,9 @@ _PARTS = {
 }
 """Properties of `principled`: where glTF has them, their factor and its default, their image and its channel."""
 
-_UNNAMED: Node = {"pbrMetallicRoughness": {"baseColorFactor": [0.8, 0.8, 0.8, 1], "metallicFactor": 0.0}}
+_UNNAMED: Node = {"pbrMetallicRoughness": {"metallicFactor": 0.0}}  # the material of what has none
 _DULLEST = 1.01  # the least index of refraction of `principled`; what has it reflects by its colour alone
+_F0 = 0.04  # the reflectance of a dielectric in specular-glossiness, seen along the normal
 
 
 class Look(NamedTuple):
@@ -48,6 +49,7 @@ class Look(NamedTuple):
 
     number: int | None
     mirrored: bool = False  # its images are on the mesh, and so its normal map is
+    tint: tuple[float, ...] = _WHITE  # by which all vertices multiply its colour and alpha
     painted: bool = False  # its colour is the mesh's attribute `vertex_color`
 
 
@@ -66,13 +68,9 @@ class Materials:
         """A material of the file, with its extensions among its properties; None is that of what has none."""
         material = _UNNAMED if number is None else self.file.entry("materials", number)
         entry = {**material, **material.get("extensions", {})}
-        if (old := entry.get(_OLD)) is not None:  # which is said not to be carried over: its colour and gloss alone are
-            entry["pbrMetallicRoughness"] = {
-                "baseColorTexture": old.get("diffuseTexture"),
-                "baseColorFactor": old.get("diffuseFactor", _WHITE),
-                "roughnessFactor": 1 - old.get("glossinessFactor", 1.0),
-                "metallicFactor": 0.0,
-            }
+        if (old := entry.get(_OLD)) is not None:
+            image, factor = old.get("diffuseTexture"), old.get("diffuseFactor", _WHITE)
+            entry["pbrMetallicRoughness"] = {"baseColorTexture": image, "baseColorFactor": factor}
         return entry
 
     def name(self, look: Look) -> str:
@@ -82,7 +80,7 @@ class Materials:
     def is_unseen(self, look: Look) -> bool:
         """Whether a material is wholly transparent by its factors."""
         entry = self.entry(look.number)
-        alpha = numbers(entry.get("pbrMetallicRoughness", {}), "baseColorFactor", _WHITE)[3]
+        alpha = look.tint[3] * numbers(entry.get("pbrMetallicRoughness", {}), "baseColorFactor", _WHITE)[3]
         mode = entry.get("alphaMode", "OPAQUE")
         return bool(alpha < entry.get("alphaCutoff", 0.5)) if mode == "MASK" else bool(mode == "BLEND" and alpha <= 0)
 
@@ -111,7 +109,7 @@ class Materials:
             writer.note("light is computed here", "occlusionTexture")
         top = Element("bsdf", id=made)
         self.scene.root.insert(len(self.scene.root.findall("bsdf")), top)
-        factor = numbers(surface, "baseColorFactor", _WHITE).tolist()
+        factor = (np.array(look.tint) * numbers(surface, "baseColorFactor", _WHITE)).tolist()
         colour = self._map(surface.get("baseColorTexture"), factor, _RGBA, colour=True)
         opacity, normals = _opacity(entry, colour), self._normals(entry, look, writer)
         plugin, parts = self._surface(entry, colour, look.painted, writer)
@@ -134,14 +132,17 @@ class Materials:
 
     def _image(self, node: Node, colour: bool) -> images.Image | None:
         """The pixels of a texture: of the image that all programs read, or else of a format that is read here."""
-        texture = self.file.entry("textures", node["index"])
-        entries = [texture, *(extension(texture, name) for name in _FORMATS)]
-        source = next((int(entry["source"]) for entry in entries if "source" in entry), None)
-        if source is None:
+        texture, place = self.file.entry("textures", node["index"]), f"texture {node['index']}"
+        entries = [("", texture), *((name, extension(texture, name)) for name in _FORMATS)]
+        sources = [(name, int(entry["source"])) for name, entry in entries if "source" in entry]
+        for name, _ in sources[1:]:
+            self.scene.changes.note("is left out beside the texture's other image", place, name=name)
+        if not sources:
             name = ", ".join(texture.get("extensions", ())) or "source"
             meaning = "a texture has no image that is read, so that its factor stands alone"
-            self.scene.changes.lose("colour", name, meaning, f"texture {node['index']}")
+            self.scene.changes.lose("colour", name, meaning, place)
             return None
+        source = sources[0][1]
         if (source, colour) not in self._last:
             data = self.file.image(source)
             if data is None:
@@ -159,19 +160,11 @@ class Materials:
         return Lie(rows, (wraps[0], wraps[1]), sampler.get("magFilter") == _NEAREST)
 
     def _normals(self, entry: Node, look: Look, writer: Writer) -> Map | None:
-        """A normal map of its strength. Mitsuba's frame is right-handed where images lie mirrored, too."""
+        """A normal map of its strength."""
         node = entry.get("normalTexture")
         strength = node.get("scale", 1.0) if node else 1.0
         part = self._map(node, [strength and 1.0] * 3, _RGB)
-        if part.lie is None:
-            return None
-        (a, b, _), (c, d, _) = part.lie.rows
-        if b or c or min(a, d) < 0:
-            writer.note("turns or mirrors the image, and not the directions in it", _TRANSFORM)
-        if strength == 1 and not look.mirrored:
-            return part
-        vectors = (2 * part.values - 1) * np.array([strength, -strength if look.mirrored else strength, 1], np.float32)
-        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.lie)
+        return writer.normals(part, strength, _TRANSFORM, mirrored=look.mirrored) if part.lie else None
 
     def _surface(self, entry: Node, colour: Map, painted: bool, writer: Writer) -> tuple[str, dict[str, Map]]:
         """The plugin that is nearest to a material, and its properties."""
@@ -218,7 +211,17 @@ class Materials:
             writer.lose("clearcoatNormalTexture", "the coat has the normals of what is under it")
         gloss = parts["clearcoat_gloss"]  # whose α is 0.1 without gloss, and 0.001 with all
         parts["clearcoat_gloss"] = replace(gloss, values=((0.1 - gloss.values**2) / 0.099).clip(0, 1))
-        return parts
+        return parts | (self._convert(colour, entry[_OLD], writer) if _OLD in entry else {})
+
+    def _convert(self, colour: Map, old: Node, writer: Writer) -> dict[str, Map]:
+        """The properties of `principled` for specular-glossiness, texel by texel."""
+        factor = (*numbers(old, "specularFactor", _WHITE[:3]), old.get("glossinessFactor", 1.0))
+        specular = self._map(old.get("specularGlossinessTexture"), factor, _RGBA, colour=True)
+        diffuse, gloss, lie = writer.join(colour, specular, "colour", _OLD)
+        base, metal = convert_specular_glossiness(diffuse[..., _RGB], gloss[..., _RGB])
+        writer.note("becomes metal and roughness by Khronos' formulas", _OLD)
+        rough = replace(specular, values=1 - specular.values[..., _ALPHA])
+        return {"base_color": Map(base, lie), "roughness": rough, "metallic": Map(metal, lie)}
 
 
 def _opacity(entry: Node, colour: Map) -> Map | None:
@@ -242,6 +245,19 @@ def _eta(entry: Node, passes: bool, writer: Writer) -> Map:
     if _SPECULAR in entry and ((reflectance > 0 and tinted) or (passes and abs(ior - eta) > 1e-6)):
         writer.lose(_SPECULAR, "its reflection has no colour, no image and, on glass, no strength of its own")
     return constant(max(float(ior) if passes else eta, _DULLEST))
+
+
+def convert_specular_glossiness(diffuse: images.Image, specular: images.Image) -> tuple[images.Image, images.Image]:
+    """Base colour (H, W, 3) and metal (H, W, 1), by the formulas in the appendix of the extension."""
+    bright_diffuse, bright = (np.sqrt(c**2 @ np.array([[0.299], [0.587], [0.114]])) for c in (diffuse, specular))
+    left = (1 - specular.max(axis=-1, keepdims=True)) / (1 - _F0)
+    b = bright_diffuse * left + bright - 2 * _F0
+    root = np.sqrt((b * b - 4 * _F0 * (_F0 - bright)).clip(0))
+    metal = np.where(bright < _F0, 0, ((root - b) / (2 * _F0)).clip(0, 1))
+    of_diffuse = diffuse * left / (1 - metal).clip(1e-6)
+    of_specular = (specular - _F0 * (1 - metal)) / metal.clip(1e-6)
+    base = (of_diffuse + (of_specular - of_diffuse) * metal**2).clip(0, 1)
+    return base.astype(np.float32), metal.astype(np.float32)
 
 
 def _uv_sets(entry: Node) -> Iterator[int]:

@@ -18,8 +18,15 @@ from photonfarm.renderer.tools.importing import images
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
 from photonfarm.renderer.tools.importing.surfaces import Lie, Map, Writer, constant
 
-_CARRIED = re.compile("(map_)?(kd|ke|d)|k[as]|n[si]|tr|tf|illum|sharpness|map_aat")
+_CARRIED = re.compile(
+    "(map_)?(kd|ke|d|pr|pm|ps|pc|aniso)|k[as]|n[si]|tr|tf|illum|sharpness|map_aat|pcr|anisor|norm|(map_)?bump"
+)
 """What has its meaning here, or none where light and reflections are those of the scene."""
+
+_PRINCIPLED = {"pr": "roughness", "pm": "metallic", "ps": "sheen", "pc": "clearcoat", "aniso": "anisotropic"}
+"""Statements of which each, a number or an image, is a property of `principled`."""
+
+_RELIEFS = ("norm", "map_bump", "bump")
 
 _EFFECTS: dict[str, Effect | None] = {"disp": "geometry", "map_ka": None}  # of what is not carried over; else colour
 
@@ -29,15 +36,17 @@ _OPTION = re.compile(
 )
 """An option before the name of an image: one word, or up to three numbers."""
 
-_OPTIONS = re.compile(r"(o|s|clamp|blendu|blendv|boost|texres) .*|\w+ (off|[0. ]*)|mm [0.]+ 1[0.]*")
+_OPTIONS = re.compile(
+    r"(o|s|bm) [-+.\de ]*|(clamp|blendu|blendv|boost|texres) .*|(?!(o|s|bm) )\w+ (off|[0. ]*)|mm [0.]+ 1[0.]*"
+)
 """The options that have their meaning here, or none by what they speak of or by their values."""
 
 _GLASS, _MIRRORS, _LIT = (4, 6, 7, 9), (3, 5, 8), range(1, 10)
 """The models of illumination that are glass, those that reflect the scene, and those of what light and shadows meet."""
 
-_Image = tuple[Path, Lie]  # a file, and how it lies on a surface
+_Image = tuple[Path, Lie, float]  # a file, how it lies on a surface, and the strength of its bumps
 
-_WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
+WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 _GREY = (0.7, 0.7, 0.7)  # the reflectance of what has no colour
 _SMOOTH = 0.2  # gloss up to this α is Mitsuba's `roughplastic`, which loses light above; `principled` gains some
 _SHINES = 0.02  # gloss is modelled from this specular reflectance on
@@ -60,7 +69,7 @@ def statements(file: Path) -> Iterator[tuple[int, str, str]]:
         while line.endswith("\\") and not line.lstrip().startswith("#"):
             line = f"{line[:-1]} {next(lines, (0, ''))[1]}"
         words = line.split(None, 1)
-        if words and words[0][0] != "#":
+        if words and (words[0][0] != "#" or words[0] == "#MRGB"):
             yield number, words[0], words[1].rstrip() if len(words) > 1 else ""
 
 
@@ -127,7 +136,7 @@ def _lie(options: Mapping[str, str]) -> Lie:
 
 def _read_map(image: _Image, factor: Sequence[float]) -> Map:
     """An image's linear colours times a factor."""
-    file, lie = image
+    file, lie, _ = image
     values = images.decode(file.read_bytes(), str(file))[..., :3]
     return Map(images.linear(values) * np.array(factor, np.float32), lie)
 
@@ -140,11 +149,18 @@ class Material:
     file: Path
     changes: Changes
     lines: dict[str, tuple[int, str, str]] = field(default_factory=dict)
+    painted: bool = False  # its colour is that of vertices, their attribute `vertex_color`
+    mirrored: bool = False  # its images lie mirrored
 
     @property
     def has_images(self) -> bool:
         """Whether it names images."""
-        return any(key.startswith("map_") for key in self.lines)
+        return any(key.startswith("map_") or key in _RELIEFS for key in self.lines)
+
+    @property
+    def relief(self) -> str:
+        """The key of its normal map, or else of its bump map, or nothing."""
+        return next((key for key in _RELIEFS if key in self.lines), "")
 
     def say(self, effect: Effect | None, name: str, meaning: str) -> None:
         """Say what a statement means that is not carried over, and what of the picture that changes, if anything."""
@@ -164,7 +180,7 @@ class Material:
             meaning = f"is lit as by model {1 if illum == 0 else 2} here"
             self.say("colour" if illum == 10 else None, f"illum {illum:g}", meaning)
         opacity, glow = self._opacity(illum), self._glow()
-        tint = self._cut("tf", _WHITE) if opacity else _WHITE
+        tint = self.cut("tf", WHITE) if opacity else WHITE
         if illum in _GLASS and opacity and not self._is_textured:
             glass = {"int_ior": self._eta(1.01), "specular_transmittance": constant(*tint)}
             writer.put_surface(top, "thindielectric", glass)
@@ -175,7 +191,7 @@ class Material:
             self.say(effect, f"illum {illum:g}", "is of glass, and is not here, by its d, Tr or images")
         if min(tint) < 1:
             self.say("colour", "Tf", "does not tint the light that passes through")
-        self._put_gloss(writer.put_layers(top, opacity, None), illum, writer)
+        self._put_gloss(writer.put_layers(top, opacity, self._normals(writer)), illum, writer)
         return writer.light(glow, opacity, "map_Ke")
 
     def _numbers(self, key: str, otherwise: Sequence[float] = _BLACK) -> Sequence[float]:
@@ -197,19 +213,19 @@ class Material:
     def _number(self, key: str, otherwise: float) -> float:
         return self._numbers(key, (otherwise,))[0]
 
-    def _cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
+    def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
         """The numbers of a line from 0 to `most`, to which others are cut. Where `otherwise` is white, so is black."""
         values = self._numbers(key, otherwise)
         made: list[float] = np.clip(values, 0, most).tolist()
         if np.abs(np.subtract(made, values)).max() > 1e-3:  # more than rounding
             bounds = "is below 0, and is cut to that" if most == math.inf else f"is cut to what lies in 0 to {most:g}"
             self.say(effect, self.lines[key][1], bounds)
-        if tuple(otherwise) == _WHITE and max(made) <= 0:
+        if tuple(otherwise) == WHITE and max(made) <= 0:
             self.say(None, self.lines[key][1], "is black where black is not meant, and is taken for white")
-            return list(_WHITE)
+            return list(WHITE)
         return made
 
-    def _image(self, key: str) -> _Image | None:
+    def image(self, key: str) -> _Image | None:
         """The image of a line; None if it is not there, which is said."""
         line, word, rest = self.lines.get(key, (0, key, ""))
         if not rest:
@@ -225,32 +241,32 @@ class Material:
         for name, value in options.items():
             if not _OPTIONS.fullmatch(f"{name} {value}"):
                 self.say("colour", f"{word} -{name}", "is an option that is not carried over")
-        return file, _lie(options)
+        return file, _lie(options), float(options.get("bm", "").split()[0] if options.get("bm") else 1)
 
     @property
     def _is_textured(self) -> bool:
-        return any(self._image(key) for key in ("map_kd", "map_d"))
+        return self.painted or any(self.image(key) for key in ("map_kd", "map_d"))
 
     def _glow(self) -> Map:
         """What it emits, by `Ke` and an image."""
-        image = self._image("map_ke")
-        ke = self._cut("ke", _WHITE if image else _BLACK, math.inf, "light")
+        image = self.image("map_ke")
+        ke = self.cut("ke", WHITE if image else _BLACK, math.inf, "light")
         return _read_map(image, ke) if image else constant(*ke)
 
     def _opacity(self, illum: float) -> Map | None:
         """Its opacity; None is opaque. An image's own opacity where it has some, or else its brightness."""
-        opacity, image = self._dissolve(illum), self._image("map_d")
+        opacity, image = self._dissolve(illum), self.image("map_d")
         if image is None:
             return constant(opacity) if opacity < 1 else None
-        file, lie = image
+        file, lie, _ = image
         values = images.decode(file.read_bytes(), str(file), raw=True)
         grey = values[..., 3:] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2, keepdims=True)
         return Map(np.float32(opacity) * grey.clip(0, 1), lie)
 
     def _dissolve(self, illum: float) -> float:
         """Its `d`, or 1 − `Tr`, unless that hides what is there to be seen."""
-        d, tr = self.lines.get("d"), self._cut("tr", (0.0,))[0]
-        opacity = self._cut("d", (1 - tr,))[0]
+        d, tr = self.lines.get("d"), self.cut("tr", (0.0,))[0]
+        opacity = self.cut("d", (1 - tr,))[0]
         if d and d[2].lower().startswith("-halo") and opacity < 1:
             self.say("colour", "d -halo", "is as opaque at its edges as in its middle")
         if d and "tr" in self.lines and abs(opacity + tr - 1) > 0.01:
@@ -263,25 +279,67 @@ class Material:
         self.say(None, "d 0", "is not seen, as the file says")
         return opacity
 
+    def _normals(self, writer: Writer) -> Map | None:
+        """Its normal map; an image of heights is none, which is said."""
+        word, stated = self.lines.get(self.relief, (0, "", ""))[1:]
+        for other in _RELIEFS:
+            if self.lines.get(other, (0, "", stated))[2] != stated:
+                self.say("colour", self.lines[other][1], f"is left out beside {word}")
+        image = self.image(self.relief)
+        if image is None:
+            return None
+        file, lie, strength = image
+        values = images.decode(file.read_bytes(), str(file), raw=True)[..., :3]
+        if self.relief != "norm":
+            directions = 2 * values - 1  # of length 1, and most of them upwards
+            are_long = np.abs(np.linalg.norm(directions, axis=2) - 1) < 0.1
+            if are_long.mean() <= 0.9 or (directions[..., 2] - np.abs(directions[..., 0])).mean() <= 0.3:
+                self.say("colour", word, "raises no bumps, as heights are left out; export a normal map")
+                return None
+            self.say(None, word, "has the colours of a normal map, and is taken for one")
+        part = Map(values, lie, file if _is_plain(file) else None)
+        return writer.normals(part, strength, f"{word} -s", mirrored=self.mirrored, of_all=True)
+
     def _put_gloss(self, place: Element, illum: float, writer: Writer) -> None:
         """Put what lies below opacity: diffuse, with the gloss of plastic or without."""
         ks, colour = self._numbers("ks"), self._colour()
-        if max(ks) <= _SHINES or illum in (0, 1):
-            writer.put_surface(place, "diffuse", {"reflectance": colour})
+        is_pbr = any(key.removeprefix("map_") in _PRINCIPLED for key in self.lines)
+        is_glossy = max(ks) > _SHINES and illum not in (0, 1)
+        if not is_glossy and not is_pbr:
+            writer.put_surface(place, "diffuse", {"reflectance": colour}, painted=self.painted)
             return
         alpha = max(math.sqrt(2 / (max(self._number("ns", 30.0), 0.0) + 2)), 0.02)
-        if illum in _MIRRORS:
+        is_plastic = alpha <= _SMOOTH and not (is_pbr or self.painted)
+        if illum in _MIRRORS and not is_pbr:
             self.say("colour", f"illum {illum:g}", "reflects as plastic does here, and not as a mirror")
-        is_tinted = max(ks) - min(ks) > 0.1 * max(ks) and alpha > _SMOOTH
-        said = "becomes the gloss of plastic, by Ns" + ", without its colour" * is_tinted
-        self.say("colour" if is_tinted else None, "Ks", said)
-        if alpha <= _SMOOTH:
+        if is_glossy:
+            is_tinted = max(ks) - min(ks) > 0.1 * max(ks) and not (is_plastic or is_pbr)
+            said = "becomes the gloss of plastic, by Ns" + ", without its colour" * is_tinted
+            self.say("colour" if is_tinted else None, "Ks", said)
+        if is_plastic:
             tint = constant(*(max(part, 0) / max(ks) for part in ks))
             parts = {"diffuse_reflectance": colour, "alpha": constant(alpha), "specular_reflectance": tint}
             writer.put_surface(place, "roughplastic", parts)
         else:
             parts = {"base_color": colour, "roughness": constant(math.sqrt(alpha)), "eta": self._eta(1.5)}
-            writer.put_surface(place, "principled", parts)
+            parts |= self._properties() if is_pbr else {}
+            writer.put_surface(place, "principled", parts, painted=self.painted)
+
+    def _properties(self) -> dict[str, Map]:
+        """The properties of `principled` that it states, by numbers or images."""
+        parts = {"clearcoat_gloss": constant(1 - self.cut("pcr", (0.0,))[0])}
+        for key, name in _PRINCIPLED.items():
+            image = self.image(f"map_{key}")
+            if image:
+                file, lie, _ = image
+                parts[name] = Map(images.decode(file.read_bytes(), str(file), raw=True)[..., :1].clip(0, 1), lie)
+                if self._number(key, 1) != 1:
+                    self.say(None, self.lines[key][1], "is left out beside its image")
+            elif key in self.lines:
+                parts[name] = constant(self.cut(key, (0.0,))[0])
+        if self._number("aniso", 0) and self._number("anisor", 0):
+            self.say("colour", "anisor", "its gloss is not turned")
+        return parts
 
     def _eta(self, otherwise: float) -> Map:
         """Its index of refraction."""
@@ -291,13 +349,13 @@ class Material:
         return constant(eta if eta >= 1.01 else otherwise)
 
     def _colour(self) -> Map:
-        image = self._image("map_kd")
-        kd = self._cut("kd", _WHITE if image else _GREY)
+        image = self.image("map_kd")
+        kd = self.cut("kd", WHITE if image or self.painted else _GREY)
         if image is None:
-            if "kd" not in self.lines and self.lines:
+            if "kd" not in self.lines and self.lines and not self.painted:
                 self.say(None, "Kd", "is not there; the surface is grey")
             return constant(*kd)
-        file, lie = image
+        file, lie, _ = image
         if min(kd) >= 1 and _is_plain(file):
             return Map(np.zeros((0, 0, 3), np.float32), lie, file)
         colour = _read_map(image, kd)

@@ -8,8 +8,9 @@ from __future__ import annotations
 import math
 from array import array
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element, SubElement
 
 import numpy as np
@@ -18,25 +19,31 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.waiting import Log
+from photonfarm.renderer.tools.importing import images
 from photonfarm.renderer.tools.importing.changes import Changes
 from photonfarm.renderer.tools.importing.imported import Floats, ImportedScene, Mesh, unit
-from photonfarm.renderer.tools.importing.readers.mtl import Material, read_libraries, statements
+from photonfarm.renderer.tools.importing.readers.mtl import WHITE, Material, read_libraries, statements
 
-_WIDTHS = {"v": 3, "vt": 2, "vn": 3}
-"""How many numbers are kept of the statements that tables are made of."""
+_WIDTHS = {"v": 6, "vt": 2, "vn": 3}
+"""How many numbers are kept of the statements that tables are made of; colours follow the coordinates of points."""
 
 _DRAWN = "p l curv curv2 vp cstype deg bmat step parm trim hole scrv sp end con ctech stech res mg lod bevel"
 """What has no surface of its own, belongs to free-form surfaces, or says how quickly programs draw."""
 
-_LOST = {
-    "s": "faces of smoothing groups are flat without vn; export normals",
-    "v": "colours of vertices are not read of OBJ; export as glTF",
-}
+_ROUNDING = 1e-6  # the error of a polygon's area, as a share of it, from which its triangles do not fill it
 
 _Ints = NDArray[np.int64]
 
 _Tables = tuple[Floats, Floats, Floats]
-"""Points, texture coordinates with v downwards, and normals; NaN, and row −1, for none."""
+"""Points and their linear colours, texture coordinates with v downwards, and normals; NaN, and row −1, for none."""
+
+
+class _Look(NamedTuple):
+    """A material as a mesh has it."""
+
+    material: Material
+    painted: bool  # its colour is the mesh's attribute `vertex_color`
+    mirrored: bool  # its images lie mirrored, and so its normal map does
 
 
 def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
@@ -45,14 +52,15 @@ def read(path: Path, scratch: Path, log: Log) -> ImportedScene:
     scene = ImportedScene()
     file = _File(path, scene.changes)
     parts = list(_parts(file, read_libraries(path, file.libraries, scene.changes)))
-    known: dict[Material, tuple[str, Element | None]] = {}
-    for _, material, _ in parts:
-        if material not in known:
-            made = scene.ids.make(material.name, "material")
-            known[material] = made, material.put(SubElement(scene.root, "bsdf", id=made), scratch / made)
-    for owner, material, mesh in parts:
-        shape_id = scene.ids.make("_".join(filter(None, (owner or path.stem, material.name))))
-        made, light = known[material]
+    known: dict[_Look, tuple[str, Element | None]] = {}
+    for _, look, _ in parts:
+        if look not in known:
+            made = scene.ids.make(look.material.name, "material")
+            material = replace(look.material, painted=look.painted, mirrored=look.mirrored)
+            known[look] = made, material.put(SubElement(scene.root, "bsdf", id=made), scratch / made)
+    for owner, look, mesh in parts:
+        shape_id = scene.ids.make("_".join(filter(None, (owner or path.stem, look.material.name))))
+        made, light = known[look]
         scene.put_shape(shape_id, mesh, made, owner, light, both_sides=True)
     if scene.root.find("shape") is None:
         raise SpecError(f"{path}: has no faces{' with an area' if parts else ''}; nothing can be rendered")
@@ -68,53 +76,49 @@ class _File:
     tables: dict[str, array[float]] = field(default_factory=lambda: {word: array("d") for word in _WIDTHS})
     named: array[int] = field(default_factory=lambda: array("q"))  # v, vt and vn of each corner, 0 for none
     marks: array[int] = field(default_factory=lambda: array("q"))
-    """Of each face: line, part, number of corners; how many v, vt and vn stand before it."""
+    """Of each face: line, part, smoothing group, number of corners; how many v, vt and vn stand before it."""
     parts: dict[tuple[str, str, str], int] = field(default_factory=dict)  # numbers of (object, group, material)
     libraries: list[str] = field(default_factory=list)
     uses: dict[str, int] = field(default_factory=dict)  # the first line of each material
-    lost: dict[str, int] = field(default_factory=dict)  # the first line of what is in `_LOST`
 
     def __post_init__(self) -> None:
-        state, smooth = {"o": "", "g": "", "usemtl": ""}, False
-        part = self.parts.setdefault(("", "", ""), 0)
+        state, groups = {"o": "", "g": "", "usemtl": "", "s": ""}, {"": 0, "off": 0, "0": 0}
+        part = smooth = self.parts.setdefault(("", "", ""), 0)
         for line, word, rest in statements(self.path):
             if word in self.tables:
                 self._add_row(line, word, rest.partition("#")[0].split())
             elif word in {"f", "fo"}:
-                self._add_face(line, rest.partition("#")[0].split(), part)
-                if smooth and not self.named[-1]:
-                    self.lost.setdefault("s", line)
+                self._add_face(line, rest.partition("#")[0].split(), part, smooth)
             elif word in state:
                 state[word] = rest
                 part = self.parts.setdefault((state["o"], state["g"], state["usemtl"]), len(self.parts))
+                smooth = groups.setdefault(state["s"].lower(), len(groups))
                 self.uses.setdefault(state["usemtl"], line)
-            elif word == "s":
-                smooth = rest.lower() not in ("off", "0")
             elif word == "mtllib":
                 self.libraries.append(rest)
+            elif word == "#MRGB":
+                if rest.strip("fF"):  # which is plain white
+                    self.changes.lose("colour", word, "ZBrush's colours of vertices are not read; export as glTF")
             elif word in _DRAWN.split():
                 self.changes.note("has no surface, and is left out", f"line {line}", name=word)
             else:
                 self.changes.lose("geometry", word, "is not read of OBJ, and is left out", f"line {line}")
-        for word, line in self.lost.items():
-            self.changes.lose("colour", word, _LOST[word], f"from line {line}")
 
     def _add_row(self, line: int, word: str, texts: list[str]) -> None:
         """Add the numbers of a v, vt or vn."""
-        width = _WIDTHS[word]
+        place, width = f"line {line}", _WIDTHS[word]
         try:
             row = [float(text.partition("(")[0]) for text in texts]  # some write −nan(ind)
         except ValueError as error:
             bad = str(error).rpartition(" ")[2]
-            raise SpecError(f"{self.path}: line {line}: {word} has {bad}, which is no number") from error
+            raise SpecError(f"{self.path}: {place}: {word} has {bad}, which is no number") from error
         if word == "v" and (len(row) < 3 or not math.isfinite(sum(row[:3]))):
-            raise SpecError(f"{self.path}: line {line}: v has no three finite numbers")
-        colours = row[3:] if len(row) > 4 else []  # a fourth number alone is a weight
-        if word == "v" and any(part != 1 for part in colours):  # and ones are white
-            self.lost.setdefault("v", line)
+            raise SpecError(f"{self.path}: {place}: v has no three finite numbers")
+        if word == "v" and len(row) not in (3, 4, 6) and row[6:] != [1]:  # 1 is a weight, or an alpha
+            self.changes.lose("colour", "v", "numbers after x y z, or x y z r g b, are left out", place)
         self.tables[word].extend((row + [0.0 if word == "vt" else math.nan] * width)[:width])
 
-    def _add_face(self, line: int, corners: list[str], part: int) -> None:
+    def _add_face(self, line: int, corners: list[str], part: int, smooth: int) -> None:
         try:
             for corner in corners:
                 v, _, others = corner.partition("/")
@@ -123,12 +127,12 @@ class _File:
         except (ValueError, OverflowError) as error:
             raise SpecError(f"{self.path}: line {line}: f has a corner that is none of v/vt/vn") from error
         before = (len(self.tables[word]) // width for word, width in _WIDTHS.items())
-        self.marks.extend((line, part, len(corners), *before))
+        self.marks.extend((line, part, smooth, len(corners), *before))
 
     def find_corners(self, marks: _Ints) -> _Ints:
-        """The rows of v, vt and vn (K, 3) that corners name, −1 for none, by the marks of their faces (K, 6)."""
+        """The rows of v, vt and vn (K, 3) that corners name, −1 for none, by the marks of their faces (K, 7)."""
         named = np.array(self.named, np.int64).reshape(-1, 3)
-        index = np.where(named < 0, marks[:, 3:] + named, named - 1)
+        index = np.where(named < 0, marks[:, 4:] + named, named - 1)
         there = [len(self.tables[word]) // width for word, width in _WIDTHS.items()]
         wrong = ((index < 0) | (index >= there)) & ((named != 0) | (np.arange(3) == 0))
         for bad, kind in np.argwhere(wrong)[:1]:
@@ -137,8 +141,8 @@ class _File:
         return index
 
 
-def _parts(file: _File, materials: dict[str, Material]) -> Iterator[tuple[str, Material, Mesh]]:
-    """The faces of a file by object, or else group, and by material."""
+def _parts(file: _File, materials: dict[str, Material]) -> Iterator[tuple[str, _Look, Mesh]]:
+    """The faces of a file by object, or else group, and by material; where images lie mirrored under it, apart."""
     corner, part, tables = _triangles(file)
     by = 0 if any(o for o, _, _ in file.parts) else 1
     names = [(name[by], name[2]) for name in file.parts]
@@ -147,40 +151,49 @@ def _parts(file: _File, materials: dict[str, Material]) -> Iterator[tuple[str, M
         if name:
             meaning = "materials are in no material file, and their surfaces are grey"
             file.changes.lose("colour", "usemtl", meaning, f"{name!r}, line {file.uses[name]}")
+    mapped = np.array([name in materials and materials[name].relief != "" for _, name in names])
+    a, b, c = tables[1][corner[..., 1]].swapaxes(0, 1)
+    mirrored = mapped[part] & ((b - a)[:, 0] * (c - a)[:, 1] > (b - a)[:, 1] * (c - a)[:, 0])  # v is downwards
     distinct = {name: number for number, name in enumerate(sorted(set(names)))}
-    kind = np.array([distinct[name] for name in names])[part]
+    kind = 2 * np.array([distinct[name] for name in names])[part] + mirrored
     order = np.argsort(kind, kind="stable")
     for chosen in np.split(order, np.flatnonzero(np.diff(kind[order])) + 1) if len(order) else ():
-        owner, name = list(distinct)[kind[chosen[0]]]
-        yield owner, materials[name], _mesh(corner[chosen].reshape(-1, 3), tables, materials[name])
+        owner, name = list(distinct)[kind[chosen[0]] // 2]
+        mesh = _mesh(corner[chosen].reshape(-1, 3), tables, materials[name])
+        yield owner, _Look(materials[name], "vertex_color" in mesh.attributes, bool(kind[chosen[0]] % 2)), mesh
 
 
 def _triangles(file: _File) -> tuple[_Ints, _Ints, _Tables]:
     """The rows of tables that triangles have at their corners (T, 3, 3), their parts (T,), and the tables."""
-    marks = np.array(file.marks, np.int64).reshape(-1, 6)
-    line, part, sizes = marks[:, :3].T
+    marks = np.array(file.marks, np.int64).reshape(-1, 7)
+    line, part, group, sizes = marks[:, :4].T
     points, uv, normals = (np.array(file.tables[word]).reshape(-1, width) for word, width in _WIDTHS.items())
     corner = file.find_corners(np.repeat(marks, sizes, axis=0))
-    triangle, face = _cut(points[corner[:, 0]], sizes)
+    triangle, face, across, crossing = _cut(points[corner[:, 0], :3], sizes)
+    for each in line[crossing]:
+        meaning = "faces cross themselves or have no area, and are filled as well as can be"
+        file.changes.note(meaning, f"line {each}", name="f")
     for each in line[sizes < 3]:
         file.changes.note("faces have fewer than three corners, and so no surface", f"line {each}", name="f")
-    normals = unit(np.concatenate([np.where(np.isfinite(normals), normals, np.nan), np.full((1, 3), np.nan)]))
+    made = _smooth_normals(corner, np.repeat(across, sizes, axis=0), np.repeat(group, sizes), len(normals))
+    normals = unit(np.concatenate([np.where(np.isfinite(normals), normals, np.nan), made, np.full((1, 3), np.nan)]))
     uv = np.concatenate([uv * (1, -1) + (0, 1), np.full((1, 2), np.nan)])
+    points[:, 3:] = _colours(points[:, 3:], file.changes)
     return corner[triangle], part[face], (points, uv, normals)
 
 
-def _cut(points: Floats, sizes: _Ints) -> tuple[_Ints, _Ints]:
+def _cut(points: Floats, sizes: _Ints) -> tuple[_Ints, _Ints, Floats, _Ints]:
     """Polygons of `sizes` corners each (N,), whose points (K, 3) follow one another, as triangles.
 
-    Returns their corners (T, 3) and the polygon of each (T,). Those of fewer than three corners have no triangles, and
-    those that cross themselves are filled as well as can be.
+    Returns their corners (T, 3), the polygon of each (T,), polygons' normals as long as twice their areas (N, 3), by
+    Newell's formula, and the polygons that cross themselves. Those of fewer than three corners have no triangles.
     """
     starts, counts = np.cumsum(sizes) - sizes, np.maximum(sizes - 2, 0)
     owner = np.repeat(np.arange(len(sizes)), counts)
     number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
     fan = starts[owner, None] + np.stack([0 * number, number + 1, number + 2], axis=1)
     a, b, c = points[fan].swapaxes(0, 1)
-    areas, across = np.cross(b - a, c - a), np.zeros((len(sizes), 3))  # twice the area, by Newell's formula
+    areas, across = np.cross(b - a, c - a), np.zeros((len(sizes), 3))
     np.add.at(across, owner, areas)
     bent = np.unique(owner[((areas * across[owner]).sum(axis=1) <= 0) & (counts[owner] > 1)])
     cuts = [starts[n] + _ears(points[starts[n] : starts[n] + sizes[n]], across[n]) for n in bent]
@@ -190,7 +203,8 @@ def _cut(points: Floats, sizes: _Ints) -> tuple[_Ints, _Ints]:
     a, b, c = points[corner].swapaxes(0, 1)
     areas = (np.cross(b - a, c - a) * across[owner]).sum(axis=1)
     corner[areas < 0] = corner[areas < 0, ::-1]
-    return corner, owner
+    filled, whole = np.bincount(owner, np.abs(areas), len(sizes)), (across * across).sum(axis=1)
+    return corner, owner, across, np.flatnonzero((np.abs(filled - whole) >= _ROUNDING * whole) & (sizes > 3))
 
 
 def _ears(points: Floats, across: Floats) -> _Ints:
@@ -198,6 +212,31 @@ def _ears(points: Floats, across: Floats) -> _Ints:
     flat = np.ascontiguousarray(np.delete(points - points[0], np.abs(across).argmax(), axis=1))
     made = triangulate_float64(flat, np.array([len(points)], np.uint32)).reshape(-1, 3)
     return np.array(made if len(made) else [[0, k, k + 1] for k in range(1, len(points) - 1)], np.int64)
+
+
+def _smooth_normals(corner: _Ints, across: Floats, group: _Ints, count: int) -> Floats:
+    """Normals for the corners (K, 3) of smoothing groups that have none, which then name them from row `count` on.
+
+    Each is the mean of the normals of polygons (K, 3), by area, that meet at a vertex in a group (K,).
+    """
+    smooth = (corner[:, 2] < 0) & (group > 0)
+    keys = corner[smooth, 0] * (group.max(initial=0) + 1) + group[smooth]
+    distinct, which = np.unique(keys, return_inverse=True)
+    sums: Floats = np.zeros((len(distinct), 3))
+    np.add.at(sums, which, across[smooth])
+    corner[smooth, 2] = count + which
+    return sums
+
+
+def _colours(given: Floats, changes: Changes) -> Floats:
+    """Linear colours of vertices, NaN for those that have none, from what stands after their coordinates."""
+    given = np.where(np.isfinite(given).all(axis=1, keepdims=True), given, np.nan)
+    if (given > 2).any() and not np.nansum(given % 1):
+        changes.note("colours of vertices are whole numbers beyond 1, and are taken for 0 to 255", name="v")
+        given = given / 255
+    elif (given > 1.001).any():  # more than rounding
+        changes.lose("colour", "v", "colours of vertices go beyond 1, and are cut")
+    return images.linear(given.clip(0, 1).astype(np.float32)).astype(np.float64)
 
 
 def _mesh(corner: _Ints, tables: _Tables, material: Material) -> Mesh:
@@ -212,8 +251,21 @@ def _mesh(corner: _Ints, tables: _Tables, material: Material) -> Mesh:
     if material.has_images and (vt < 0).any():
         material.say(None, "vt", "some faces have none, and show one point of the images")
     return Mesh(
-        points[v],
+        points[v, :3],
         which.reshape(-1, 3).astype(np.uint32),
         normals[vn] if (vn >= 0).any() else None,
         np.where(placed, uvs[vt], (0.0, 1.0)) if material.has_images or placed.any() else None,
+        _paint(points[v, 3:], material),
     )
+
+
+def _paint(colours: Floats, material: Material) -> dict[str, Floats]:
+    """The colours of a mesh's vertices, if it has some, and its material no image."""
+    if not np.isfinite(colours).any():
+        return {}
+    if material.image("map_kd") is not None:
+        material.say(None, "v", "colours of vertices are left out beside the image")
+        return {}
+    if not np.isfinite(colours).all():
+        material.say(None, "v", "some vertices have no colour, and are white")
+    return {"vertex_color": np.nan_to_num(colours, nan=1) * material.cut("kd", WHITE)}

@@ -310,6 +310,19 @@ of["TEX_IMAGE"].image = image
 tree.links.new(of["TEX_IMAGE"].outputs["Alpha"], of["BSDF_PRINCIPLED"].inputs["Alpha"])
 surface(15, "film", "ShaderNodeBsdfTransparent", Color=(1, 0.2, 0.2, 1))
 surface(16, "twice", "ShaderNodeAddShader", [("ShaderNodeEmission", 0), ("ShaderNodeEmission", 1)])
+surface(18, "glowing", "ShaderNodeAddShader", [("ShaderNodeBsdfDiffuse", 0), ("ShaderNodeEmission", 1)])
+surface(19, "gauze", "ShaderNodeMixShader", [("ShaderNodeBsdfDiffuse", 1), ("ShaderNodeBsdfTransparent", 2)], Fac=0.25)
+lamp = bpy.data.lights.new("Mixed", "POINT")
+lamp.use_nodes, lamp.shadow_soft_size, lamp.energy = True, 0, 40
+bpy.context.scene.collection.objects.link(bpy.data.objects.new("Mixed", lamp))
+tree = lamp.node_tree
+mixed = tree.nodes.new("ShaderNodeMixShader")
+mixed.inputs[0].default_value = 0.25
+for number, strength in ((1, 2), (2, 6)):
+    shader = tree.nodes.new("ShaderNodeEmission")
+    shader.inputs["Strength"].default_value = strength
+    tree.links.new(shader.outputs[0], mixed.inputs[number])
+tree.links.new(mixed.outputs[0], tree.get_output_node("CYCLES").inputs["Surface"])
 surface(17, "fog", "")
 tree = bpy.data.materials["fog"].node_tree
 tree.links.new(tree.nodes.new("ShaderNodeVolumeScatter").outputs[0], tree.get_output_node("CYCLES").inputs["Volume"])
@@ -342,6 +355,10 @@ def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Pa
         hit = scene.ray_intersect(mi.Ray3f([1.1, -3 * direction, 0.1], [0, direction, 0]))
         assert np.array(hit.emitter(scene).eval(hit)).ravel() == pytest.approx([4, 2, 1], rel=1e-5)
     assert "Dielectric" in str(down(7).bsdf())
+    assert np.array(down(18).emitter(scene).eval(down(18))).ravel() == pytest.approx([1, 1, 1])
+    assert np.array(down(19).bsdf().eval_null_transmission(down(19))).ravel() == pytest.approx([0.25] * 3)
+    (lamp,) = (emitter for emitter in scene.emitters() if emitter.class_name() == "PointLight")
+    assert np.array(mi.traverse(lamp)["intensity.value"]).ravel() == pytest.approx([40 * 3 / (4 * np.pi)] * 3)
     assert not down(17).is_valid()  # what has a volume alone is seen through
     assert ("Add Shader", ["material 'twice'"]) in [(c.name, c.places) for c in made.changes if c.effect == "light"]
     for x, opacity in ((-0.35, 1), (0.15, 0)):  # of an image's own alpha

@@ -128,6 +128,7 @@ def test_colours_in_each_form_are_read(
         ("map_Bump -bm 0.5 four.png", {"map_Bump": "colour"}),
         ("Ks .5 .1 .1\nPr .3\nPm 1\nPs 1\nPc 1\nPcr .1\naniso 0\nanisor 0", {}),
         ("map_Kd -s on -o 0 off four.png", {"map_Kd -s": "colour", "map_Kd -o": "colour"}),
+        ("norm -bm on four.png", {"norm -bm": "colour"}),
         ("disp x.png", {"disp": "geometry"}),
         ("illum 10", {"illum 10": "colour"}),
         ("bogus 1", {"bogus": "colour"}),

@@ -126,10 +126,14 @@ def _is_plain(file: Path) -> bool:
     return False
 
 
+def _floats(options: Mapping[str, str], name: str) -> list[float]:
+    """The numbers of an option; words in their place are said where it is read."""
+    return [float(word) for word in options.get(name, "").split() if word not in ("on", "off")]
+
+
 def _lie(options: Mapping[str, str]) -> Lie:
     """How an image with options lies. MTL's v goes upwards, and Mitsuba's downwards."""
-    s, o = ([float(word) for word in options.get(key, "").split() if word not in ("on", "off")] for key in "so")
-    (su, sv), (u, v) = [*s, 1.0, 1.0][:2], [*o, 0.0, 0.0][:2]
+    (su, sv), (u, v) = [*_floats(options, "s"), 1.0, 1.0][:2], [*_floats(options, "o"), 0.0, 0.0][:2]
     wrap = "clamp" if options.get("clamp") == "on" else "repeat"
     return Lie(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))
 
@@ -241,7 +245,7 @@ class Material:
         for name, value in options.items():
             if not _OPTIONS.fullmatch(f"{name} {value}"):
                 self.say("colour", f"{word} -{name}", "is an option that is not carried over")
-        return file, _lie(options), float(options.get("bm", "").split()[0] if options.get("bm") else 1)
+        return file, _lie(options), [*_floats(options, "bm"), 1.0][0]
 
     @property
     def _is_textured(self) -> bool:

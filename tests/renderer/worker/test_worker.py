@@ -18,12 +18,12 @@ from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
 from photonfarm.queue.connection import connect
 from photonfarm.queue.failures import read_kept_failures
-from photonfarm.queue.job import TRIES, job_name
+from photonfarm.queue.job import TRIES, Share, job_name
 from photonfarm.queue.reconciliation import reconcile
 from photonfarm.queue.rq_adapter import queue_status
 from photonfarm.queue.workers import Activity, WorkerReport, read_workers
 from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
-from photonfarm.renderer.worker.source import QueueSource
+from photonfarm.renderer.worker.source import QueueSource, ShareSource
 from photonfarm.renderer.worker.worker import ChildOutput, check, ending, render_job, run_worker
 from photonfarm.scene.spec import Source
 from photonfarm.store import SceneStore, Store
@@ -176,6 +176,15 @@ def test_what_a_worker_does_is_told_while_it_does_it_and_not_after(
         assert _once(lambda: not queue_status(connection).activities)
         assert source.take("the disk is full", {}) is None
         assert _once(lambda: queue_status(connection).paused == {"ada": "the disk is full"})
+
+
+def test_a_share_of_a_scene_that_is_not_there_yet_takes_no_job_of_others(scene: SceneStore) -> None:
+    store = Store(scene.folder.parent.parent)
+    share, absent = Share(number=0, of=1), "0" * 32
+    settings = WorkerSettings(store=str(store.root), share=share, scene_ids=(absent,), name="ada")
+    assert ShareSource(settings, store, share).take(None, {}) is None
+    both = settings.model_copy(update={"scene_ids": (absent, scene.scene_id)})
+    assert ShareSource(both, store, share).take(None, {}) is not None
 
 
 def _once(look: Callable[[], bool], seconds: float = 10.0) -> bool:

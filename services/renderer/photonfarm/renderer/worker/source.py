@@ -180,10 +180,12 @@ class ShareSource:
     def _list_missing(self) -> None:
         """List what is missing, without what has failed too often; what has failed comes last."""
         self._store.check()
-        began, scenes = time.monotonic(), self._settings.scenes
+        began, wanted = time.monotonic(), self._settings.scenes
+        scenes = wanted
         if not self._settings.until_complete:  # a worker that waits for more lets the scenes come later
-            scenes = tuple(filter(self._store.has_scene, scenes))
-        missing, unreadable = missing_jobs(self._store, scenes, followed=True)
+            scenes = tuple(filter(self._store.has_scene, wanted))
+        none_is_there = wanted and not scenes
+        missing, unreadable = ({}, {}) if none_is_there else missing_jobs(self._store, scenes, followed=True)
         self.pause_s = pause_after_look(time.monotonic() - began, self._settings.idle_s)
         for scene_id in unreadable.keys() - self._unreadable.keys():
             log.warning("scene %s is passed over, and the others go on: %s", scene_id, unreadable[scene_id])

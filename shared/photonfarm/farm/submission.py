@@ -230,8 +230,8 @@ def submit(
         replaced = ", ".join(f"{key} ({was} before, {is_} now)" for key, (was, is_) in changes) or None
     with announce_work(opened.storage, named.spec.scene_id, "submit", log.warning):
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
-    anew = planned.scene_id if planned.plan == 0 else False  # a scene of this id may have been forgotten
-    queued = _queue(opened, redis_url, retry=retry or anew)
+    new_scene = planned.scene_id if planned.plan == 0 else False  # its jobs may have failed before it was forgotten
+    queued = _queue(opened, redis_url, retry=retry or new_scene)
     return Submission(
         planned.scene_id,
         planned.plan,

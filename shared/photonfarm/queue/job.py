@@ -1,7 +1,7 @@
 """Jobs: checked names, `<scene id>-<number>`, from which everything else follows; and shares of them.
 
-Where there is no Redis, the store alone says what is missing. Then worker K of N owns the jobs whose number leaves K
-when it is divided by N. Nobody reserves a job: two workers may render the same one, which costs the time of the second
+Where there is no Redis, the store alone says what is missing. Then worker K of N owns the jobs whose number modulo N
+is K. Nobody reserves a job: two workers may render the same one, which costs the time of the second
 and no more, as the first commit stays.
 """
 

@@ -70,7 +70,7 @@ def test_no_more_is_committed_than_the_ratio_to_what_the_trainer_has_used(
         if used is not None:
             report_consumed(connection, scene.scene_id, used)
         clock.now += AHEAD_LOOK_S
-        return pace.ahead().get(scene.scene_id)
+        return pace.scenes_ahead().get(scene.scene_id)
 
     assert reason_after(job=0) is None
     assert reason_after(job=1) == "4 samples are committed, and the trainer has used 0 (--ahead 1.5)"
@@ -90,9 +90,9 @@ def test_each_scene_is_held_against_its_own_trainer(
 ) -> None:
     ahead, new, used = add("ahead", 8, 3), add("new", 16, 1), add("used", 24, 3)
     report_consumed(connection, used.scene_id, 6)
-    assert TrainerPace(store, connection, 1.0).ahead().keys() == {ahead.scene_id}
-    assert TrainerPace(store, connection, 1.0, scene_id=new.scene_id).ahead() == {}
-    assert TrainerPace(store, connection, 1.0, scene_id=ahead.scene_id).ahead().keys() == {ahead.scene_id}
+    assert TrainerPace(store, connection, 1.0).scenes_ahead().keys() == {ahead.scene_id}
+    assert TrainerPace(store, connection, 1.0, scene_id=new.scene_id).scenes_ahead() == {}
+    assert TrainerPace(store, connection, 1.0, scene_id=ahead.scene_id).scenes_ahead().keys() == {ahead.scene_id}
 
 
 def test_a_ratio_below_one_is_refused_as_it_would_stop_for_good() -> None:

@@ -40,7 +40,7 @@ def test_guided_light_paths_follow_from_the_configuration_alone(small: Callable[
     at_rest = room.render_halves(views[0], (1, 2))
     room.apply(moved)
     np.testing.assert_array_equal(room.render_halves(views[0], (1, 2)), halves)
-    room.forget_guides()
+    room.forget_path_guides()
     np.testing.assert_array_equal(room.render_halves(views[0], (1, 2)), halves)
     np.testing.assert_allclose(room.render_images(views[:1] * 2, (1, 2)), halves, rtol=1e-3, atol=1e-3)
     assert np.any(halves[0] != halves[1])

@@ -248,7 +248,7 @@ def test_the_gradient_is_torchs_own_to_the_bit_for_equal_parts_and_the_right_one
             loss = made(inputs).square().mean()
             torch.autograd.backward(loss)
             if made is network and len(inputs) < len(x):
-                group.average(weights, loss, len(inputs))
+                group.average_gradients(weights, loss, len(inputs))
             return torch.cat([weight.grad.double().flatten() for weight in made.parameters()])
 
         ours, torchs = gradient(network, own), gradient(DistributedDataParallel(network), own)

@@ -288,7 +288,7 @@ class SceneReader:
     # ----------------------------------------------------------------------------------------------------------- others
 
     def at_work(self, what: str) -> AbstractContextManager[None]:
-        """Announce that this process is at work in the scene, as `lease.at_work` does."""
+        """Announce that this process is at work in the scene, as `lease.announce_work` does."""
         return announce_work(self._storage, self._scene_id, what)
 
     def lease(self) -> str | None:

@@ -77,7 +77,15 @@ def trace(
         dr.zeros(mi.Spectrum, slots),
     )
     bounce = dr.full(mi.Int32, -1, slots)
-    options = PathOptions(depth + 1, depth + 1, 0, zero, zero, False, False)
+    options = PathOptions(
+        max_depth=depth + 1,
+        rr_depth=depth + 1,
+        connections=0,
+        count=zero,
+        light_ratio=zero,
+        connects=False,
+        traces_light=False,
+    )
     loop_once(
         state=(first_state(scene, lights, start, rng),),
         cond=lambda s: s.active,

@@ -1,7 +1,7 @@
 """Random numbers: Owen-scrambled Sobol' points, in pairs of dimensions, each with its own scramble.
 
 The points of a *sequence* are stratified together. A sequence is the samples of one pixel for eye paths, all light
-paths of an image for light paths, and all pixels for the places where a sample of them finds its light paths. Point
+paths of an image for light paths, and all pixels of one sample, to pair them with light paths. Point
 number `index` of pair `dimension` is a point of the (0,2)-sequence of Sobol', whose index and coordinates are scrambled
 by Owen's method, with a hash (Burley, *Practical Hash-based Owen Scrambling*, JCGT 2020; the permutation is that of
 Laine and Karras 2011 with the constants of Vegdahl 2021). So every single point is uniform, and an estimate has the
@@ -25,6 +25,7 @@ import numpy as np
 from photonfarm.renderer.bdpt.launches import Launch
 
 LIGHT, EYE, PAIRING, PHOTONS, PIXELS, LEARNING, SLOTS = range(7)
+"""What a sequence is for, as a part of its seed."""
 
 _ULP = 1 / (1 << 24)
 
@@ -81,7 +82,7 @@ class Sampler:
         return mi.Point2f(_unit(_scramble(index, first)), _unit(_scramble(_sobol_1(index), _mix(first))))
 
     def apart(self) -> Sampler:
-        """The same point from a pair of dimensions on that a path does not read before 5000 vertices."""
+        """The same point, 2¹⁵ pairs of dimensions further on, which no path of fewer than 5000 vertices reaches."""
         return Sampler(self.sequence, self.index, self.dimension + (1 << 15))
 
     def _next_seed(self) -> mi.UInt32:
@@ -137,7 +138,7 @@ def along_curve(lane: mi.UInt32, n: mi.UInt32, rng: Sampler) -> mi.Point2f:
 
 
 def point_on_curve(place: mi.UInt32, below: mi.Point2f) -> mi.Point2f:
-    """The points in [0, 1)² at places along Morton's curve, 16 bits for each coordinate; ``below`` are those below."""
+    """The points in [0, 1)² at places on Morton's curve of 16 bits a coordinate; ``below`` is the place in the cell."""
     return dr.minimum((corner_of(place) + below) / (1 << 16), dr.one_minus_epsilon(mi.Float))
 
 

@@ -1,8 +1,8 @@
 """The image-space buffers of a view [supplement 1.3], which have no noise.
 
 **Depth and normal** are those of the first hit of one ray through each pixel centre. **Albedo** is a mean over the
-pixel's area, by a regular grid of 4 × 4 rays, because the radiance of a box filter is such a mean too. A single ray
-would show another texel, and at edges another surface.
+pixel's area, by a regular grid of 4 × 4 rays, like the radiance, which a box filter averages over the pixel. A single
+ray would show another texel, and at edges another surface.
 
 **Albedo** is the diffuse reflectance of the first surface, and 0 for surfaces without a diffuse part (glass, mirrors,
 metals, null). For BSDFs without a function of their own Mitsuba's `eval_diffuse_reflectance` returns π times the whole
@@ -93,12 +93,14 @@ def camera_rays(camera: Camera, directions: F32, spec: SceneSpec) -> tuple[tuple
 
 
 def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: str) -> tuple[Any, ...]:
-    """(hits, normals, distances) of the first surfaces that rays meet ("centre"), or ("albedo",); zeros without."""
+    """(hits, normals, distances) of the first surfaces that rays meet ("centre"), or ("albedo",); zeros on a miss."""
     si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
     hit = si.is_valid()
-    columns: tuple[Any, ...] = (dr.select(hit, seen_reflectance(si, hit), 0),)
+    columns: tuple[Any, ...]
     if what == "centre":
         columns = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
+    else:
+        columns = (dr.select(hit, seen_reflectance(si, hit), 0),)
     dr.eval(columns)
     return columns
 

@@ -100,7 +100,7 @@ class LoadedScene:
             elif was_present and not present:
                 group.park(self._parking)
         if not np.array_equal(modification.vector, self._state.vector):
-            self.forget_guides()
+            self.forget_path_guides()
         self._state = modification
         if self._groups:
             self.scene.parameters_changed([])  # Mitsuba rebuilds what depends on all shapes
@@ -170,7 +170,7 @@ class LoadedScene:
             self._light_guides[integrator] = guide
         return self._light_guides[integrator]
 
-    def forget_guides(self) -> None:
+    def forget_path_guides(self) -> None:
         """Learn the guides of light paths anew, as for another configuration."""
         self._light_guides.clear()
 

@@ -4,8 +4,8 @@ Mitsuba has Embree build for scenes that never change: one hierarchy over all tr
 triangle, at every edit. Embree's low quality, meant for dynamic scenes, makes one hierarchy per mesh and a small one
 above them: rebuilds are 4 to 6 times faster, whole edits of the room `room` twice (14 instead of 29 ms), and images
 take 0.9 to 1.02 times as long. Rays meet the same surfaces, except where two surfaces touch; and as guides are learned
-from such rays, whole images differ by their noise. So the quality is no option: every worker sets it, as radiance must
-follow from keys alone.
+from such rays, whole images differ by their noise. So the quality cannot be configured: every worker sets it, as
+radiance must follow from keys alone.
 
 Embree's scene is found in the graph of a ray that is not yet traced, which names two addresses: Embree's entry point
 and the scene. Nothing is done unless the first is an address that libembree3 exports, so that the second must be the

@@ -13,6 +13,7 @@ from photonfarm.core.keys import Stream, make_key
 from photonfarm.renderer.scene.arrays import floats, integers
 
 Colour = tuple[float, float, float]
+Point = tuple[float, float, float]
 
 
 def rgb(colour: Colour) -> dict[str, Any]:
@@ -130,7 +131,7 @@ def mesh(
     return made
 
 
-def rectangle_light(centre: Colour, size: tuple[float, float], up: Colour, radiance: Colour) -> dict[str, Any]:
+def rectangle_light(centre: Point, size: tuple[float, float], up: Point, radiance: Colour) -> dict[str, Any]:
     """A one-sided rectangle across the axis `up` that shines against it; `size` along the two other axes, in order."""
     axis = int(np.argmax(np.abs(up)))
     first, second = (i for i in range(3) if i != axis)
@@ -148,8 +149,6 @@ def rectangle_light(centre: Colour, size: tuple[float, float], up: Colour, radia
         "emitter": {"type": "area", "radiance": rgb(radiance)},
     }
 
-
-Point = tuple[float, float, float]
 
 _GRID = (-1.0, -0.4, -1e-3, 1e-3, 0.4, 1.0)
 """The coordinates of a rounded box's vertices on a face of the unit cube: the inner pair bounds the flat part."""
@@ -172,7 +171,7 @@ def legs(width: float, depth: float, height: float, thickness: float) -> list[An
 
 
 def rounded_box(size: Point, centre: Point, radius: float) -> Any:
-    """A box with rounded edges: the sum of a box and a sphere; smooth vertex normals fit it."""
+    """A box with rounded edges: the Minkowski sum of a box and a sphere; smooth vertex normals fit it."""
     u, v = (a.ravel() for a in np.meshgrid(_GRID, _GRID, indexing="ij"))
     n = len(_GRID)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
@@ -188,8 +187,8 @@ def rounded_box(size: Point, centre: Point, radius: float) -> Any:
     direction = np.concatenate(vertices)
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     inner = np.array(size) / 2 - radius
-    quad = np.concatenate(faces)
-    triangles = np.concatenate([quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]])
+    sides = np.concatenate(faces)
+    triangles = np.concatenate([sides[:, [0, 1, 2]], sides[:, [0, 2, 3]]])
     return trimesh.Trimesh(np.sign(direction) * inner + radius * direction + centre, triangles, process=False)
 
 
@@ -202,9 +201,9 @@ def lathe(profile: list[tuple[float, float]], sections: int = 32) -> Any:
 
 def rod(radius: float, foot: Point, height: float, sections: int = 16) -> Any:
     """A vertical cylinder that stands at `foot`."""
-    rod = lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sections)
-    rod.apply_translation(foot)
-    return rod
+    cylinder = lathe([(0, 0), (radius, 0), (radius, height), (0, height)], sections)
+    cylinder.apply_translation(foot)
+    return cylinder
 
 
 def quad(corner: Point, u: Point, v: Point) -> Any:

@@ -126,7 +126,7 @@ class PilotScene:
     def _render(self, modification: Modification, view: View, candidate: Candidate, seed: int, spp: int) -> F32:
         self._apply(modification)
         if self.spec.groups:
-            self.loaded.forget_guides()  # a sample has them to learn, as with one view of each configuration
+            self.loaded.forget_path_guides()  # a sample has them to learn, as with one view of each configuration
         if candidate not in self._integrators:
             settings = asdict(candidate)
             self._integrators[candidate] = integrator_of(self.spec.transport.model_copy(update=settings))

@@ -104,8 +104,9 @@ def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[fl
     Some light no technique finds well, such as a caustic seen in a mirror. With equal seeds all candidates have the
     same rare bright samples of it, and chance decides whether a short pilot has one. The shared noise of a pixel is the
     least (y_a − y_b)²/2 of all candidates. Where the worst 1 % of the pixels have more of it than all others together,
-    the difference is subtracted from each candidate's error. So a choice among them is wrong by no more than the ratio
-    of their times. In later rounds of a pilot the candidates are those still measured.
+    the difference is subtracted from each candidate's error. At worst, where what is left out outweighs the rest, the
+    choice is slower by the ratio of the candidates' times. In later rounds of a pilot
+    the candidates are those still measured.
     """
     squares = [(((a.astype(np.float64) - b) * weights) ** 2 / 2).mean(axis=-1).ravel() for a, b in pairs]
     shared = np.sort(np.minimum.reduce(squares))
@@ -150,10 +151,10 @@ class BlockSums:
 
             s² = max(ρ · mean variance of a pixel / n, variance between the images) / images,    N = n · images / ρ
 
-        Pixels depend on each other where eye paths are joined to the same light paths. The variance of a block mean is
-        then ρ times that of independent pixels; ρ up to 40 was measured. One block has few pairs of images, but a
-        candidate's settings are the same everywhere. So ρ is the mean of R over all pairs, and at least 1. R is the
-        mean over the M blocks of (variance of the block mean between the two images) / (mean variance of a pixel / n).
+        Pixels depend on each other where eye paths are joined to the same light paths. R of a pair of images is the
+        mean over its M blocks of (variance of the block mean between the two images) / (mean variance of a pixel / n);
+        it is 1 for independent pixels. One block has few pairs of images, but a candidate's settings are the same
+        everywhere. So ρ is the mean of R over all pairs, and at least 1. Up to 40 was measured.
 
         Pairs are independent, but the blocks of one image may not be. By Satterthwaite's rule a pair has
         2·mean(R)²/var(R) degrees of freedom, between 1 and M; s² has that times the number of pairs. Where the variance

@@ -34,8 +34,8 @@ from photonfarm.scene.spec import PhotonSpec, SceneSpec
 SIMILAR = 4.0
 """The factor between times of half-estimates up to which a measurement still applies.
 
-The choice depends on an image's fixed part, which matters if samples are few. A written plan keeps the time, up to a
-sample.
+An image has costs that do not grow with its samples, so the choice depends on half_spp. A written plan keeps the time
+of an image, up to that of one sample.
 """
 
 SpecTables = dict[str, dict[str, Any]]
@@ -97,7 +97,7 @@ class TransportPlan:
 def make_plan(
     spec: SceneSpec, beside: Path | None, purpose: Purpose, *, seconds: float, again: bool, log: Log
 ) -> TransportPlan:
-    """The plan of a spec for a purpose; a cached measurement is used if it took `seconds`, unless `again` is set."""
+    """The plan of a spec for a purpose; a cached measurement of at least `seconds` is used, unless `again`."""
     kept = None if again else find(spec, purpose)
     if kept is not None and kept.asked_s >= seconds and knows(kept, spec):
         return plan_of(spec, kept, cached=True)
@@ -126,10 +126,10 @@ def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> Trans
     settings, the present ones stay.
     """
     photons = recommend_photons(spec.photons, measurement.reach, spec.transport.max_depth)
-    settings = present(spec), spec.transport.half_spp
+    start = present(spec), spec.transport.half_spp
     if not measurement.rows:
         return TransportPlan(spec, measurement, cached, PLAIN, spec.transport.half_spp, *photons, {})
-    at_equal_cost, seen = _compare(measurement, *settings), [settings]
+    at_equal_cost, seen = _compare(measurement, *start), [start]
     while (better := _better(measurement, *seen[-1])) is not None:
         if better in seen:
             return TransportPlan(spec, measurement, cached, *seen[0], *photons, at_equal_cost)

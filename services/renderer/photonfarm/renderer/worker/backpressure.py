@@ -87,7 +87,7 @@ class TrainerPace:
         self._due = 0.0
         self._ahead: dict[str, str] = {}
 
-    def ahead(self) -> dict[str, str]:
+    def scenes_ahead(self) -> dict[str, str]:
         """The scenes of which no job should be taken now: the reason, by scene id. Raises redis.RedisError."""
         if self._clock() >= self._due:
             began = self._clock()

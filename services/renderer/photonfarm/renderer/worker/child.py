@@ -135,7 +135,7 @@ class RenderWorker:
         now = time.monotonic()
         self._not_here = {scene_id: entry for scene_id, entry in self._not_here.items() if now < entry[1]}
         paused = self._disk.reason()
-        left = {**self._source.ahead(), **read_leases(self._store.storage)}
+        left = {**self._source.scenes_ahead(), **read_leases(self._store.storage)}
         left |= {scene_id: str(error) for scene_id, (error, _) in self._not_here.items()}
         self._log_pauses(paused, left)
         job = self._source.take(paused, left)
@@ -260,7 +260,7 @@ class RenderWorker:
         if (fatal := self._fatal_of(error)) is not None:
             self._fatal = fatal
             return "again"
-        if isinstance(error, QueueError):  # the store has no such job
+        if isinstance(error, QueueError):  # a queued job that the store does not have
             return "done"
         self._tainted = not isinstance(error, PhotonfarmError)
         return "failed"

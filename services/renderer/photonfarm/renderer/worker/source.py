@@ -92,9 +92,9 @@ class QueueSource:
                 pipeline.execute()
             serve(self._connection, self._store)
 
-    def ahead(self) -> Mapping[str, str]:
+    def scenes_ahead(self) -> Mapping[str, str]:
         """The scenes whose trainers are far behind, so that no job of them should be taken: the reason, by scene id."""
-        return self._pace.ahead() if self._pace else {}
+        return self._pace.scenes_ahead() if self._pace else {}
 
     def take(self, paused: str | None, left: Mapping[str, str]) -> RenderArguments | None:
         """The next job of the scenes that are not `left`; None if there was none for a while, or while `paused`.
@@ -160,7 +160,7 @@ class ShareSource:
         """Nobody is told of the worker."""
         return contextlib.nullcontext()
 
-    def ahead(self) -> Mapping[str, str]:
+    def scenes_ahead(self) -> Mapping[str, str]:
         """Of trainers nothing is known."""
         return {}
 

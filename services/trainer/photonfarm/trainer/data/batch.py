@@ -35,7 +35,7 @@ class TrainingBatch:
     rows: tuple[int, ...]
     units: tuple[Key, ...]  # by which each is held out: equal for samples that are not independent
     inputs: Inputs
-    target: Tensor  # (B, 2, H, W, 3) half-estimates A and B, linear radiance × exposure
+    target: Tensor  # (B, 2, H, W, 3) half-estimates A and B, or (B, 1, …) with noisy colour; linear radiance × exposure
 
     @classmethod
     def of(

@@ -117,7 +117,7 @@ class Ranks:
             with self._others_there():
                 distributed.all_reduce(torch.zeros(()))
 
-    def average(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
+    def average_gradients(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
         """The loss over the joint batch, whose gradient the weights get; `count` of its samples are of this process."""
         if self.size == 1:
             return loss.item()

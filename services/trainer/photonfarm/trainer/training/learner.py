@@ -128,7 +128,7 @@ def name_compile_errors(how: Compilation) -> Iterator[None]:
 class DivergedError(IncompleteError):
     """Loss or held-out error are no longer finite, or much worse than before; the same run would diverge again.
 
-    `found` states which, and at which step.
+    `fault` states which, and at which step.
     """
 
     exit_code = 8
@@ -174,7 +174,7 @@ class Learner:
         batch = batch.to(self._device).for_training()
         loss = self._loss(predict_image(self.network, batch.inputs), batch.target)
         torch.autograd.backward(loss)
-        value = self._ranks.average(list(self.network.parameters()), loss, len(batch.rows))
+        value = self._ranks.average_gradients(list(self.network.parameters()), loss, len(batch.rows))
         if math.isfinite(value):
             self.optimiser.step()
             if self.average is not None:

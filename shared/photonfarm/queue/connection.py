@@ -75,7 +75,8 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
     except redis.AuthenticationError as error:
         raise QueueError(f"the Redis at {shown} {_why_refused(str(error).rstrip('.'), url)}") from error
     except (redis.RedisError, OSError) as error:
-        remedy = "" if isinstance(error, redis.BusyLoadingError) else "; `photonfarm redis` starts one"
+        answers = isinstance(error, redis.BusyLoadingError | redis.ResponseError)
+        remedy = "" if answers else "; `photonfarm redis` starts one"
         raise QueueError(f"no Redis at {shown}: {str(error).rstrip('.')}{remedy}") from error
     return connection
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from photonfarm.core.errors import QueueError
-from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.redis_server import EmbeddedRedis, server_binary
 from photonfarm.queue.connection import connect
 
 
@@ -57,11 +57,22 @@ def test_a_second_server_on_the_folder_is_refused_and_the_first_goes_on(tmp_path
         assert connect(server.url).ping()
 
 
+def test_a_server_on_the_path_serves_where_the_package_has_none_for_the_machine(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("platform.machine", lambda: "riscv64")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(QueueError, match="valkey-server or redis-server on PATH"):
+        server_binary()
+    (tmp_path / "redis-server").touch(mode=0o755)
+    assert server_binary() == tmp_path / "redis-server"
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux ends a child with its parent")
 def test_it_does_not_outlive_a_killed_parent_and_its_folder_can_be_used_again(tmp_path: Path) -> None:
     code = """
 import sys, time
-from photonfarm.farm.redis_server import EmbeddedRedis
+from photonfarm.farm.redis_server import EmbeddedRedis, server_binary
 with EmbeddedRedis(sys.argv[1]) as server:
     print(server.pid, flush=True)
     time.sleep(60)

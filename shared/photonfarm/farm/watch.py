@@ -22,7 +22,7 @@ from photonfarm.farm.progress import FarmProgress, QueueProgress, SceneProgress
 from photonfarm.farm.running_farm import running_farm
 from photonfarm.farm.training import RunFolder
 from photonfarm.store import SceneStatus, SceneStore, Store
-from photonfarm.store.model.store import FAILURES_FOLDER
+from photonfarm.store.model.store import FAILURES_FOLDER, name_of
 
 if TYPE_CHECKING:
     from photonfarm.queue.failures import Failure
@@ -48,18 +48,10 @@ class _Seen:
     core_s: dict[int, float] = field(default_factory=dict)  # that committed jobs took, by their numbers
     size_bytes: int = 0
     redrawn: int = 0
-    unreadable: int = 0  # markers; they count as free
-    error: StoreError | None = None  # of the first of these
     history: deque[tuple[float, int]] = field(default_factory=deque)  # when so many samples were rendered
 
-    def add(self, job: int, marker: dict[str, Any] | StoreError) -> None:
-        """Add a job's marker, or why it cannot be read."""
-        if isinstance(marker, StoreError):
-            if not isinstance(marker.__cause__, FileNotFoundError):  # else a repair has moved it since it was listed
-                self.core_s[job] = 0.0
-                self.unreadable += 1
-                self.error = self.error or marker
-            return
+    def add(self, job: int, marker: dict[str, Any]) -> None:
+        """Add a job's marker."""
         self.core_s[job] = marker["figures"]["core_s"]
         self.redrawn += marker["figures"]["redrawn"]
         self.size_bytes += sum(file["size"] for file in marker["files"].values())
@@ -111,8 +103,9 @@ class FarmWatch:
         else:
             scenes, failed = {self._scene_id: self._look_at(self._store.scene(self._scene_id), queue)}, {}
         for scene_id, error in failed.items():
+            name = name_of(self._store, scene_id) or "unreadable"
             scenes[scene_id] = SceneProgress(
-                SceneStatus(scene_id, "unreadable", 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error))
+                SceneStatus(scene_id, name, 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error))
             )
         return FarmProgress(
             [scenes[scene_id] for scene_id in sorted(scenes)],
@@ -129,10 +122,15 @@ class FarmWatch:
         seen = self._seen.get(scene.scene_id)
         if seen is None or seen.core_s.keys() - committed:  # a repair has removed some
             seen = self._seen[scene.scene_id] = _Seen()
-        new = sorted(committed - seen.core_s.keys())
+        new, unread = sorted(committed - seen.core_s.keys()), []
         with ThreadPoolExecutor(READERS) as readers:
             for job, marker in zip(new, readers.map(partial(_read_marker, scene), new), strict=True):
-                seen.add(job, marker)
+                if not isinstance(marker, StoreError):
+                    seen.add(job, marker)
+                elif not isinstance(marker.__cause__, FileNotFoundError):  # else a repair has moved it since
+                    unread.append(marker)  # it is tried again at the next look
+        if any(not isinstance(error, CorruptError) for error in unread):
+            self._store.check()
         complete, planned = progress.committed_samples, progress.planned_samples
         told = sum(each.done for each in queue.activities.values() if _is_of(each, scene.scene_id))
         in_hand = min(told, planned - complete)  # a report may be seconds old
@@ -153,8 +151,8 @@ class FarmWatch:
                 seen.size_bytes,
                 core_s,
                 seen.redrawn,
-                seen.unreadable,
-                str(seen.error) if seen.error else None,
+                len(unread),
+                str(unread[0]) if unread else None,
                 sum(job >= jobs or job in withdrawn for job in committed),
             ),
             (progress.committed_passes, progress.planned_passes),

@@ -98,6 +98,28 @@ def test_further_passes_are_told_apart_from_samples_and_a_repair_takes_back_what
     assert (found.status.jobs_committed, found.status.core_s) == (1, samples.FIGURES.core_s)
 
 
+def test_a_marker_that_could_not_be_read_is_tried_again_at_the_next_look(
+    scene: SceneStore, store: Store, tmp_path: Path
+) -> None:
+    watch = FarmWatch(store, f"unix://{tmp_path}/none")
+    for job in (0, 1):
+        samples.commit(scene, job, samples.outputs(scene, job))
+    file = scene.folder / "committed/000000000000.json"
+    whole = file.read_bytes()
+    file.write_bytes(b"{")
+    (found,) = watch.look().scenes
+    assert (found.status.markers_unreadable, found.status.core_s) == (1, samples.FIGURES.core_s)
+    file.write_bytes(whole)
+    (found,) = watch.look().scenes
+    assert (found.faults, found.status.core_s) == ([], 2 * samples.FIGURES.core_s)
+
+
+def test_a_scene_without_readable_plans_is_told_by_its_name(scene: SceneStore, store: Store, tmp_path: Path) -> None:
+    (scene.folder / "plans/000000/zarr.json").write_text("{")
+    (found,) = FarmWatch(Store(store.root), f"unix://{tmp_path}/none").look().scenes
+    assert (found.status.name, bool(found.status.error)) == ("small", True)
+
+
 def test_a_damaged_scene_is_told_and_the_others_are_watched(scene: SceneStore, store: Store, tmp_path: Path) -> None:
     other = store.scene(store.plan(samples.small_spec(points=17), Request(modifications=1)).scene_id)
     (other.folder / "spec.json").write_text("{")

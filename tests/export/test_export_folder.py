@@ -93,6 +93,16 @@ def test_a_sample_whose_bytes_are_damaged_ends_it_and_is_exported_once_it_is_men
     assert exported(scene, tmp_path / "out", "npz").new == 6
 
 
+def test_samples_that_a_repair_takes_back_stay_in_an_export_and_are_described(tmp_path: Path) -> None:
+    scene = planned(tmp_path / "store")
+    samples.commit_all(scene)
+    exported(scene, tmp_path / "out", "exr")
+    cameras = (tmp_path / "out/transforms.json").read_bytes()
+    (scene.folder / "committed/000000000001.json").unlink()
+    assert exported(scene, tmp_path / "out", "exr").samples == 10
+    assert (tmp_path / "out/transforms.json").read_bytes() == cameras
+
+
 # ----------------------------------------------------------------------------------------------------- what is refused
 
 

@@ -25,6 +25,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import SceneReader, SceneStore
 from photonfarm.store.format import declarations, schema
+from photonfarm.store.model import plans
 
 BUFFERS = ("albedo", "normal", "depth")
 """The buffers that every view has."""
@@ -219,8 +220,11 @@ class Snapshot:
         return self._reader.read(row, guides=self._guides)
 
     def inputs(self, row: int) -> tuple[Modification, View]:
-        """The configuration and the view of a row."""
-        return self._reader.inputs(row)[:2]
+        """The configuration and the view of a row, complete or not: a repair may take back what was exported."""
+        sample = plans.sample_at(self._plans, row)
+        assert sample is not None  # noqa: S101 - it was exported
+        modification = plans.modification_at(self._plans, sample.modification_row)
+        return modification, plans.view_at(self._plans, sample.view_row)
 
     def values(self, sample: Sample, columns: Sequence[Column]) -> Values:
         """The values of a sample, each in its column's type."""

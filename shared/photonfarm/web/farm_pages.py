@@ -84,9 +84,10 @@ class SceneSamples:
     def picture(self, row: int, name: str) -> bytes:
         """A picture of a sample as a PNG: a, b, mean, noise, reference, or a buffer or guide by its name."""
         exposure = self._reader.spec.exposure
-        if name == "reference":
-            halves = [self._reader.read(each).radiance.astype(np.float64) for each in self._list_passes(row)]
-            return images.encode(pictures.display(np.mean(halves, axis=(0, 1)).astype(np.float32), exposure))
+        if name == "reference":  # one pass at a time in memory
+            rows = self._list_passes(row)
+            total = sum(self._reader.read(each).radiance.mean(axis=0, dtype=np.float64) for each in rows)
+            return images.encode(pictures.display(np.asarray(total / len(rows), np.float32), exposure))
         sample = self._open(row)
         if name == "noise":
             return images.encode(images.draw_noise(sample.radiance))

@@ -75,10 +75,10 @@ run_option = click.option(
 )
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON.")
 retry_option = click.option(
-    "--retry", is_flag=True, help="Also queue jobs that were set aside after repeated failures."
+    "--retry", is_flag=True, help="Also take up again jobs that were set aside after repeated failures."
 )
 no_queue_option = click.option(
-    "--no-queue", is_flag=True, help="Use no Redis: only write the plan, which workers find by themselves."
+    "--no-queue", is_flag=True, help="Use no Redis, even if one is named: workers find the plan by themselves."
 )
 
 

@@ -16,9 +16,9 @@ from photonfarm.cli.options import json_option, store_option
 from photonfarm.core.errors import IncompleteError, StoreError
 
 
-def _scene_option(required: bool = False) -> Callable[[FC], FC]:
+def _scene_option(which: str = "This scene alone", *, required: bool = False) -> Callable[[FC], FC]:
     """`--scene ID`, one scene of the store."""
-    text = "One scene alone: its id, how it begins, or its name."
+    text = f"{which}: its id, how it begins, or its name."
     return click.option("--scene", metavar="ID", required=required, help=text)
 
 
@@ -179,7 +179,7 @@ def merge(
 @click.command()
 @click.argument("other")
 @store_option
-@_scene_option()
+@_scene_option("This scene of OTHER alone")
 @json_option
 def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> None:
     """Copy the complete samples of the store OTHER, a folder or bucket, into this one, which may be new.
@@ -204,7 +204,7 @@ def join(other: str, store: str | Path, scene: str | None, as_json: bool) -> Non
 
 @click.command()
 @store_option
-@_scene_option(required=True)
+@_scene_option("The scene", required=True)
 @click.option(
     "--plan", type=click.IntRange(0), help="The plan's number.  [default: the last one with samples to forget]"
 )
@@ -227,7 +227,7 @@ def withdraw(store: str | Path, scene: str, plan: int | None, as_json: bool) -> 
 
 @click.command()
 @store_option
-@_scene_option(required=True)
+@_scene_option("The scene", required=True)
 @click.option("--yes", is_flag=True, help="Do not ask.")
 @json_option
 def forget(store: str | Path, scene: str, yes: bool, as_json: bool) -> None:

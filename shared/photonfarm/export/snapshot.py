@@ -167,7 +167,7 @@ def parse_ranges(text: str) -> list[range]:
 
 
 def parse_rows(text: str) -> list[int]:
-    """The rows that `ranges` wrote."""
+    """The rows that `format_ranges` wrote."""
     return [row for span in parse_ranges(text) for row in span]
 
 

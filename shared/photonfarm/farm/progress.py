@@ -122,8 +122,9 @@ class FarmProgress:
         if any(scene.rate for scene in self.scenes):
             return "none is known here; workers without Redis are at work (`work --share`, `slurm`)"
         return (
-            f"no farm is known here; `photonfarm up` goes on with the {missing} samples that are missing, given their "
-            "spec, and `photonfarm work --share 0/1` renders just these"
+            "no farm is known here; workers without Redis are seen by what they commit (`status --watch`). `photonfarm "
+            f"up` goes on with the {missing} samples that are missing, given their spec, and `photonfarm work --share "
+            "0/1` renders just these"
         )
 
     def check_read(self) -> None:

@@ -39,7 +39,8 @@ def parse(path: Path) -> Located:
 
     def refuse(*entity: str | bool | None) -> None:  # its name first, its file fifth; nothing for a whole DOCTYPE
         file = f"{entity[4]}" if entity and entity[4] else "…"
-        what = f"entity {entity[0]!r} of file {file!r}, which stands" if entity else "a DOCTYPE, whose entities stand"
+        of_file = f" of file {file!r}" if entity and entity[4] else ""
+        what = f"entity {entity[0]!r}{of_file}, which stands" if entity else "a DOCTYPE, whose entities stand"
         raise ParseError(
             f"line {parser.CurrentLineNumber}: has {what} for content that is not read; "
             f'write <include filename="{file}"/> where it is named, or the content itself'

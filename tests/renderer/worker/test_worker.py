@@ -22,7 +22,7 @@ from photonfarm.queue.job import TRIES, Share, job_name
 from photonfarm.queue.reconciliation import reconcile
 from photonfarm.queue.rq_adapter import queue_status
 from photonfarm.queue.workers import Activity, WorkerReport, read_workers
-from photonfarm.renderer.worker.settings import JOB_IN_HAND, WorkerSettings
+from photonfarm.renderer.worker.settings import JOB_ENDED, JOB_IN_HAND, WorkerSettings
 from photonfarm.renderer.worker.source import QueueSource, ShareSource
 from photonfarm.renderer.worker.worker import ChildOutput, check, ending, render_job, run_worker
 from photonfarm.scene.spec import Source
@@ -278,3 +278,8 @@ def test_a_job_is_overdue_whether_or_not_the_dump_of_its_stacks_crashed(code: in
     told = ending(code, output, 4.0)
     assert told.startswith("job some-3 took longer than --deadline 4 s and was ended")
     assert ("line 2 in job" in told, "line 1" in told) == (code == 1, False)
+
+
+def test_a_child_that_ends_over_another_timeout_says_so() -> None:
+    said = "Redis failed: Timeout (30 s) reading"
+    assert ending(5, ChildOutput.of(f"{JOB_IN_HAND}some-3\n{JOB_ENDED}done\n{said}\n"), 4.0) == said

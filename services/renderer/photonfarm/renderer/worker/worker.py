@@ -134,7 +134,7 @@ class ChildOutput:
     @classmethod
     def of(cls, text: str) -> ChildOutput:
         """Parse a child's output: its reports of jobs, other lines, and the dump of faulthandler, main thread last."""
-        written, timeout, dump = text.partition("Timeout (")
+        written, timeout, dump = f"\n{text}".partition("\nTimeout (")
         last, in_hand, endings = "", None, Counter[str]()
         for line in written.splitlines():
             if line.startswith(JOB_IN_HAND):

@@ -9,7 +9,7 @@ in every chain, since Blosc alone lets flipped bits through.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, cast
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError
-from photonfarm.core.records import LIT_POINTS
+from photonfarm.core.records import F32, LIT_POINTS
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.format.declarations import FIELDS, OUTPUTS, ArrayDeclaration
 
@@ -148,11 +148,27 @@ def read_input(storage: Storage, folder: str, array: Any) -> NDArray[Any]:
     for name in chunk_names(array):
         if name not in held:
             raise CorruptError(f"{storage.where}/{folder}/{name}: is missing")
-    known = [str(field["name"]) for field in FIELDS.get(folder.rpartition("/")[2], ())]
-    if known and (there := [field["name"] for field in array.attrs["fields"]]) != known:
-        raise ValueError(f"has the fields {there}, and this program reads {known}: install a newer photonfarm")
     try:
-        return np.asarray(array[...])
+        values = np.asarray(array[...])
+        fields = FIELDS.get(folder.rpartition("/")[2])
+        return values if fields is None else select_by_name(values, [f["name"] for f in array.attrs["fields"]], fields)
     except (ValueError, KeyError, RuntimeError) as error:
         reason = str(error).partition(" Stored: b")[0].rstrip(".")  # bytes of checksums tell nobody anything
         raise ValueError(f"{array.path}: {reason}") from error
+
+
+def select_by_name(values: F32, stored: Sequence[str], known: Sequence[Mapping[str, Any]]) -> F32:
+    """Vectors (…, F) whose columns have the names `stored`, with the `known` fields; those not stored are at rest.
+
+    Unused rows stay NaN. Raises ValueError for a field that is not known.
+    """
+    names = [field["name"] for field in known]
+    if list(stored) == names:
+        return values
+    if unknown := [name for name in stored if name not in names]:
+        raise ValueError(f"has the field {unknown[0]}, which this program does not know: install a newer photonfarm")
+    selected = np.empty((*values.shape[:-1], len(names)), np.float32)
+    for place, field in enumerate(known):
+        at_rest = np.where(np.isnan(values[..., 0]), np.float32(np.nan), np.float32(field["rest"]))
+        selected[..., place] = values[..., stored.index(field["name"])] if field["name"] in stored else at_rest
+    return selected

@@ -1,4 +1,6 @@
-"""The columns of stored vectors have names; a plan that has others is refused."""
+"""The columns of stored vectors have names, may be added, and are at rest where a plan lacks them."""
+
+from typing import Any
 
 import numpy as np
 import pytest
@@ -7,9 +9,12 @@ import zarr
 
 from photonfarm.core.errors import CorruptError
 from photonfarm.store import SceneStore
+from photonfarm.store.format import declarations, schema
 from photonfarm.store.format.metadata import seal
 
 scene = samples.scene
+TURN = {"name": "turn", "unit": "degrees", "rest": 0.0, "zero": "as modelled"}
+POWER = {"name": "power", "unit": "natural logarithm", "rest": -0.5, "zero": "as the scene states it"}
 
 
 def test_a_plan_describes_its_vectors(scene: SceneStore) -> None:
@@ -25,9 +30,28 @@ def test_a_plan_describes_its_vectors(scene: SceneStore) -> None:
         np.testing.assert_array_equal(density, np.where(unused, np.nan, 1).astype(np.float32))
 
 
+def test_a_plan_that_lacks_a_field_has_it_at_rest(scene: SceneStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    before = scene.plans()[0].rows.modification
+    fields = (*declarations.FIELDS["modification"], TURN, POWER)
+    monkeypatch.setitem(declarations.FIELDS, "modification", fields)
+    after = SceneStore(scene.storage, scene.scene_id).plans()[0].rows.modification
+    np.testing.assert_array_equal(after[..., :4], before)
+    unused = np.isnan(before[..., 0])
+    np.testing.assert_array_equal(after[~unused][:, 4:], np.broadcast_to(np.float32([0, -0.5]), (np.sum(~unused), 2)))
+    assert np.isnan(after[unused]).all()
+
+
+def test_columns_are_found_by_name_in_any_order() -> None:
+    known: Any = declarations.FIELDS["modification"]
+    values = np.arange(8, dtype=np.float32).reshape(1, 2, 4)
+    np.testing.assert_array_equal(
+        schema.select_by_name(values[..., [3, 0, 2, 1]], ["present", "x", "z", "y"], known), values
+    )
+
+
 def test_a_field_of_a_newer_program_is_refused(scene: SceneStore) -> None:
     plan = zarr.open_group(scene.folder / "plans/000000", mode="r+")
     plan["view"].update_attributes({"fields": [*plan["view"].attrs["fields"], {"name": "fov"}]})
     seal(scene.folder / "plans/000000")
-    with pytest.raises(CorruptError, match=r"fov.*install a newer photonfarm"):
+    with pytest.raises(CorruptError, match="has the field fov, which this program does not know"):
         SceneStore(scene.storage, scene.scene_id).plans()

@@ -117,8 +117,6 @@ def sheets(size: int) -> SceneDict:
 
 # ------------------------------------------------ Rows ------------------------------------------------
 
-_DISAGREE = "shading and geometric normals disagree; `ptracer` is off by up to 23 %"
-
 SCENES = (
     HardScene(17, "glass-plate", glass_plate, max_depth=8),
     HardScene(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
 
 from photonfarm.cli.options import store_option
+from photonfarm.core.waiting import tell_waiting
 from photonfarm.trainer.cli.evaluation_verbs import device_option
 from photonfarm.trainer.cli.train_verb import run_option
 
@@ -72,7 +74,8 @@ def infer(
     trained = TrainedRun.load(run)
     if along is not None:
         shows.check_path(trained)
-        frames = shows.render_frames(store, trained, modification, along)
+        with tell_waiting(partial(click.echo, err=True), f"rendering buffers of {trained.scene_id}"):
+            frames = shows.render_frames(store, trained, modification, along)
         result = shows.show_frames(store, trained, frames, out, fps=fps, device=device)
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)

@@ -228,7 +228,8 @@ def write_mp4(pictures: Sequence[Path], file: Path, fps: float) -> None:
     coded = ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2", "-c:v", "libx264", "-crf", "16", "-pix_fmt", "yuv420p"]
     ffmpeg = [import_module(FFMPEG).get_ffmpeg_exe(), "-loglevel", "error", "-y"]
     command = [*ffmpeg, *given, *coded, "-movflags", "+faststart", file.name]
-    done = subprocess.run(command, cwd=file.parent, capture_output=True, text=True, errors="replace", check=False)
+    with store_errors("start ffmpeg for the film", file):
+        done = subprocess.run(command, cwd=file.parent, capture_output=True, text=True, errors="replace", check=False)
     if done.returncode:
         *_, reason = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         raise StoreError(f"{file}: ffmpeg cannot write the film: {reason}")

@@ -30,7 +30,7 @@ from photonfarm.store.io.local import sync
 from photonfarm.trainer.runs.run_folder import GOOD, SETTINGS
 from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings
 
-FORMAT = 4
+FORMAT = 5
 ANEW = "remove it, and the run begins anew"
 TENSOR = "tensor"
 

@@ -124,7 +124,7 @@ class FarmProgress:
         return (
             "no farm is known here; workers without Redis are seen by what they commit (`status --watch`). `photonfarm "
             f"up` goes on with the {missing} samples that are missing, given their spec, and `photonfarm work --share "
-            "0/1` renders just these"
+            "0/1 --until-complete` renders just these"
         )
 
     def check_read(self) -> None:

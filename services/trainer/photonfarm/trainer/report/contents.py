@@ -14,7 +14,7 @@ from typing import Any, Unpack
 
 from photonfarm.core.archives import FrameCosts
 from photonfarm.core.errors import BackendError
-from photonfarm.core.records import F32, ViewBuffers
+from photonfarm.core.records import F32, Guides, ViewBuffers
 from photonfarm.core.statistics import Estimate
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureOptions, PredictorRow, compare
@@ -65,6 +65,9 @@ MOVABLE_LIGHTS = {
     "light_transport_photons": Published(0.0468, 0.0014, 0.887, 25.1, 0.172),
 }
 
+Inputs = tuple[ViewBuffers, Guides | None]
+"""What a network is given of a view."""
+
 PublishedTable = dict[str, Published]
 """Rows by architecture, in the order of the published table."""
 
@@ -106,7 +109,7 @@ class ReportContents:
     machine: Machine  # on which times were taken
     worst: tuple[WorstCase, ...]
     published: str | None  # the name of the paper's table beside ours
-    buffers: Mapping[int, ViewBuffers]  # of the shown rows
+    inputs: Mapping[int, Inputs]  # of the shown rows, as far as the first run is given them
 
     @property
     def measure(self) -> ReportEntry:
@@ -159,11 +162,13 @@ def gather_contents(
         machine = Machine.here()
         tell("the worst cases are looked for", 0, 0)
         surfaces = {} if costs is None else dict(zip(costs.rows.tolist(), costs.surface, strict=True))
-        buffers = _read_buffers(store, first, sorted(references.keys() & images.keys()))
+        inputs = _read_inputs(store, first, sorted(references.keys() & images.keys()), guides=False)
         worst = find_worst_cases(
             [
-                HeldOutView(row, images[row], references[row].half_a, references[row].half_b, of, surfaces.get(row))
-                for row, of in buffers.items()
+                HeldOutView(
+                    row, images[row], references[row].half_a, references[row].half_b, buffers, surfaces.get(row)
+                )
+                for row, (buffers, _) in inputs.items()
             ]
         )
         return [case.row for case in worst]
@@ -191,11 +196,12 @@ def gather_contents(
         machine=machine,
         worst=tuple(worst),
         published=title if any(entry.published for entry in entries) else None,
-        buffers=_read_buffers(store, first, [target.row for target in evaluation.shown]),
+        inputs=_read_inputs(store, first, [target.row for target in evaluation.shown], guides=first.needs.guides),
     )
 
 
-def _read_buffers(store: str | Path, run: TrainedRun, rows: list[int]) -> dict[int, ViewBuffers]:
+def _read_inputs(store: str | Path, run: TrainedRun, rows: list[int], *, guides: bool) -> dict[int, Inputs]:
     source = run.source(store)
     source.refresh()
-    return {row: source.read(row).buffers for row in rows}
+    samples = {row: source.read(row, guides=guides) for row in rows}
+    return {row: (sample.buffers, sample.guides) for row, sample in samples.items()}

@@ -80,7 +80,8 @@ def _judge(name: str, ratio: float, shown: float, wins: float, unit: str) -> tup
     if wins < 0.5:
         mean = f"only in the mean over all has it {share} that error"
         return "mixed", f"{name} is worse than the mean colour in most unseen {unit}s; {mean}."
-    return "better", f"{name} predicts unseen {unit}s with {share} the mean colour’s error."
+    where = " where no light is above white" if shown > ratio else ""
+    return "better", f"{name} predicts unseen {unit}s with {share} the mean colour’s error{where}."
 
 
 def _format_share(ratio: float) -> str:
@@ -125,6 +126,7 @@ def format_page(
         views=views,
         largest=LARGEST,
         legend=write_legend(contents),
+        named=contents.entries[0].name,
         light=encode_light(views),
         viewer=VIEWER.read_text(),
         plots=plots,

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from photonfarm.core.pictures import Picture, display, display_values, draw_albedo, draw_depth, draw_normal
-from photonfarm.core.records import F32, ViewBuffers
+from photonfarm.core.records import F32
 from photonfarm.trainer.compare.evaluation_samples import Target
 from photonfarm.trainer.report.contents import ReportContents
 from photonfarm.trainer.report.worst_cases import ALL, WorstCase, name_kinds
@@ -19,6 +19,22 @@ from photonfarm.trainer.report.worst_cases import ALL, WorstCase, name_kinds
 LARGEST = 0.25  # difference in the metric space that is drawn brightest
 
 PREDICTION, NOISY, DIFFERENCE = "prediction", "noisy half", "difference"
+
+
+OF_GUIDES = {
+    "direct": "direct light",
+    "gloss": "direct light in gloss",
+    "emission": "emitted light",
+    "specular": "specular albedo",
+    "roughness": "roughness",
+    "throughput": "mirrors and glass",
+    "beyond_albedo": "albedo beyond them",
+}
+"""The guides that are shown where they vary over the view."""
+
+RADIANCE = ("direct", "gloss", "emission")
+
+VARIED = 8.0  # standard deviation of a picture's bytes, above which there is something to see in it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +85,7 @@ def _make_view(contents: ReportContents, target: Target) -> ShownView:
     ]
     for name, image in others:
         images += _compare_layers(name, image, target.image, of=f" of {name}")[:2]
-    inputs = tuple(_list_inputs(contents.buffers[target.row]))
+    inputs = tuple(_list_inputs(contents, target.row))
     return ShownView(target.row, write_caption(contents.worst, target.row), against, tuple(images), inputs, mse)
 
 
@@ -97,11 +113,20 @@ def make_light_layer(name: str, caption: str, exposed: F32) -> Layer:
     return Layer(name, caption, display(exposed, 1.0), exposed)
 
 
-def _list_inputs(buffers: ViewBuffers) -> Iterator[Layer]:
-    """The buffers that every network is given; guides, which some are given too, are in the store."""
+def _list_inputs(contents: ReportContents, row: int) -> Iterator[Layer]:
+    """The buffers that every network is given, and the guides that the first one is given too."""
+    buffers, guides = contents.inputs[row]
     yield Layer("albedo", "albedo", draw_albedo(buffers.albedo))
     yield Layer("normal", "normal", draw_normal(buffers.normal))
     yield Layer("depth", "depth", draw_depth(buffers.depth))
+    for field, name in OF_GUIDES.items() if guides else ():
+        values: F32 = getattr(guides, field)
+        if field in RADIANCE:
+            layer = make_light_layer(name, name, np.float32(contents.card.spec.exposure) * values)
+        else:
+            layer = Layer(name, name, draw_albedo(values if values.ndim == 3 else values[..., None].repeat(3, axis=2)))
+        if layer.picture.std() > VARIED:
+            yield layer
 
 
 def write_legend(contents: ReportContents) -> str:

@@ -256,18 +256,20 @@ def table(plan: TransportPlan, rows: Sequence[CandidateAtCost]) -> list[str]:
     for row in rows:
         settings = row.candidate
         remark = "chosen" if settings == plan.candidate else "" if row.fits else "too costly"
-        cells.append((
-            str(settings.connections),
-            f"{settings.light_ratio:g}",
-            str(settings.light_samples),
-            "yes" if settings.guided_light else "no",
-            str(row.errors.images),
-            str(row.samples),
-            f"{row.error:.3g}",
-            f"{1e3 * row.time_s:.1f}",
-            plus_minus(row.relative_cost, row.spread),
-            remark,
-        ))  # fmt: skip
+        cells.append(
+            (
+                str(settings.connections),
+                f"{settings.light_ratio:g}",
+                str(settings.light_samples),
+                "yes" if settings.guided_light else "no",
+                str(row.errors.images),
+                str(row.samples),
+                f"{row.error:.3g}",
+                f"{1e3 * row.time_s:.1f}",
+                plus_minus(row.relative_cost, row.spread),
+                remark,
+            )
+        )
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  ".join(f"{cell:>{n}}" for cell, n in zip(line, widths, strict=True)).rstrip() for line in cells]
 

@@ -105,17 +105,14 @@ def print_submission(result: Submission, as_json: bool) -> None:
     if as_json:
         print_json(asdict(result))
         return
+    planned = f"scene {result.scene_id}: {format_count(result.planned, 'sample')}"
     if result.dry_run:
-        click.echo(
-            f"scene {result.scene_id}: {result.planned} samples would be planned, {result.planned_before} are already"
-        )
+        click.echo(f"{planned} would be planned, {result.planned_before} are already")
         if isinstance(result, DryRun) and result.planned:
             _print_cost(result)
         return
     queued = "not queued" if result.queued is None else f"{format_count(result.queued, 'job')} queued"
-    click.echo(
-        f"scene {result.scene_id}: {result.planned} samples planned, {result.planned_before} planned before, {queued}"
-    )
+    click.echo(f"{planned} planned, {result.planned_before} planned before, {queued}")
     if result.note:
         click.echo(result.note, err=True)
     if result.replaced:

@@ -95,7 +95,9 @@ def print_check(report: StoreReport, as_json: bool) -> None:
 
 
 def _print_scene(scene: SceneReport) -> None:
-    read = f"{scene.jobs} jobs, {scene.samples} samples, {format_bytes(scene.size_bytes)}"
+    read = (
+        f"{format_count(scene.jobs, 'job')}, {format_count(scene.samples, 'sample')}, {format_bytes(scene.size_bytes)}"
+    )
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
         click.echo(f"  A against B: {scene.halves.in_words}")
@@ -185,7 +187,8 @@ def print_joined(scenes: Sequence[JoinedScene], as_json: bool) -> None:
     for scene in scenes:
         known = scene.there - scene.planned
         jobs = format_count(scene.jobs, "job")
-        said = f"{scene.there} samples there, {scene.planned} planned here now, {known} before; {jobs} copied"
+        there = format_count(scene.there, "sample")
+        said = f"{there} there, {scene.planned} planned here now, {known} before; {jobs} copied"
         left = f"; {scene.left} are left to workers, as their jobs here are not whole there" if scene.left else ""
         click.echo(f"{scene.name} {scene.scene_id}: {said}{left}")
 

@@ -18,6 +18,7 @@ from photonfarm.cli.options import (
     run_option,
     store_option,
 )
+from photonfarm.core.formatting import format_count
 
 if TYPE_CHECKING:
     from photonfarm.plan.request import Request
@@ -117,10 +118,8 @@ def slurm(
         for warning in filter(None, (*warnings(spec), hold_out_warning(spec.spec, store, request))):
             click.echo(f"warning: {warning}", err=True)
         submission = submit(spec, store, None, request, retry=retry, shard_rows=shard_rows, workers=asked.workers)
-        click.echo(
-            f"scene {submission.scene_id}: {submission.planned} samples planned, {submission.planned_before} before",
-            err=True,
-        )
+        samples = format_count(submission.planned, "sample")
+        click.echo(f"scene {submission.scene_id}: {samples} planned, {submission.planned_before} before", err=True)
         planned.append(submission)
     if queue_url is not None:
         from photonfarm.queue.connection import add_password
@@ -132,6 +131,6 @@ def slurm(
 
         show.print_json({"plans": list(map(asdict, planned)), **asdict(started)})
         return
-    click.echo(f"job {started.workers}: {asked.workers} workers; logs in {started.logs}")
+    click.echo(f"job {started.workers}: {format_count(asked.workers, 'worker')}; logs in {started.logs}")
     if started.trainer is not None:
         click.echo(f"job {started.trainer}: the trainer, which begins once the first worker has")

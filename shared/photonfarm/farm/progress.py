@@ -114,7 +114,7 @@ class FarmProgress:
         if status is not None:
             failed = sum(len(cause.jobs) for cause in self.queue.causes)
             jobs = format_count(status.queued, "job")
-            return f"{jobs} queued, {status.running} running, {status.workers} workers, {failed} failed"
+            return f"{jobs} queued, {status.running} running, {format_count(status.workers, 'worker')}, {failed} failed"
         if self.named_redis:
             return self.queue.reason
         if not missing:

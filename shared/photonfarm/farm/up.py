@@ -13,6 +13,7 @@ from itertools import cycle
 from pathlib import Path
 
 from photonfarm.core.errors import IncompleteError, SpecError, store_errors
+from photonfarm.core.formatting import format_count
 from photonfarm.core.processes import command, free_port, tie
 from photonfarm.core.waiting import Log
 from photonfarm.farm.devices import CPU
@@ -97,7 +98,7 @@ def run_farm(
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(named, store, redis.url, request, retry=True, shard_rows=shard_rows, workers=workers)
-        say(f"{planned.planned} samples planned, {planned.planned_before} planned before")
+        say(f"{format_count(planned.planned, 'sample')} planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)
             there = f"passes that the samples have, or that were planned before: {added.planned_before}"

@@ -140,6 +140,13 @@ def test_what_is_no_network_is_refused(mine: str, store: Path, name: str, lacks:
         )
 
 
+@pytest.mark.parametrize("option", ["--architecture", "--loss"])
+def test_a_module_that_is_not_there_is_said_before_samples_are_waited_for(tmp_path: Path, option: str) -> None:
+    arguments = ("train", "cornell", "--store", tmp_path / "empty", "--run", tmp_path / "run", option, "nowhere:Net")
+    with pytest.raises(SpecError, match="finds no module 'nowhere'"):
+        CliRunner().invoke(umbrella, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
 @pytest.mark.parametrize(
     ("body", "said"),
     [

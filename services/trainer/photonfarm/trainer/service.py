@@ -21,10 +21,10 @@ from photonfarm.store import Store
 from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.model.scene_store import list_scenes
 from photonfarm.store.read.find import describe_scenes
+from photonfarm.trainer.runs import user_code
 from photonfarm.trainer.runs.progress import RunProgress, follow_progress
 from photonfarm.trainer.runs.run_folder import INITIAL, lock_run, note_scene_folder, write_views
 from photonfarm.trainer.runs.settings import TrainSettings, make_settings
-from photonfarm.trainer.runs.user_code import name_in_errors
 
 if TYPE_CHECKING:
     from photonfarm.core.records import F32
@@ -69,6 +69,9 @@ def run(
     from photonfarm.trainer.training.other_ranks import assist
 
     settings = make_settings(preset_name, changes)
+    for key, name in (("architecture", settings.network.architecture), ("loss", settings.loss)):
+        if user_code.is_own(name):
+            user_code.load(key, name)  # so that a mistake is said before samples are waited for
     with join_ranks(settings.device, settings.batch) as ranks, stop_on_signals() as stop:
         device = ranks.device(settings.device)
         if ranks.rank:
@@ -189,7 +192,7 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
         f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
         f"width {network.width}" + (f", {points} points" if find_kind(network.architecture).needs.points else "")
     )
-    with name_in_errors(architecture=network.architecture):
+    with user_code.name_in_errors(architecture=network.architecture):
         return f"{head}\n{format_summary(summarise(scene, network))}"
 
 
@@ -217,7 +220,7 @@ def rehearse(
         except ValidationError as error:
             raise SpecError(f"the film of the dry run: {'; '.join(sentences(error))}") from error
         scene = scene.model_copy(update={"film": square})
-    with name_in_errors(architecture=settings.network.architecture, loss=settings.loss):
+    with user_code.name_in_errors(architecture=settings.network.architecture, loss=settings.loss):
         return rehearse(scene, settings)
 
 

@@ -183,7 +183,7 @@ def test_an_error_of_rank_0_ends_the_others_and_that_of_all_ends_each(
     def make() -> Any:
         source = make_source(24)
         if fault == "step" and os.environ["RANK"] == "0":
-            Ranks.average = fail  # in a process of its own
+            Ranks.average_gradients = fail  # in a process of its own
         honest = source.read_samples
 
         def read_samples(rows: Any, out: Any) -> Any:

@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
-from photonfarm.renderer.bdpt.recording import resample
+from photonfarm.renderer.bdpt.kept_vertices import resample
 
 IMAGES, PATHS = 3, 1000
 

@@ -94,7 +94,7 @@ class PlanRepair:
                 samples = self._samples_of_join(folder, about.request, before, read.get("sample_key"))
                 rows = expand_samples(samples, **numbers).rows
             else:
-                rows = plans.expand_again(self._scene.spec, about.request, before, **numbers).rows
+                rows = plans.expand_request(self._scene.spec, about.request, before, **numbers).rows
         except (SpecError, ValueError) as error:
             raise self._hopeless(folder, f"its request cannot be expanded: {error}") from error
         if rows is None or len(rows.sample_key) != about.jobs * about.shard_rows:

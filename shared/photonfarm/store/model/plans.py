@@ -151,7 +151,7 @@ def content(plans: list[StoredPlan]) -> PlannedContent:
     return PlannedContent((plan.first_row, plan.rows) for plan in plans)
 
 
-def expand_again(
+def expand_request(
     spec: SceneSpec, request: AnyRequest, before: list[StoredPlan], *, first_job: int, shard_rows: int
 ) -> Expansion:
     """The rows of a request that the earlier plans do not have: a function of these, the same each time.

@@ -122,7 +122,7 @@ class SceneStore:
                 )
             numbers = {"first_job": first_job, "shard_rows": rows_per_job}
             if samples is None:
-                expansion = plans.expand_again(self.spec, request, stored_plans, **numbers)
+                expansion = plans.expand_request(self.spec, request, stored_plans, **numbers)
             else:
                 expansion = expand_samples(samples(plans.content(stored_plans)), **numbers)
             result = PlanResult(self.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)

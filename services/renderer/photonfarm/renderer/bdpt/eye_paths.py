@@ -21,7 +21,7 @@ from photonfarm.renderer.bdpt.lights.emission import DirectSample, Lights, hit_d
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
 from photonfarm.renderer.bdpt.recording import loop_once
 
-_MAX_THROUGHPUT_KEPT = 0.95
+_MAX_SURVIVAL = 0.95
 _NEAR_VERTICES = 2
 
 
@@ -196,7 +196,7 @@ def _more_direct_light(
 ) -> mi.Spectrum:
     """Radiance at the first vertex from all samples of the lights but one; a light can only be hit instead (s=0)."""
     n = options.light_samples
-    rng = s.rng.apart()  # so that eye paths are the same for every n
+    rng = s.rng.skip_ahead()  # so that eye paths are the same for every n
     total = mi.Spectrum(0)
     for _ in range(n - 1):
         light = sample_direct(lights, si, rng, active)
@@ -239,9 +239,7 @@ def _roulette(s: EyeState, first: mi.Bool, options: PathOptions) -> None:
     """
     left = dr.max(s.throughput) * dr.square(s.eta)
     s.whole = dr.select(first, left, s.whole)
-    kept = dr.select(
-        s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(2 * left / s.whole, 1)
-    )
+    kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_SURVIVAL), dr.minimum(2 * left / s.whole, 1))
     s.active &= s.rng.next_independent() < kept
     s.throughput *= dr.rcp(kept)
 

@@ -30,7 +30,7 @@ from photonfarm.renderer.bdpt.lights.emission import AREA, Emission, Lights, sam
 from photonfarm.renderer.bdpt.randomness import Sampler
 from photonfarm.renderer.bdpt.recording import loop_once
 
-_MAX_THROUGHPUT_KEPT = 0.95
+_MAX_SURVIVAL = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,6 +191,7 @@ def vertex_bounce(
         weight = dr.max(s.throughput) * useful
         total[reachable] += weight
         keep = reachable & (s.rng.next_independent() * total < weight)
+        # The draw has the probability weight / total; `KeptVertices.of` multiplies by the total
         vertex = KeptVertex(si, s.throughput / (weight * cos_in), s.count * dvcm, dvc, count, depth).record()
         kept = tuple(dr.select(keep, new, old) for new, old in zip(vertex, s.kept, strict=True))
 
@@ -198,7 +199,7 @@ def vertex_bounce(
 
     goes_on = active & (depth + 1 < options.max_depth)
     state = replace(s, active=goes_on, dvcm=dvcm, dvc=dvc, depth=depth + 1, weight=total, kept=kept)
-    scatter(state, si, bsdf, cos_in)
+    scatter(state, si, bsdf, cos_in)  # with the technique count of the vertex before
     state.count = count
     roulette(state, start, options)
     state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
@@ -247,9 +248,9 @@ def roulette(s: LightState, start: Emission, options: PathOptions) -> None:
     of their throughput may end, since they cost as much as others and carry less.
     """
     left = dr.max(s.throughput) / dr.max(start.throughput)
-    kept = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_THROUGHPUT_KEPT), dr.minimum(3 * left, 1))
-    s.active &= (s.rng.next_independent() < kept) & (kept > 0)
-    s.throughput *= dr.rcp(kept)
+    survival = dr.select(s.depth > options.rr_depth, dr.minimum(left, _MAX_SURVIVAL), dr.minimum(3 * left, 1))
+    s.active &= (s.rng.next_independent() < survival) & (survival > 0)
+    s.throughput *= dr.rcp(survival)
 
 
 def exchange_directions(si: mi.SurfaceInteraction3f, wo: mi.Vector3f) -> tuple[mi.SurfaceInteraction3f, mi.Vector3f]:

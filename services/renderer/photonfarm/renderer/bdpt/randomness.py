@@ -81,7 +81,7 @@ class Sampler:
         first = _mix(seed)
         return mi.Point2f(_unit(_scramble(index, first)), _unit(_scramble(_sobol_1(index), _mix(first))))
 
-    def apart(self) -> Sampler:
+    def skip_ahead(self) -> Sampler:
         """The same point, 2¹⁵ pairs of dimensions further on, which no path of fewer than 5000 vertices reaches."""
         return Sampler(self.sequence, self.index, self.dimension + (1 << 15))
 

@@ -2,8 +2,8 @@
 
 Mitsuba has Embree build for scenes that never change: one hierarchy over all triangles, with spatial splits, 1 µs a
 triangle, at every edit. Embree's low quality, meant for dynamic scenes, makes one hierarchy per mesh and a small one
-above them: rebuilds are 4 to 6 times faster, whole edits of the room `room` twice (14 instead of 29 ms), and images
-take 0.9 to 1.02 times as long. Rays meet the same surfaces, except where two surfaces touch; and as guides are learned
+above them: rebuilds are 4 to 6 times faster, whole edits of the room `room` take 14 instead of 29 ms, and images take
+0.9 to 1.02 times as long. Rays meet the same surfaces, except where two surfaces touch; and as guides are learned
 from such rays, whole images differ by their noise. So the quality cannot be configured: every worker sets it, as
 radiance must follow from keys alone.
 

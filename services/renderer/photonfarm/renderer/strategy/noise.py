@@ -12,7 +12,7 @@ candidates share are left out (`pair_errors`).
 pilot. Its images then lack that light, and show no noise from it either. But all candidates have the same mean image,
 so another candidate's images show what is missing. A mean m over N independent samples has E[N·(m − μ)²] = var y. So a
 candidate whose mean m of a block is significantly below the mean m_d of another is charged N·(m_d − m)², less what
-chance explains (`missed`).
+chance explains (`charge_for_missed`).
 """
 
 from __future__ import annotations
@@ -134,34 +134,35 @@ class BlockSums:
         self._pairs: dict[int, list[tuple[Blocks, Blocks, Blocks]]] = {blocks: [] for blocks in BLOCKS}
         """By size of blocks, for each pair: mean of y, variance of y in a block's pixels, variance of its mean."""
         self._pixels = 0
-        self._found: dict[int, _Evidence] = {}
+        self._evidence: dict[int, _Evidence] = {}
 
     def add(self, a: F32, b: F32, weights: F32, view: int = 0) -> None:
         """Add two independent images of a view, (H, W, 3)."""
-        grey = (np.stack([a, b]).astype(np.float64) * weights).mean(axis=-1, keepdims=True)
-        self._found.clear()
+        y = (np.stack([a, b]).astype(np.float64) * weights).mean(axis=-1, keepdims=True)
+        self._evidence.clear()
         self._views.append(view)
-        self._pixels = grey[0].size
+        self._pixels = y[0].size
         for blocks, pairs in self._pairs.items():
-            means, of_pixels = block_means(grey, blocks), block_means((grey[:1] - grey[1:]) ** 2 / 2, blocks)[0]
+            means, of_pixels = block_means(y, blocks), block_means((y[:1] - y[1:]) ** 2 / 2, blocks)[0]
             pairs.append((means.mean(axis=0), of_pixels, (means[0] - means[1]) ** 2 / 2))
 
     def evidence(self, blocks: int) -> _Evidence:
         """The means of blocks of n pixels, their squared standard errors s², samples N and degrees of freedom.
 
-            s² = max(ρ · mean variance of a pixel / n, variance between the images) / images,    N = n · images / ρ
+            s² = max(ρ · mean variance of a pixel / n, variance between the images) / I,    N = n · I / ρ
 
-        Pixels depend on each other where eye paths are joined to the same light paths. R of a pair of images is the
-        mean over its M blocks of (variance of the block mean between the two images) / (mean variance of a pixel / n);
-        it is 1 for independent pixels. One block has few pairs of images, but a candidate's settings are the same
-        everywhere. So ρ is the mean of R over all pairs, and at least 1. Up to 40 was measured.
+        I is the number of images, two for each pair. Pixels depend on each other where eye paths are joined to the same
+        light paths. R of a pair (`ratios`) is the mean over its M blocks of (variance of the block mean between the two
+        images) / (mean variance of a pixel / n); it is 1 for independent pixels. One block has few pairs of images, but
+        a candidate's settings are the same everywhere. So ρ is the mean of R over all pairs, and at least 1. Up to 40
+        was measured.
 
         Pairs are independent, but the blocks of one image may not be. By Satterthwaite's rule a pair has
         2·mean(R)²/var(R) degrees of freedom, between 1 and M; s² has that times the number of pairs. Where the variance
         between the images is the larger one, as near a light, a block has one for each pair of its own view.
         """
-        if blocks in self._found:
-            return self._found[blocks]
+        if blocks in self._evidence:
+            return self._evidence[blocks]
         mean, of_pixels, of_block = (np.stack(column) for column in zip(*self._pairs[blocks], strict=True))
         n = self._pixels / mean[0].size
         noisy = of_pixels > 0
@@ -174,18 +175,18 @@ class BlockSums:
         views = np.array(self._views)
         of_view = [views == view for view in dict.fromkeys(self._views)]
         pairs = np.array([[[float(chosen.sum())]] for chosen in of_view])
-        dependence = max(1.0, float(ratios.mean()))
-        independent = dependence * np.stack([of_pixels[chosen].mean(axis=0) for chosen in of_view]) / n
+        rho = max(1.0, float(ratios.mean()))
+        independent = rho * np.stack([of_pixels[chosen].mean(axis=0) for chosen in of_view]) / n
         between = np.stack([of_block[chosen].mean(axis=0) for chosen in of_view])
         scatter = ratios.var(ddof=1) if len(ratios) > 1 else np.inf
         pooled = len(ratios) * np.clip(2 * ratios.mean() ** 2 / max(scatter, 1e-30), 1, mean[0].size)
-        self._found[blocks] = _Evidence(
+        self._evidence[blocks] = _Evidence(
             mean=np.stack([mean[chosen].mean(axis=0) for chosen in of_view]),
             variance=np.maximum(independent, between) / (2 * pairs),
-            samples=2 * pairs * n / dependence,
+            samples=2 * pairs * n / rho,
             freedom=np.where(between > independent, pairs, pooled),
         )
-        return self._found[blocks]
+        return self._evidence[blocks]
 
 
 def charge_for_missed(sums: BlockSums, others: Sequence[BlockSums]) -> float:

@@ -5,9 +5,9 @@ of each render without reading anything back, so a light that is switched off in
 no kernel changes.
 
 Mitsuba's ``sample_ray`` has no density and is wrong for rotated environment maps and stale bounding spheres, so
-emission is sampled here by type. e is the density with
-which a light path starts at a point and in a direction. In each case e = ê·c, with a number ê per light that is known
-before sampling (column ``emission``), and cos₀ the cosine at the point:
+emission is sampled here by type. e is the density with which a light path starts at a point y₀ and in a direction. In
+each case e = ê·c, with a number ê per light that is known before sampling (column ``emission``), and cos₀ the cosine
+at y₀:
 
     area                 uniform on the surface, cosine-weighted direction    ê = P/(A·π)             c = cos₀
     constant, envmap     direction by the light's own density p_ω, disk πR²   ê = P/(πR²)             c = p_ω
@@ -15,7 +15,8 @@ before sampling (column ``emission``), and cos₀ the cosine at the point:
     point, projector     uniform on the sphere                                ê = P/(4π)              c = 1
     spot                 uniform in its cone                                  ê = P/(2π(1 − cos θ))   c = 1
 
-P is the selection probability, A the area, R the radius of a sphere around the scene's *present* bounding box.
+P is the probability with which light paths choose the light (`emit_probability`), A the area, R the radius of a sphere
+around the scene's *present* bounding box.
 """
 
 from __future__ import annotations
@@ -229,15 +230,6 @@ class DirectSample:
     valid: mi.Bool
 
 
-def _choose_start(lights: Lights, rng: Sampler) -> LightIndex:
-    """The lights that begin light paths, by inversion of the running sum: the smallest i with cdf(i) > u·cdf(N−1)."""
-    if lights.count == 1:
-        return dr.zeros(mi.UInt32, dr.width(rng.index))
-    cdf, last = lights.emit_cdf, lights.count - 1
-    target = rng.next_1d() * dr.gather(mi.Float, cdf, mi.UInt32(last))
-    return dr.binary_search(0, last, lambda i: dr.gather(mi.Float, cdf, i) <= target)
-
-
 def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumbers, active: mi.Bool) -> DirectSample:
     """Choose a light and a point of it, as seen from ``si``."""
     if lights.selection is None:
@@ -285,8 +277,8 @@ def hit_densities(
     reference.p = origin
     ds = mi.DirectionSample3f(scene, si, reference)
     p_direction = emitter.pdf_direction(reference, ds, active)
-    factor = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)
-    emission = lights.emission_factor(emitter) * factor * lights.gain(emitter, ds, si.sh_frame.n, vertex, active)
+    c = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)  # of the table above
+    emission = lights.emission_factor(emitter) * c * lights.gain(emitter, ds, si.sh_frame.n, vertex, active)
     return lights.nee_probability(emitter, vertex) * p_direction, emission
 
 
@@ -308,6 +300,15 @@ class Emission:
     delta: mi.Bool  # POSITION or DIRECTION
     valid: mi.Bool
     cell: mi.UInt32  # of the guide's table; 0 without a guide
+
+
+def _choose_start(lights: Lights, rng: Sampler) -> LightIndex:
+    """The lights that begin light paths, by inversion of the running sum: the smallest i with cdf(i) > u·cdf(N−1)."""
+    if lights.count == 1:
+        return dr.zeros(mi.UInt32, dr.width(rng.index))
+    cdf, last = lights.emit_cdf, lights.count - 1
+    target = rng.next_1d() * dr.gather(mi.Float, cdf, mi.UInt32(last))
+    return dr.binary_search(0, last, lambda i: dr.gather(mi.Float, cdf, i) <= target)
 
 
 def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UInt32) -> Emission:

@@ -40,7 +40,7 @@ def _load(spec: str, *, measured_again: bool = False) -> tuple[SceneSpec, Path]:
 @click.option(
     "--seconds",
     type=click.FloatRange(0, min_open=True),
-    help="Processor time for all of it; less of it, fewer views.  [default: no limit]",
+    help="Processor time for all of it; with less time, fewer views.  [default: no limit]",
 )
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @device_option
@@ -138,7 +138,9 @@ def scene_free_space(spec: str, write: bool, as_json: bool) -> None:
     show_default=True,
     help="How noise counts: as the trainer's relative loss weighs it, or relative to the brightness of each pixel.",
 )
-@click.option("--write", is_flag=True, help="Put what gains into SPEC's file; samples planned before keep theirs.")
+@click.option(
+    "--write", is_flag=True, help="Put the settings that gain into SPEC's file; samples planned before keep theirs."
+)
 @click.option("--again", is_flag=True, help="Measure anew, also if this scene has been measured here.")
 @device_option
 @json_option

@@ -89,7 +89,7 @@ def buffers(
     default=(1,),
     show_default=True,
     metavar="K",
-    help="Time a half-estimate of one of K pixels; may be repeated.",
+    help="Time a half-estimate with one pixel in K kept; may be repeated.",
 )
 @click.option(
     "--timed",

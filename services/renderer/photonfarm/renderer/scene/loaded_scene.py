@@ -26,7 +26,7 @@ GUIDE_VIEWS = 4
 """The views that a guide of light paths is learned from."""
 
 GUIDED_SAMPLES = 16
-"""The samples that such a guide is learned for, where there is a single configuration; else it is one."""
+"""The samples that such a guide is learned for, where there is a single configuration; else 1."""
 
 
 class LoadedScene:

@@ -34,8 +34,8 @@ from photonfarm.scene.spec import PhotonSpec, SceneSpec
 SIMILAR = 4.0
 """The factor between times of half-estimates up to which a measurement still applies.
 
-An image has costs that do not grow with its samples, so the choice depends on half_spp. A written plan keeps the time
-of an image, up to that of one sample.
+An image has costs that do not grow with its samples, so the choice depends on half_spp. --write keeps the time of
+an image, up to that of one sample, so that the measurement still applies.
 """
 
 SpecTables = dict[str, dict[str, Any]]

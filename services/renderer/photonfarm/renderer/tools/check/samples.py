@@ -119,14 +119,14 @@ def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
     return shares[0], shares[1]
 
 
-def _rays(small: SceneSpec, view: View) -> tuple[F32, F32, F32]:
+def _rays(coarse: SceneSpec, view: View) -> tuple[F32, F32, F32]:
     """Origins (R, 3) at the near plane, directions (R, 3) and lengths (R,) of the rays of a view's image."""
-    camera = Camera.of(view, small)
+    camera = Camera.of(view, coarse)
     direction = camera.rays().reshape(-1, 3)
     along = direction @ camera.forward
-    near = small.view.near / along
+    near = coarse.view.near / along
     origin = camera.origin + near[:, None] * direction
-    return origin.astype(np.float32), direction, (small.view.far / along - near).astype(np.float32)
+    return origin.astype(np.float32), direction, (coarse.view.far / along - near).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,13 +148,13 @@ class Samples:
     cameras: Cameras
 
 
-def small(spec: SceneSpec) -> SceneSpec:
+def shrink_spec(spec: SceneSpec) -> SceneSpec:
     """The spec as it is loaded for a check."""
     return exposure.shrunk(spec, SIDE).model_copy(update={"points": min(spec.points, POINTS)})
 
 
 def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, work: WorkLog) -> Samples:
-    """Render the configurations of a spec in a scene that was loaded from `small` of it."""
+    """Render the configurations of a spec in a scene that was loaded from `shrink_spec` of it."""
     film = scene.spec.film
     half_spp = int(np.clip(exposure.PATHS // (film.width * film.height), 1, MOST_SPP))
     shown: list[Shown] = []

@@ -64,7 +64,7 @@ def check(named: NamedSpec, log: Log) -> SceneCheck:
 def _check(named: NamedSpec, work: WorkLog) -> SceneCheck:
     begun, spec = time.monotonic(), named.spec
     work.begin(f"loading {spec.name}")
-    scene = LoadedScene.load(samples.small(spec), named.file.parent)
+    scene = LoadedScene.load(samples.shrink_spec(spec), named.file.parent)
     group_of = groups_by_shape(spec)
     shapes = facts_of(scene.scene, group_of)
     work.begin(f"{len(shapes)} shapes; drawing them, and moving groups to {len(spec.groups)} boxes' ends")

@@ -67,11 +67,10 @@ def count_operations(spec: SceneSpec, run: Run) -> float:
     """Floating-point operations of a run's convolutions and matrix products."""
     from photonfarm.trainer.dry_run import summarise
     from photonfarm.trainer.networks import find_kind
-    from photonfarm.trainer.runs.settings import NetworkSettings, make_preset
+    from photonfarm.trainer.runs.settings import make_settings
 
-    told = {key: value for key, value in run.train.items() if key != "preset"}
-    network = {key: told.pop(key) for key in [*told] if key in NetworkSettings.model_fields}
-    settings = make_preset(run.train["preset"], network=network, **told)
+    changes = {key: value for key, value in run.train.items() if key != "preset"}
+    settings = make_settings(run.train["preset"], changes)
     of_image = sum(part.gmacs for part in summarise(spec, settings.network)) * 2e9
     images = settings.batch * (2 if find_kind(settings.network.architecture).needs.kept else 1)  # a denoiser's halves
     return OF_A_STEP * of_image * images * settings.max_steps

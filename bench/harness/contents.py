@@ -156,7 +156,7 @@ class Pool:
 def commit(scene: SceneStore, job: int, contents: Contents | Pool) -> None:
     """Give a job its contents in the order that a worker has, as fast as they are taken."""
     rows = scene.job_rows(job)
-    with JobWriter(scene, scene.job_rows(job)) as out:
+    with JobWriter(scene, rows) as out:
         for kind, row, sample in in_order(rows):
             modification, view = rows.modifications[sample.modification_row], rows.views[sample.view_row]
             if kind == "modification" and scene.spec.photons.paths:

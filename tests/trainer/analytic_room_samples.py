@@ -138,11 +138,11 @@ class ScarceSource(AnalyticSource):
 
 def commit_job(scene: SceneStore, job: int) -> bool:
     """Write one job of a store, its images analytic; as a render worker does."""
-    rows, new_views, cloud = scene.job_rows(job), set(scene.job_rows(job).new_views), scene.base()[1]
-    photons = {}
+    rows, cloud, photons = scene.job_rows(job), scene.base()[1], {}
+    new_views = set(rows.new_views)
     if scene.spec.photons.paths:
         photons = {row: trace(scene.spec, modification, row) for row, modification in rows.modifications.items()}
-    with JobWriter(scene, scene.job_rows(job)) as out:
+    with JobWriter(scene, rows) as out:
         for sample in rows.samples:
             shown = rows.modifications[sample.modification_row], rows.views[sample.view_row]
             clean, buffers = render(scene.spec, *shown)

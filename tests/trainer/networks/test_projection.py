@@ -15,8 +15,8 @@ from photonfarm.trainer.runs.settings import Occlusion
 W, H, NEAR, FAR = 12, 8, 0.1, 20.0
 
 
-def optics(occlusion: str = "exact", width: int = W, height: int = H) -> Optics:
-    return Optics(focal_px=7.3, width=width, height=height, near=NEAR, far=FAR, occlusion=occlusion)
+def optics(occlusion: str) -> Optics:
+    return Optics(focal_px=7.3, width=W, height=H, near=NEAR, far=FAR, occlusion=occlusion)
 
 
 def cameras(count: int, seed: int) -> torch.Tensor:
@@ -55,15 +55,15 @@ def oracle(features: np.ndarray, sample: Sequence[np.ndarray], occlusion: str) -
     return image
 
 
-def random_scene(seed: int, batch: int = 3, points: int = 900) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
-    """Features (B, P, 5), and the arguments of `footprint`."""
+def random_scene(seed: int) -> tuple[torch.Tensor, tuple[torch.Tensor, ...]]:
+    """Features (3, 900, 5), and the arguments of `footprint`."""
     generator = torch.Generator().manual_seed(seed)
     draw = {"generator": generator, "dtype": torch.float64}
-    position, features = 4 * torch.randn(batch, points, 3, **draw), torch.randn(batch, points, 5, **draw)
-    present, seen = (torch.rand(batch, points, generator=generator) < share for share in (0.8, 0.6))
-    depth = 8 * torch.rand(batch, H, W, **draw)
+    position, features = 4 * torch.randn(3, 900, 3, **draw), torch.randn(3, 900, 5, **draw)
+    present, seen = (torch.rand(3, 900, generator=generator) < share for share in (0.8, 0.6))
+    depth = 8 * torch.rand(3, H, W, **draw)
     depth[depth < 2] = 0  # nothing hit there
-    return features, (position, present, seen, cameras(batch, seed), depth)
+    return features, (position, present, seen, cameras(3, seed), depth)
 
 
 @pytest.mark.parametrize("occlusion", get_args(Occlusion))

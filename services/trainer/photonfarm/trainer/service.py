@@ -17,7 +17,7 @@ from photonfarm.core.errors import IncompleteError, QueueError, SpecError, Store
 from photonfarm.core.processes import Stop, repeat
 from photonfarm.scene.spec import Film
 from photonfarm.scene.spec_loading import load_spec, scene_folder
-from photonfarm.store import Store
+from photonfarm.store import SceneReader, Store
 from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.model.scene_store import list_scenes
 from photonfarm.store.read.find import describe_scenes
@@ -63,7 +63,6 @@ def run(
     Raises IncompleteError if the time is over before there is anything to train on, and with `until_complete` also if a
     signal stops it.
     """
-    from photonfarm.store import SceneReader
     from photonfarm.trainer.runs.devices import describe_device, join_ranks
     from photonfarm.trainer.training.loop import Hooks, stop_on_signals
     from photonfarm.trainer.training.other_ranks import assist
@@ -105,7 +104,6 @@ def _train(
     hooks: Hooks,
 ) -> None:
     """Train as the only process or as rank 0: wait for a scene, report, and write event files for TensorBoard."""
-    from photonfarm.store import SceneReader
     from photonfarm.trainer.runs.tensorboard import open_event_files
     from photonfarm.trainer.training.loop import train
 

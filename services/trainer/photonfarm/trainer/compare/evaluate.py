@@ -35,7 +35,7 @@ from photonfarm.trainer.predictors.evaluation import (
     read_batches,
     time_by_turns,
 )
-from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
+from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun, list_predictors
 from photonfarm.trainer.runs.devices import describe_device, usable_device
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
@@ -179,8 +179,7 @@ def compare(
     shown = samples.to_show(references_by_row)
     network = load_inception(inception, str(place)) if references_by_row and not without_inception else None
     test = _Test(store, samples, references_by_row, network, str(place), on_progress or (lambda *_: None))
-    ready = [ReadyPredictor(denoiser, kept, first.settings) for denoiser, kept in denoisers]
-    predictors: list[TrainedRun | ReadyPredictor] = [*runs, *ready]
+    predictors = list_predictors(runs, denoisers)
     test.on_progress("networks are loaded and timed", 0, 0)
     calls = [test.load(predictor) for predictor in predictors]
     times, predicts = time_by_turns(calls), [predict for predict, _ in calls]

@@ -52,7 +52,8 @@ def write_evaluation(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list
 
 def format_evaluation(evaluation: Evaluation) -> str:
     """A line on what was measured, and the table as Markdown."""
-    return f"{evaluation.scene}: {make_table(evaluation).title}\n\n{make_table(evaluation).format_markdown()}"
+    table = make_table(evaluation)
+    return f"{evaluation.scene}: {table.title}\n\n{table.format_markdown()}"
 
 
 def make_table(evaluation: Evaluation, metrics: Mapping[str, tuple[str, int]] = METRICS) -> Table:

@@ -2,9 +2,9 @@
 
 image = emission + known light + reflectance × U-Net
 
-Emission and direct light are rendered [renderer.guides]; lit points and photons add light that was reflected before.
-The output of the U-Net is divided by the reflectance of a surface, so that it need learn neither textures nor the
-colours of metals. No input depends on the noise of the half-estimates that are its targets.
+Emission and direct light are rendered [renderer.scene.guides]; lit points and photons add light that was reflected
+before. The output of the U-Net is divided by the reflectance of a surface, so that it need learn neither textures nor
+the colours of metals. No input depends on the noise of the half-estimates that are its targets.
 
 Shape letters: B batch, H W image, C channels.
 """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -17,7 +17,7 @@ from photonfarm.store import SceneReader
 from photonfarm.trainer.networks import build, find_kind
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.predictors.denoisers import fill_in
+from photonfarm.trainer.predictors.denoisers import Oidn, fill_in
 from photonfarm.trainer.predictors.evaluation import DevicePredictor, make_network_predictor
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.checkpoint import read_settings
@@ -115,6 +115,11 @@ class ReadyPredictor:
             return lambda inputs: require(inputs.noisy).colour
         if self.denoiser == "fill-in":
             return lambda inputs: fill_in(require(inputs.noisy), inputs.albedo)
-        from photonfarm.trainer.predictors.denoisers import Oidn
-
         return Oidn(self.settings.threads)
+
+
+def list_predictors(
+    runs: Sequence[TrainedRun], denoisers: Iterable[tuple[ReadyDenoiser, int]]
+) -> list[TrainedRun | ReadyPredictor]:
+    """The runs, then denoisers given one of so many pixels, which read samples as the first run does."""
+    return [*runs, *(ReadyPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers)]

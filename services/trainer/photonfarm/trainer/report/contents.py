@@ -19,7 +19,7 @@ from photonfarm.core.statistics import Estimate
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureOptions, PredictorRow, compare
 from photonfarm.trainer.compare.evaluation_samples import Reference
-from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
+from photonfarm.trainer.predictors.trained import TrainedRun, list_predictors
 from photonfarm.trainer.report.data_and_runs import Baselines, DatasetCard, RunStory, shorten_names
 from photonfarm.trainer.report.frame_times import (
     FrameTime,
@@ -143,9 +143,9 @@ def gather_contents(
     store: str | Path, runs: Sequence[TrainedRun], *, timed: bool, **how: Unpack[MeasureOptions]
 ) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
-    first, denoisers = runs[0], how.get("denoisers", ())
+    first, predictors = runs[0], list_predictors(runs, how.get("denoisers", ()))
     card = DatasetCard.of(store, first.scene_id, first.exposure)
-    kept = [k for k in (1, *(run.needs.kept for run in runs), *(k for _, k in denoisers)) if k]
+    kept = [k for k in (1, *(predictor.needs.kept for predictor in predictors)) if k]
     tell = how.get("on_progress") or (lambda *_: None)
     costs: FrameCosts | None = None
     untimed, worst, machine = "it was not asked for", [], Machine.here()
@@ -177,8 +177,6 @@ def gather_contents(
     tell("the mean colour and the untrained network are measured", 0, 0)
     title, table = find_published_table(card.spec)
     names = shorten_names(list(runs))
-    ready = [ReadyPredictor(denoiser, k, first.settings) for denoiser, k in denoisers]
-    predictors: list[TrainedRun | ReadyPredictor] = [*runs, *ready]
     entries = []
     for i, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
         architecture = predictor.settings.network.architecture if isinstance(predictor, TrainedRun) else None
@@ -203,5 +201,5 @@ def gather_contents(
 def _read_inputs(store: str | Path, run: TrainedRun, rows: list[int], *, guides: bool) -> dict[int, Inputs]:
     source = run.source(store)
     source.refresh()
-    samples = {row: source.read(row, guides=guides) for row in rows}
-    return {row: (sample.buffers, sample.guides) for row, sample in samples.items()}
+    samples = (source.read(row, guides=guides) for row in rows)  # one by one: their radiance is not kept
+    return {sample.row: (sample.buffers, sample.guides) for sample in samples}

@@ -43,7 +43,7 @@ class HeldOutView:
     half_a: F32  # of the reference, exposed; independent of `half_b`
     half_b: F32
     buffers: ViewBuffers
-    surface: NDArray[np.uint8] | None  # (H, W) kinds of `frame_costs.Surface`; None without the renderer
+    surface: NDArray[np.uint8] | None  # (H, W) kinds of `archives.Surface`; None without the renderer
 
 
 @dataclass(frozen=True, slots=True)

@@ -185,10 +185,8 @@ class TrainSettings(Frozen):
     prefetch: Count = 2  # batches read ahead
     threads: Annotated[int, Field(ge=1, le=1024)] = 1  # of torch on the CPU; renderers share the machine
     device: str = "auto"  # cuda where torch has one, and otherwise the cpu
-    compile: Compilation = (
-        "off"  # "on": torch.compile makes kernels for the U-Net, which takes minutes at the beginning
-    )
-    # and is slower than without on a CPU (docs/results/train_step.md); "graphs": with CUDA graphs too
+    compile: Compilation = "off"  # "on": torch.compile makes kernels for the U-Net, which takes minutes at first, and
+    # is slower than without on a CPU (docs/results/train_step.md); "graphs": with CUDA graphs too
     resident_gb: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"  # of decoded samples that are kept on the
     # device; "auto": on CUDA while a quarter of the card is free, and none on a CPU, beside whose memory the files lie
 

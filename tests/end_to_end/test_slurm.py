@@ -19,8 +19,6 @@ from slurm_cluster import Cluster
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.store import SceneStore, Store
 
-ROOT = Path(__file__).parents[2]
-
 pytestmark = [
     pytest.mark.skipif(
         os.environ.get("PHOTONFARM_TEST_SLURM") != "1", reason="starts a SLURM; run by: make test-slurm"

@@ -18,7 +18,7 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.spec_loading import NamedSpec
 
 MOST_CPU_S = 1.2
-"""Of a start: three times what it takes on a quiet machine."""
+"""The most processor time of a start: three times what it takes on a quiet machine."""
 
 HEAVY = {"torch", "mitsuba", "drjit", "zarr", "scipy", "matplotlib", "trimesh", "obstore"}
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers, Visibility
+from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.request import Request
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
-from photonfarm.store import Figures, JobWriter, SceneReader, SceneStore, Store
+from photonfarm.store import Figures, JobWriter, SceneReader, SceneStatus, SceneStore, Store
 from photonfarm.store.format.schema import output_arrays
 
 FIGURES = Figures(core_s=2.0, wall_s=1.0, redrawn=1, worker="test", versions={"numpy": np.__version__})
@@ -59,6 +60,11 @@ def reader_of(scene: SceneStore) -> SceneReader:
     reader = SceneReader(scene.folder.parent.parent, scene.scene_id)
     reader.refresh()
     return reader
+
+
+def statuses(store: Store) -> list[SceneStatus]:
+    """What `photonfarm status` says of the scenes of a store without a queue."""
+    return [scene.status for scene in FarmWatch(store, "unix:///none").look().scenes]
 
 
 def outputs(scene: SceneStore, job: int) -> Outputs:

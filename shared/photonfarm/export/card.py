@@ -176,7 +176,7 @@ _CONTEXT: dict[str, Any] = {
     **{term: f"cr:{term}" for term in (*_TERMS, "key", "recordSet", "source")},
     "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
 }
-"""Of the context that the specification of Croissant 1.1 prints, the terms that are used here."""
+"""The terms that are used here, of the context that the specification of Croissant 1.1 prints."""
 
 
 def write_croissant(exported: Exported) -> None:

@@ -22,7 +22,7 @@ from photonfarm.farm.progress import FarmProgress, QueueProgress, SceneProgress
 from photonfarm.farm.running_farm import running_farm
 from photonfarm.farm.training import RunFolder
 from photonfarm.store import SceneStatus, SceneStore, Store
-from photonfarm.store.model.store import FAILURES_FOLDER, name_of
+from photonfarm.store.model.store import FAILURES_FOLDER, READERS, name_of
 
 if TYPE_CHECKING:
     from photonfarm.queue.failures import Failure
@@ -36,9 +36,6 @@ WINDOW_S = 120.0
 
 STEADY_S = 10.0
 """The least span of looks that a pace is taken from."""
-
-READERS = 8
-"""The number of markers read at a time: a bucket takes milliseconds for each answer."""
 
 
 @dataclass(slots=True)
@@ -117,7 +114,8 @@ class FarmWatch:
         )
 
     def _look_at(self, scene: SceneStore, queue: QueueProgress) -> SceneProgress:
-        progress, committed = scene.progress(), scene.committed_jobs()
+        committed = scene.committed_jobs()
+        progress = scene.progress_of(committed)
         jobs, withdrawn = scene.jobs(), scene.withdrawn_jobs()  # after the markers: each one's plan is there by now
         seen = self._seen.get(scene.scene_id)
         if seen is None or seen.core_s.keys() - committed:  # a repair has removed some

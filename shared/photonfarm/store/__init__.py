@@ -4,7 +4,7 @@ from photonfarm.store.format.markers import Figures
 from photonfarm.store.model.commit import JobWriter
 from photonfarm.store.model.plans import JobRows, SampleRow
 from photonfarm.store.model.scene_store import PlanResult, Progress, SceneStore
-from photonfarm.store.model.store import SceneStatus, Store, store_status
+from photonfarm.store.model.store import SceneStatus, Store
 from photonfarm.store.read.batch import Sample
 from photonfarm.store.read.reader import SceneReader
 
@@ -20,5 +20,4 @@ __all__ = [
     "SceneStatus",
     "SceneStore",
     "Store",
-    "store_status",
 ]

@@ -10,7 +10,7 @@ UNITS = [hashlib.sha256(bytes([i])).digest()[:16] for i in range(200)]
 
 
 HELD = "3 9 14 15 29 40 44 45 47 49 57 60 66 75 81 93 102 115 118 121 134 147 157 163 166 170 173 183 188"
-"""Of the units, by the share HOLD_OUT, since there are stores."""
+"""The units that the share HOLD_OUT has held out since there are stores."""
 
 
 def test_what_is_held_out_is_a_contract() -> None:

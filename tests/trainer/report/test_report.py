@@ -23,7 +23,8 @@ from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
-from photonfarm.store import SceneReader, Store, store_status
+from photonfarm.store import SceneReader, Store
+from photonfarm.store.model.store import scene_status
 from photonfarm.store.read.merge import MergedView
 from photonfarm.trainer.compare.evaluate import PredictorRow
 from photonfarm.trainer.metrics.image_metrics import confidence_interval, metric_space, mse, mssim
@@ -205,7 +206,7 @@ def test_the_dataset_s_card_says_whom_it_is_owed_to_and_how_it_was_made(measured
     card, scene = figures["dataset"], measured.scene
     assert card["credits"] == scene.spec.credits.model_dump()
     assert [request["seed"] for request in card["requests"]] == [0]
-    assert (card["bytes"], card["core_seconds"]) == (store_status(Store(measured.store))[0].size_bytes, 4 * 0.5)
+    assert (card["bytes"], card["core_seconds"]) == (scene_status(scene).size_bytes, 4 * 0.5)
     assert card["versions"] == {"test": ["1"]}
     assert card["guides"] == scene.spec.guides.model_dump()
     page = (out / "report.html").read_text()

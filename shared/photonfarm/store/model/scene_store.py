@@ -214,8 +214,11 @@ class SceneStore:
         It costs those who ask often less if it is `followed`: what a repair sets aside may then be seen late
         (`FollowedMarkers`).
         """
-        committed = self._followed.look() if followed else self.committed_jobs()
-        stored_plans = self.plans()
+        return self.progress_of(self._followed.look() if followed else self.committed_jobs())
+
+    def progress_of(self, committed: set[int]) -> Progress:
+        """The scene's progress, given the jobs that have their marker."""
+        stored_plans = self.plans()  # after the markers: each one's plan is there by now
         complete = plans.complete_rows(stored_plans, committed)
         further = [plan for plan in stored_plans if isinstance(plan.request, TopUp)]
         return Progress(

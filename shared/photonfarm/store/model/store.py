@@ -212,33 +212,23 @@ class SceneStatus:
     error: str | None = None  # why the scene cannot be read; all numbers are 0 then
 
 
-_READERS = 8
+READERS = 8
 """The number of markers read at a time: a bucket takes milliseconds for each answer."""
 
 _BLOCK = 256
 """The number of markers that a reader takes at a time, and forgets once they are summed up."""
 
 
-def store_status(store: Store) -> list[SceneStatus]:
-    """The status of every scene; reads every marker, and holds few of them at a time.
-
-    A scene that cannot be read has an `error`, and unreadable markers are counted by themselves. Raises StoreError if
-    the store cannot be read.
-    """
-    known, failed = store.each(scene_status)
-    for scene_id, error in failed.items():
-        name = name_of(store, scene_id) or "unreadable"
-        known[scene_id] = SceneStatus(scene_id, name, 0, 0, 0, 0, 0, 0.0, 0, 0, None, error=str(error))
-    return [known[scene_id] for scene_id in sorted(known)]
-
-
 def scene_status(scene: SceneStore) -> SceneStatus:
-    """The status of one scene, as `store_status` has it; raises StoreError if it cannot be read."""
-    progress = scene.progress()
-    committed = sorted(scene.committed_jobs())  # before the plans: each one's plan is there by now
-    jobs, withdrawn = scene.jobs(), scene.withdrawn_jobs()
+    """The status of one scene; reads every marker, and holds few of them at a time.
+
+    Unreadable markers are counted by themselves. Raises StoreError if the scene cannot be read.
+    """
+    done = scene.committed_jobs()
+    progress, committed = scene.progress_of(done), sorted(done)
+    jobs, withdrawn = scene.jobs(), scene.withdrawn_jobs()  # after the markers: each one's plan is there by now
     blocks = [committed[start : start + _BLOCK] for start in range(0, len(committed), _BLOCK)]
-    with ThreadPoolExecutor(_READERS) as readers:
+    with ThreadPoolExecutor(READERS) as readers:
         sums = list(readers.map(partial(_sum_markers, scene), blocks))
     errors = [error for *_, error in sums if error is not None]
     if errors and not isinstance(errors[0], CorruptError):
@@ -260,7 +250,7 @@ def scene_status(scene: SceneStore) -> SceneStatus:
 
 
 def _sum_markers(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int, int, StoreError | None]:
-    """Of the markers of some jobs: bytes, core seconds and redrawn renders; unreadable ones, and the first error."""
+    """Bytes, core seconds and redrawn renders by the markers of some jobs; unreadable markers, and the first error."""
     size_bytes, core_s, redrawn, errors = 0, 0.0, 0, []
     for job in jobs:
         try:

@@ -111,7 +111,7 @@ def _withdrawable(scene: SceneStore, stored_plans: list[StoredPlan], plan: Store
 
 
 def _references(plan: StoredPlan) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """For each sample of a plan its job, and the jobs of its view and of its configuration, (N,) and (N, 2)."""
+    """The job of each sample of a plan, (N,), and the jobs of its view and of its configuration, (N, 2)."""
     used = np.flatnonzero(plan.rows.sample_modification != UNUSED)
     referred = np.stack([plan.rows.sample_view[used], plan.rows.sample_modification[used]], axis=1)
     return (plan.first_row + used) // plan.shard_rows, referred // plan.shard_rows

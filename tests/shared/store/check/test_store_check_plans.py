@@ -16,7 +16,7 @@ from photonfarm.farm.submission import check_hold_out, submit
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
 from photonfarm.scene.spec_loading import NamedSpec
-from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format.metadata import seal
 
 scene = stores.scene
@@ -60,7 +60,7 @@ def test_changed_metadata_of_a_plan_is_found_and_other_scenes_go_on(
     other = store.scene(store.plan(samples.small_spec(points=8), Request(modifications=2)).scene_id)
     change_text(scene.folder / "plans/000000/zarr.json", old, new)
     again = Store(store.root)
-    errors = {status.scene_id: status.error for status in store_status(again)}
+    errors = {status.scene_id: status.error for status in samples.statuses(again)}
     assert (errors.pop(other.scene_id), len(errors)) == (None, 1)
     assert ("checksums is missing" if "checksums" in old else "fails its CRC-32C") in str(errors[scene.scene_id])
     assert again.plan(samples.small_spec(points=8), Request(modifications=3)).new == 1
@@ -142,7 +142,7 @@ def test_a_lost_last_plan_can_be_given_up_by_moving_its_markers_and_its_folder_a
     (scene.folder / "plans/000001").rename(aside / "000001")
     with pytest.raises(CorruptError):
         Store(store.root).plan(samples.small_spec(), Request(modifications=7, views_per_modification=2))
-    assert store_status(Store(store.root))[0].markers_without_plan == 1
+    assert samples.statuses(Store(store.root))[0].markers_without_plan == 1
     marker(scene, 3).rename(aside / marker(scene, 3).name)
     again = Store(store.root).scene(scene.scene_id)
     assert (found(checked(store)), again.missing_jobs()) == ({}, [])
@@ -167,7 +167,7 @@ def test_a_plan_of_another_version_is_refused_in_a_sentence_by_all_who_load_it(
     ):
         with pytest.raises(StoreError):
             look()
-    assert said in str(store_status(Store(store.root))[0].error)
+    assert said in str(samples.statuses(Store(store.root))[0].error)
     report = checked(store, repair=True)
     assert (found(report), report.exit_code) == ({"plan": 1}, 4)
     assert said in report.scenes[0].groups[0].first[0].detail

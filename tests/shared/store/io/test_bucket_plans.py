@@ -13,7 +13,7 @@ from photonfarm.store.check.check import check_store
 
 
 class KilledError(Exception):
-    """In place of a signal."""
+    """Stands for a signal."""
 
 
 def test_a_folder_is_joined_into_a_bucket_and_goes_on_where_it_was_cut_off(url: str, tmp_path: Path) -> None:

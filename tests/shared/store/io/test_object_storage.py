@@ -11,7 +11,7 @@ import store_samples as samples
 
 from photonfarm.core.errors import CorruptError
 from photonfarm.plan.request import Request
-from photonfarm.store import SceneReader, Store, store_status
+from photonfarm.store import SceneReader, Store
 
 planned, at_once = bucket_samples.planned, bucket_samples.at_once
 
@@ -39,7 +39,7 @@ def test_what_is_committed_reads_back_and_is_counted(place: str | Path) -> None:
         np.testing.assert_array_equal(reader.read(row).buffers.normal, given.buffers[row].normal)
         np.testing.assert_array_equal(reader.read_photons(row).power, given.photons[row].power)
     np.testing.assert_array_equal(reader.base()[0].vertices, geometry.vertices)
-    (status,) = store_status(Store(place))
+    (status,) = samples.statuses(Store(place))
     assert (status.samples_planned, status.samples_complete, status.jobs_committed) == (2, 2, 1)
     assert status.size_bytes == sum(scene.storage.size(f"{scene.name}/{name}") for name in scene.marker(0)["files"])
 
@@ -108,7 +108,7 @@ def test_a_bucket_that_has_lost_the_store_s_document_or_a_spec_is_refused_and_to
     obstore.put(objects_, "scenes/nothex/plans/000000/zarr.json", b"{}")
     obstore.delete(objects_, f"{scene.name}/spec.json")
     assert store.scene_ids() == [scene.scene_id]
-    (about,) = store_status(Store(url))
+    (about,) = samples.statuses(Store(url))
     assert "spec.json" in str(about.error)
     obstore.delete(objects_, "photonfarm.json")
     with pytest.raises(CorruptError):

@@ -11,7 +11,7 @@ import store_samples as samples
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.core.records import ViewBuffers, Visibility, arrays_of
 from photonfarm.plan.request import Request
-from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format.shards import NOISY_GUIDES, round_to_8_bits
 
 scene, reader_of = samples.scene, samples.reader_of
@@ -238,7 +238,7 @@ def test_a_scene_without_photons_stores_none(store: Store) -> None:
 
 def test_the_status_counts_samples_jobs_bytes_and_core_seconds(store: Store, scene: SceneStore) -> None:
     samples.commit(scene, 1, samples.outputs(scene, 1))
-    (status,) = store_status(store)
+    (status,) = samples.statuses(store)
     assert (status.samples_planned, status.samples_complete) == (10, 4)
     assert (status.jobs_planned, status.jobs_committed) == (3, 1)
     assert (status.core_s, status.redrawn) == (2.0, 1)

@@ -16,7 +16,7 @@ from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.core.records import LIT_POINTS, arrays_of
 from photonfarm.plan.request import Request
 from photonfarm.scene.spec import Emitters, GuideSpec
-from photonfarm.store import SceneReader, SceneStore, Store, store_status
+from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import declarations, markers, schema
 from photonfarm.store.format.metadata import seal
 from photonfarm.store.io.local import LocalStorage
@@ -250,7 +250,7 @@ def test_unknown_files_arrays_attributes_and_keys_are_ignored(scene: SceneStore,
     samples.commit_all(again)
     assert again.progress().committed_samples == 5
     assert again.plan(Request(modifications=6)).plan == 1
-    assert store_status(opened)[0].samples_planned == 6
+    assert samples.statuses(opened)[0].samples_planned == 6
 
 
 def read_all(scene: SceneStore) -> list[bytes]:

@@ -14,7 +14,7 @@ from photonfarm.plan.request import Request
 from photonfarm.queue.connection import connect
 from photonfarm.queue.reconciliation import reconcile
 from photonfarm.queue.rq_adapter import queue_status
-from photonfarm.store import JobWriter, SceneReader, SceneStore, Store, store_status
+from photonfarm.store import JobWriter, SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.io.local import LocalStorage
 from photonfarm.store.read.find import Query, find_samples, scene_named
@@ -62,7 +62,7 @@ def test_a_damaged_scene_holds_up_no_other(
     damaged, whole = planned(store, 16), planned(store, 17)
     harm(damaged.folder)
     again = Store(store.root)
-    statuses = {status.scene_id: status for status in store_status(again)}
+    statuses = {status.scene_id: status for status in samples.statuses(again)}
     assert statuses[whole.scene_id].error is None
     assert (statuses[whole.scene_id].jobs_planned, statuses[whole.scene_id].jobs_committed) == (2, 1)
     about = statuses[damaged.scene_id]
@@ -109,7 +109,7 @@ def test_what_is_no_scene_of_ours_among_the_scenes_is_ignored_by_all(store: Stor
         (store.root / "scenes" / name / "plans/000000").mkdir()
     again = Store(store.root)
     assert again.scene_ids() == [scene.scene_id]
-    assert [about.error for about in store_status(again)] == [None]
+    assert [about.error for about in samples.statuses(again)] == [None]
     assert scene_named(again, "small") == scene.scene_id
     samples.commit_all(scene)
     scene.write_base(*samples.base())
@@ -128,7 +128,7 @@ def test_a_store_that_cannot_be_read_is_no_error_of_its_scenes(
 
     monkeypatch.setattr(LocalStorage, "read", refused)
     with pytest.raises(StoreError):
-        store_status(again)
+        samples.statuses(again)
     with pytest.raises(StoreError):
         reconcile(again, connect(redis_url))
 

@@ -23,10 +23,7 @@ REQUEST = Request(modifications=8, views_per_modification=1)
 @pytest.fixture
 def scene(store: Store) -> SceneStore:
     """Four jobs of two samples, each with configurations of its own; the first and the third are committed."""
-    unit = {"min": [0, 0, 0], "max": [1, 1, 1]}
-    movable = {"name": "object", "shapes": ["tall-block"], "at": [0, 0, 0], "box": unit, "removal_probability": 0}
-    spec = samples.small_spec(objects=[movable])
-    scene = store.scene(store.plan(spec, REQUEST, shard_rows=2).scene_id)
+    scene = store.scene(store.plan(samples.small_spec(**samples.ALWAYS), REQUEST, shard_rows=2).scene_id)
     scene.write_base(*samples.base())
     for job in (0, 2):
         assert samples.commit(scene, job, samples.outputs(scene, job))

@@ -1,8 +1,8 @@
 """The worker: a supervisor, which starts its child again whenever it ends, until there is nothing left to do.
 
-The child (`child`) renders in its own process, so that scenes and kernels stay loaded. It is
-always a fresh interpreter, as Dr.Jit's threads do not survive a fork. It gets its settings through stdin, as the Redis
-URL may hold a password. It ends when that pipe is closed, so that it cannot outlive its supervisor.
+The child (`child`) renders in its own process, so that scenes and kernels stay loaded. It is always a fresh
+interpreter, as Dr.Jit's threads do not survive a fork. It gets its settings through stdin, as the Redis URL may hold a
+password. It ends when that pipe is closed, so that it cannot outlive its supervisor.
 """
 
 from __future__ import annotations

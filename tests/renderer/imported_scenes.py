@@ -1,4 +1,4 @@
-"""What tests of imported scenes ask them."""
+"""What tests of imported scenes ask them, and parts of the files that they are made from."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
 
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -33,6 +34,8 @@ CORNERS = ((0.25, 0.75), (0.75, 0.75), (0.25, 0.25), (0.75, 0.25))
 """Where four.png has the middles of its texels on the square."""
 
 WHOLE = "usemtl it\nf 1/1 2/2 3/3 4/4"
+
+SPHERE = '<shape type="sphere" id="Ball"/>'
 
 
 def hit(made: Any, x: float, y: float, side: float = 5) -> Any:
@@ -61,6 +64,14 @@ def emission(made: Any, x: float, y: float, side: float = 5) -> np.ndarray:
     """What is emitted towards a ray down at (x, y)."""
     si = hit(made, x, y, side)
     return np.array(si.emitter(made).eval(si)).ravel()
+
+
+def from_sky(made: Any, directions: np.ndarray) -> np.ndarray:
+    """What comes from directions (N, 3); (N, 3)."""
+    looked = dr.zeros(mi.SurfaceInteraction3f, len(directions))
+    unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    looked.wi = mi.Vector3f(np.ascontiguousarray(-unit.T))
+    return np.array(made.environment().eval(looked)).T
 
 
 def area(made: Any) -> float:

@@ -13,14 +13,11 @@ from scipy import stats
 from photonfarm.renderer.bdpt.guiding import grid
 from photonfarm.renderer.bdpt.lights import selection
 from photonfarm.renderer.bdpt.lights.emission import read_lights
+from tests.stability.scenes.case import load
 from tests.stability.scenes.hard_scenes import HARD_SCENES, camera, grey, lit_room, rectangle, shining
 
 SIGNIFICANCE = 1e-5  # of each test over all its comparisons; the seeds are fixed
 CELLS = selection.CELLS**3
-
-
-def load(scene: Any) -> Any:
-    return mi.load_dict(scene, optimize=False)
 
 
 def table(scene: Any) -> Any:

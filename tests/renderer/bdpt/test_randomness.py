@@ -18,10 +18,10 @@ SIGNIFICANCE = 1e-5  # of each test, over all its comparisons together; the seed
 SEEDS = (0, 1, 12345, 0xFFFFFFFF)
 
 
-def points(seed: int, n: int, pairs: int = 1, number: int = 0, first: int = 0) -> Any:
-    """[n, 2·pairs]: the first pairs of dimensions of points first … first + n − 1 of a sequence."""
+def points(seed: int, n: int, pairs: int = 1, number: int = 0) -> Any:
+    """[n, 2·pairs]: the first pairs of dimensions of the first points of a sequence."""
     sequence = randomness.stream(randomness.image_keys([seed]), randomness.EYE, number)
-    rng = randomness.sampler(sequence, dr.arange(mi.UInt32, n) + first)
+    rng = randomness.sampler(sequence, dr.arange(mi.UInt32, n))
     return np.concatenate([np.array(rng.next_2d()).T for _ in range(pairs)], axis=1).astype(np.float64)
 
 
@@ -117,11 +117,11 @@ def test_an_estimate_over_sequences_has_the_expectation_of_independent_numbers()
 # ------------------------------------------------ Along the curve ------------------------------------------------
 
 
-def on_curve(n: int, repeats: int = 1) -> Any:
-    """[repeats, n, 2]."""
-    lane = dr.tile(dr.arange(mi.UInt32, n), repeats)
-    rng = randomness.sampler(mi.UInt32(n) + dr.zeros(mi.UInt32, n * repeats), dr.arange(mi.UInt32, n * repeats))
-    return np.array(randomness.along_curve(lane, dr.opaque(mi.UInt32, n), rng)).T.reshape(repeats, n, 2)
+def on_curve(n: int) -> Any:
+    """[n, 2]."""
+    lane = dr.arange(mi.UInt32, n)
+    rng = randomness.sampler(dr.full(mi.UInt32, n, n), lane)
+    return np.array(randomness.along_curve(lane, dr.opaque(mi.UInt32, n), rng)).T
 
 
 def position_on_curve(xy: Any) -> Any:
@@ -137,7 +137,7 @@ def position_on_curve(xy: Any) -> Any:
 
 def test_points_along_the_curve_are_uniform_below_its_bits_too() -> None:
     """A curve of 16 bits for each coordinate alone would put all directions near a light's axis onto the axis."""
-    (xy,) = on_curve(1 << 18)
+    xy = on_curve(1 << 18)
     below = (xy.astype(np.float64) * 65536) % 1
     assert abs(below.mean() - 0.5) < 5 * np.sqrt(1 / 12 / below.size) + 2**-8  # floats near 1 keep 8 bits below
     assert np.mean(below == 0) < 2**-7
@@ -147,7 +147,7 @@ def test_points_along_the_curve_are_uniform_below_its_bits_too() -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 3, 100, 1000, 1023, 1024])
 def test_lanes_along_the_curve_are_stratified_for_any_number(n: int) -> None:
-    (xy,) = on_curve(n)
+    xy = on_curve(n)
     assert ((xy >= 0) & (xy < 1)).all()
     # One point in each of n equal pieces of the curve, but for what lies nearer to a border than a bit of the position
     piece = position_on_curve(xy) * n

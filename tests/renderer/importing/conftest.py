@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from imported_scenes import SQUARE
+from imported_scenes import FOUR, SQUARE
 from PIL import Image
 
 from photonfarm.renderer.tools.importing.imported import ImportedScene
 from photonfarm.renderer.tools.importing.loading import load
 from photonfarm.renderer.tools.importing.proposal import surfaces
-from photonfarm.renderer.tools.importing.readers import reader_of
+from photonfarm.renderer.tools.importing.readers import blender, reader_of
 
 STRENGTH = "KHR_materials_emissive_strength"
 QUAD = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4")
@@ -176,10 +178,26 @@ def case() -> Callable[[str], Path]:
 
 
 @pytest.fixture
+def run(tmp_path: Path) -> Callable[..., None]:
+    """Function (script, arguments) → lets Blender's Python run it; without Blender, its tests are skipped."""
+    if not os.environ.get(blender.VARIABLE):
+        pytest.skip(f"{blender.VARIABLE} names no Blender")
+
+    def call(script: str, *arguments: str) -> None:
+        (tmp_path / "script.py").write_text(script)
+        command = blender.blender_command(tmp_path / "it.blend")
+        place = next(number for number, word in enumerate(command) if word.endswith("blender_export.py"))
+        command = [*command[:place], str(tmp_path / "script.py"), *arguments]
+        made = subprocess.run(command, capture_output=True, check=False)
+        assert made.returncode == 0, made.stderr.decode()[-1000:]
+
+    return call
+
+
+@pytest.fixture
 def write_obj(tmp_path: Path) -> Callable[[str, str], Path]:
     """Function (faces, materials) → an OBJ file, with images beside it."""
-    pixels = np.array([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]], np.uint8)
-    Image.fromarray(pixels).save(tmp_path / "four.png")
+    Image.fromarray(FOUR.astype(np.uint8)).save(tmp_path / "four.png")
     for name, value in (("full.png", 255), ("none.png", 0)):
         Image.fromarray(np.full((2, 2), value, np.uint8)).save(tmp_path / name)
 

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import mitsuba as mi
 import numpy as np
 import pytest
+from imported_scenes import Loaded
 from PIL import Image
-
-from photonfarm.renderer.tools.importing.imported import ImportedScene
-
-Loaded = Callable[[Path], tuple[ImportedScene, Any]]
 
 RED = '<bsdf type="diffuse" id="{}"><rgb name="reflectance" value="0.3 .2 .1"/></bsdf>'
 IMAGE = '<texture type="bitmap" name="{}"><string name="filename" value="images/a.png"/></texture>'

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,24 +10,14 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 import pytest
-from imported_scenes import Loaded
+from imported_scenes import Loaded, from_sky
 
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import elements
 from photonfarm.renderer.tools.importing.imported import ImportedScene
 from photonfarm.renderer.tools.importing.readers import blender
 
-needs_blender = pytest.mark.skipif(not os.environ.get(blender.VARIABLE), reason=f"{blender.VARIABLE} names no Blender")
-
-
-def run(script: str, folder: Path, *arguments: str) -> None:
-    """Let Blender's Python run a script."""
-    (folder / "script.py").write_text(script)
-    command = blender.blender_command(folder / "it.blend")
-    place = next(number for number, word in enumerate(command) if word.endswith("blender_export.py"))
-    made = subprocess.run([*command[:place], str(folder / "script.py"), *arguments], capture_output=True, check=False)
-    assert made.returncode == 0, made.stderr.decode()[-1000:]
-
+Run = Callable[..., None]
 
 STRAIGHT_DOWN = np.diag([1.0, 1, 1, 1]).tolist()
 SPOT = {"shadow_soft_size": 0.0, "spot_size": 1.0, "spot_blend": 0.0}
@@ -128,23 +117,15 @@ def test_an_area_shines_down_by_its_area_in_the_world(
     assert float(normal.y[0]) == pytest.approx(-1)
 
 
-@pytest.mark.parametrize(
-    ("numbers", "lost"),
-    [({"strength": [0.0] * 3}, []), ({"strength": [-1.0] * 3}, ["energy"])],
-)
-def test_what_no_light_is_here_is_a_loss_and_dark_lamps_are_not(tmp_path: Path, numbers: Any, lost: list[str]) -> None:
+@pytest.mark.parametrize(("strength", "lost"), [(0.0, []), (-1.0, ["energy"])])
+def test_what_no_light_is_here_is_a_loss_and_dark_lamps_are_not(
+    tmp_path: Path, strength: float, lost: list[str]
+) -> None:
     scene = ImportedScene()
-    blender.Lamps(scene, tmp_path).put(LAMP | numbers)
+    blender.Lamps(scene, tmp_path).put(LAMP | {"strength": [strength] * 3})
     assert [(change.effect, change.name, *change.places) for change in scene.changes] == [
         ("light", name, "lamp 'Lamp'") for name in lost
     ]
-
-
-def sky_in(scene: Any, direction: tuple[int, int, int]) -> np.ndarray:
-    """The radiance that comes from a direction."""
-    si = mi.SurfaceInteraction3f()
-    si.wi = -mi.Vector3f(*direction)
-    return np.array(scene.environment().eval(si)).ravel()
 
 
 def radiance_from(scene: Any, origin: list[float], target: list[float]) -> np.ndarray:
@@ -156,10 +137,9 @@ def radiance_from(scene: Any, origin: list[float], target: list[float]) -> np.nd
     return np.array(image).mean(axis=(0, 1))
 
 
-@needs_blender
 @pytest.mark.slow
-def test_area_lights_are_as_in_cycles(case: Callable[[str], Path], tmp_path: Path, loaded: Loaded) -> None:
-    run(case("blender-area-light/make.py").read_text(), tmp_path, str(tmp_path))
+def test_area_lights_are_as_in_cycles(case: Callable[[str], Path], tmp_path: Path, loaded: Loaded, run: Run) -> None:
+    run(case("blender-area-light/make.py").read_text(), str(tmp_path))
     wanted: dict[str, tuple[Any, Any]] = {
         "base": (63.7, 0.90),
         "scaled": (15.9, 0.828),
@@ -175,26 +155,24 @@ def test_area_lights_are_as_in_cycles(case: Callable[[str], Path], tmp_path: Pat
         assert found == pytest.approx(np.broadcast_to(radiance, 3), rel=0.04), name
         if emission is not None:
             hit = scene.ray_intersect(mi.Ray3f([1.8, 1.6, -1.2], [0, 1, 0]))
-            assert np.array(hit.emitter(scene).eval(hit)).ravel() == pytest.approx(
-                np.broadcast_to(emission, 3), rel=0.01
-            )
+            emitted = np.array(hit.emitter(scene).eval(hit)).ravel()
+            assert emitted == pytest.approx(np.broadcast_to(emission, 3), rel=0.01)
         else:
             assert any("Lamp" in place for change in made.changes for place in change.places)
 
 
-@needs_blender
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "colour"), [("default", (1, 1, 1)), ("kelvin", (1.771, 0.844, 0.272))])
 def test_the_start_up_scene_has_its_lamp_and_its_grey_sky(
-    case: Callable[[str], Path], tmp_path: Path, loaded: Loaded, name: str, colour: tuple[float, ...]
+    case: Callable[[str], Path], tmp_path: Path, loaded: Loaded, run: Run, name: str, colour: tuple[float, ...]
 ) -> None:
-    run(case(f"blender-{name}/make.py").read_text(), tmp_path, str(tmp_path))
+    run(case(f"blender-{name}/make.py").read_text(), str(tmp_path))
     made, scene = loaded(tmp_path / f"{name}.blend")
     assert not [change for change in made.changes if change.effect]
     (lamp,) = [shape for shape in scene.shapes() if shape.is_emitter()]
     power = np.array(mi.traverse(lamp.emitter())["radiance.value"]).ravel() * np.pi * float(lamp.surface_area()[0])
     assert power == pytest.approx(1000 * np.array(colour), rel=1e-3)
-    assert sky_in(scene, (0, 1, 0)) == pytest.approx([0.05088] * 3, rel=1e-3)
+    assert from_sky(scene, np.array([[0, 1, 0]]))[0] == pytest.approx([0.05088] * 3, rel=1e-3)
     assert made.camera == pytest.approx((7.359, 4.958, 6.926), abs=1e-3)
 
 
@@ -248,11 +226,10 @@ bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
 """
 
 
-@needs_blender
 @pytest.mark.slow
-def test_all_that_blender_draws_is_there_and_what_is_missing_is_named(tmp_path: Path, loaded: Loaded) -> None:
+def test_all_that_blender_draws_is_there_and_what_is_missing_is_named(tmp_path: Path, loaded: Loaded, run: Run) -> None:
     file = tmp_path / "drawn.blend"
-    run(DRAWN, tmp_path, str(file))
+    run(DRAWN, str(file))
     made, scene = loaded(file)
     area = {shape.id(): float(shape.surface_area()[0]) for shape in scene.shapes()}
     assert area["Box"] == pytest.approx(18)
@@ -338,11 +315,10 @@ bpy.ops.wm.save_as_mainfile(filepath=sys.argv[-1])
 """
 
 
-@needs_blender
 @pytest.mark.slow
-def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Path, loaded: Loaded) -> None:
+def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Path, loaded: Loaded, run: Run) -> None:
     file = tmp_path / "surfaces.blend"
-    run(SURFACES, tmp_path, str(file))
+    run(SURFACES, str(file))
     made, scene = loaded(file)
 
     def down(x: float) -> Any:
@@ -376,7 +352,7 @@ def test_surfaces_and_the_world_come_over_and_what_does_not_is_said(tmp_path: Pa
     assert any("exposure of +1.5 stops" in change.meaning for change in made.changes)
     # glTF's y is Blender's z, and its −z Blender's y
     for axis, colour in (((1, 0, 0), (1, 0, 0)), ((0, 1, 0), (0, 0, 1)), ((0, 0, -1), (0, 1, 0))):
-        assert sky_in(scene, axis) == pytest.approx(colour, abs=0.02)
+        assert from_sky(scene, np.array([axis]))[0] == pytest.approx(colour, abs=0.02)
 
 
 EXCHANGED = """
@@ -397,23 +373,22 @@ write(filepath=sys.argv[-1])
 """
 
 
-@needs_blender
 @pytest.mark.slow
 @pytest.mark.parametrize(("ending", "notes"), [("usdc", "cylinders, meshes or portals"), ("fbx", "that are areas")])
 def test_usd_and_fbx_have_their_names_and_usd_its_camera_and_its_sky(
-    tmp_path: Path, loaded: Loaded, ending: str, notes: str
+    tmp_path: Path, loaded: Loaded, run: Run, ending: str, notes: str
 ) -> None:
-    run(EXCHANGED, tmp_path, str(tmp_path / f"it.{ending}"))
+    run(EXCHANGED, str(tmp_path / f"it.{ending}"))
     made, scene = loaded(tmp_path / f"it.{ending}")
     assert {"Sofa", "Chair", "Rug"} <= {shape.id() for shape in scene.shapes()}
     assert any(notes in change.meaning for change in made.changes)
     assert not [change for change in made.changes if change.effect]
     if ending == "usdc":
         assert made.camera == pytest.approx((1, 3, -2))
-        assert sky_in(scene, (0, 1, 0)) == pytest.approx((0.5, 0.75, 1), abs=0.01)
+        assert from_sky(scene, np.array([[0, 1, 0]]))[0] == pytest.approx((0.5, 0.75, 1), abs=0.01)
 
 
-@needs_blender
+@pytest.mark.skipif(not os.environ.get(blender.VARIABLE), reason=f"{blender.VARIABLE} names no Blender")
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["it.blend", "it.usd", "it.fbx"])
 def test_a_file_that_blender_cannot_open_is_told_in_a_sentence(tmp_path: Path, name: str) -> None:

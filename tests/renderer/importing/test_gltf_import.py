@@ -22,9 +22,6 @@ TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4"), np.array([[0, 1, 
 SQUARE = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], "<f4"), np.array([[0, 1, 2], [0, 2, 3]], "<u4")
 
 
-NO_CONE = {"type": "spot", "spot": {"outerConeAngle": 0}}
-
-
 def put_lights(gltf: Any, *lights: dict[str, Any], **places: Any) -> None:
     """Add lights to a document, each at a node."""
     gltf.document["extensions"] = {"KHR_lights_punctual": {"lights": list(lights)}}
@@ -94,7 +91,7 @@ def test_integers_that_are_normalised_are_read(gltf: Any, loaded: Loaded) -> Non
     assert float(np.array(made.shapes()[0].surface_area())[0]) == pytest.approx(1)
 
 
-def test_a_glb_is_the_same_scene(gltf: Any, quad: Quad, read: Read, tmp_path: Path) -> None:
+def test_a_glb_is_the_same_scene(quad: Quad, read: Read, tmp_path: Path) -> None:
     from photonfarm.renderer.tools.importing.elements import text
 
     separate = text(read(quad()).root)

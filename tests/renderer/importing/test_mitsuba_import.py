@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 import pytest
-from mitsuba_scenes import SPHERE, Loaded, Read, reflectance
+from imported_scenes import SPHERE, Loaded, Read, reflectance
 from PIL import Image
 
 from photonfarm.core.errors import SpecError

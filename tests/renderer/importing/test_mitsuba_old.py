@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mitsuba_scenes import SPHERE, Loaded, Read, from_sky, reflectance
+from imported_scenes import SPHERE, Loaded, Read, from_sky, reflectance
 from PIL import Image
 
 from photonfarm.core.errors import SpecError

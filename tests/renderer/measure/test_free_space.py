@@ -37,8 +37,8 @@ def cameras(spec: SceneSpec, scene: LoadedScene, configurations: int, views: int
     return inside, not_open, least
 
 
-def with_free_space(spec: SceneSpec, beside: Path | None = None) -> SceneSpec:
-    space = measure(spec, beside, quietly).space
+def with_free_space(spec: SceneSpec) -> SceneSpec:
+    space = measure(spec, None, quietly).space
     return spec.model_copy(update={"view": spec.view.model_copy(update={"free_space": space})})
 
 

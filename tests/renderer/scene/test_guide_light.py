@@ -165,7 +165,7 @@ MATERIALS: dict[str, Shape] = {
 
 @pytest.mark.parametrize("name", MATERIALS)
 def test_over_many_views_direct_light_gloss_and_emission_have_the_mean_of_mitsubas_path_tracer(
-    name: str, monkeypatch: pytest.MonkeyPatch
+    name: str,
 ) -> None:
     """Mitsuba's paths have two edges, along the same rays of each grid; 64 views of 64 pixels, in blocks of 4."""
     floor = square((0, 0, 0), UP, 3, bsdf=MATERIALS[name])

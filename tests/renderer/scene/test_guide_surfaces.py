@@ -185,7 +185,7 @@ def test_the_back_of_a_one_sided_wall_in_a_mirror_is_black(bsdf: Shape, albedo: 
     assert centre(found.beyond_depth) == pytest.approx(9, rel=1e-2)
 
 
-def test_two_mirrors_that_face_each_other_end_after_so_many(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_mirrors_that_face_each_other_end_after_so_many() -> None:
     scene = scene_of(
         front=square((0, 0, 0), (0, 0, 1), 20, bsdf={"type": "conductor", "specular_reflectance": rgb(GREY)}),
         back=square((0, 0, 4), (0, 0, -1), 20, bsdf={"type": "conductor"}),

@@ -14,9 +14,9 @@ from photonfarm.scene.view import View
 LAMP = '<emitter type="area"><rgb name="radiance" value="6, 5, 4"/></emitter>'
 
 
-def sphere(at: float, name: str = "Lamp", inside: str = LAMP) -> str:
+def sphere(at: float, name: str = "Lamp") -> str:
     place = f'<point name="center" x="{at}" y="1" z="0"/><float name="radius" value="0.4"/>'
-    return f'<shape type="sphere" id="{name}">{place}{inside}</shape>'
+    return f'<shape type="sphere" id="{name}">{place}{LAMP}</shape>'
 
 
 def cube(at: float) -> str:

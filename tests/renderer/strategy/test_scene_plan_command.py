@@ -96,9 +96,7 @@ def test_a_short_pilot_does_not_serve_for_the_default(run: Run, asked: list[floa
         assert asked == pilots
 
 
-def test_settings_that_do_not_gain_are_not_written(
-    run: Run, asked: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_settings_that_do_not_gain_are_not_written(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     keeps = measurement(row(PLAIN, 0.2, 0.01, 0.01), row(JOINED, 0.02, 0.02, 0.04))
     monkeypatch.setattr(plan, "measure", lambda *_: keeps)
     code, _, err = run("box.toml", "--write")

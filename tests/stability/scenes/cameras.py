@@ -149,7 +149,7 @@ def _depth(max_depth: int, rr_depth: int) -> HardScene:
 
 
 SCENES = (
-    HardScene(27, "camera-in-light", camera_in_light, max_over_mean=None),
+    HardScene(27, "camera-in-light", camera_in_light),
     HardScene(27, "camera-at-wall", camera_at_wall, quick=replace(QUICK, resolution=0.02)),
     HardScene(27, "blocker-before-near-plane", blocked_before_near_plane),
     HardScene(28, "thin-lens", seen_by(**LENS), hard="a lens with an area"),

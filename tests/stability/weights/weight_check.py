@@ -103,9 +103,7 @@ class WeightComparison:
         )
 
 
-def compare_weights(
-    build: Callable[[int], SceneDict], settings: BdptSettings, *, lanes: int, seed: int = 0
-) -> WeightComparison:
+def compare_weights(build: Callable[[int], SceneDict], settings: BdptSettings, *, lanes: int) -> WeightComparison:
     """Compare all techniques of all paths of 2 … `EDGES` edges that start with ``lanes`` primary rays.
 
     For settings that are guided, light paths start by random gains, and their vertices have a random usefulness. Of
@@ -115,15 +113,15 @@ def compare_weights(
     scene = load(build(_SIZE))
     lights, lens = read_lights(scene), Pinhole.of(scene)
     if settings.guided_light:
-        lights = lights.guide_with(random_guide(lights.count, seed), scene)
-        useful = Usefulness.over(scene, random_usefulness(seed))
+        lights = lights.guide_with(random_guide(lights.count, seed=0), scene)
+        useful = Usefulness.over(scene, random_usefulness(seed=0))
     else:
         useful = None
     spared = _AT_EDGES if settings.guided_light else 0.0
     count = connection_count(settings.connections, EDGES, guided=settings.guided_light)
     counts = TechniqueCounts(count, settings.light_ratio, useful)
     result = WeightComparison()
-    for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=seed):
+    for joined in walk(scene, lights, paths=lanes, edges=EDGES, seed=0):
         complete = np.array(joined.complete)
         if not complete.any():
             continue

@@ -86,10 +86,18 @@ def camera_rays(camera: Camera, directions: F32, spec: SceneSpec) -> tuple[tuple
 
     The origins (Point3f), directions (Vector3f) and lengths (Float) of rays.
     """
+    origin, direction, reach, along = place_rays(camera, directions, spec)
+    return (points(origin), mi.Vector3f(points(direction)), floats(reach)), along
+
+
+def place_rays(
+    camera: Camera, directions: F32, spec: SceneSpec
+) -> tuple[NDArray[np.float64], F32, NDArray[np.float64], NDArray[np.float64]]:
+    """The same in numpy's memory: origins (N, 3), directions (N, 3), lengths and cosines (N,) of N rays."""
     flat = directions.reshape(-1, 3)
     along = flat.astype(np.float64) @ camera.forward
     near, far = spec.view.near / along, spec.view.far / along
-    return (points(camera.origin + flat * near[:, None]), mi.Vector3f(points(flat)), floats(far - near)), along
+    return camera.origin + flat * near[:, None], flat, far - near, along
 
 
 def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: str) -> tuple[Any, ...]:

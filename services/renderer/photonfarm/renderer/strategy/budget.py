@@ -63,13 +63,14 @@ def compile_within(
     Raises IncompleteError if there is no time for these; `what` is what does not fit then.
     """
     ordered = sorted(candidates, key=lambda candidate: candidate not in required)
-    for count, candidate in enumerate(ordered):
-        if count == len(required):
-            budget.require(what, REQUIRED)
-        if count >= len(required) and budget.spent_s > COMPILING * budget.seconds:
+    for candidate in ordered[: len(required)]:
+        render(candidate, 0, 1)
+    budget.require(what, REQUIRED)
+    for count, candidate in enumerate(ordered[len(required) :], len(required)):
+        if budget.spent_s > COMPILING * budget.seconds:
             return ordered[:count]
         render(candidate, 0, 1)
-    budget.require(what, REQUIRED if len(ordered) == len(required) else 1.0)
+    budget.require(what)
     return ordered
 
 

@@ -105,8 +105,8 @@ def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[fl
     same rare bright samples of it, and chance decides whether a short pilot has one. The shared noise of a pixel is the
     least (y_a − y_b)²/2 of all candidates. Where the worst 1 % of the pixels have more of it than all others together,
     the difference is subtracted from each candidate's error. At worst, where what is left out outweighs the rest, the
-    choice is slower by the ratio of the candidates' times. In later rounds of a pilot
-    the candidates are those still measured.
+    choice is slower by the ratio of the candidates' times. In later rounds of a pilot the candidates are those still
+    measured.
     """
     squares = [(((a.astype(np.float64) - b) * weights) ** 2 / 2).mean(axis=-1).ravel() for a, b in pairs]
     shared = np.sort(np.minimum.reduce(squares))

@@ -3,7 +3,7 @@
 They are the first that `photonfarm submit` plans by default, a view of each, on a small film. What cameras stand in and
 see is found by rays from many of them.
 
-Shape letters: N cameras, R rays of a camera's image, P points of the base cloud.
+Shape letters: N cameras, P points of the base cloud.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from photonfarm.core.pictures import Picture, display
 from photonfarm.core.records import F32, BasePointCloud
 from photonfarm.core.waiting import Steps, WorkLog
 from photonfarm.renderer.scene.arrays import floats, points
-from photonfarm.renderer.scene.gbuffer import reflects_here, sight_shares
+from photonfarm.renderer.scene.gbuffer import place_rays, reflects_here, sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import LEAVING, NONE
 from photonfarm.renderer.tools.measure import exposure
@@ -106,8 +106,9 @@ def examine_cameras(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Ca
 def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
     """The shares of images that show a surface between the near and the far plane, and a black back; (N,) each."""
     coarse = scene.spec.model_copy(update={"film": Film(width=RAYS_ALONG, height=RAYS_ALONG)})
-    rays = [_rays(coarse, view) for view in views]
-    origin, direction, reach = (np.concatenate(column) for column in zip(*rays, strict=True))
+    cameras = [Camera.of(view, coarse) for view in views]
+    rays = [place_rays(camera, camera.rays(), coarse) for camera in cameras]
+    origin, direction, reach, _ = (np.concatenate(column) for column in zip(*rays, strict=True))
     ray = mi.Ray3f(o=points(origin), d=mi.Vector3f(points(direction)))
     ray.maxt = floats(reach)
     si = scene.scene.ray_intersect(ray)
@@ -117,16 +118,6 @@ def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
     dr.eval(hit, dark)
     shares = [np.array(mask).reshape(len(views), -1).mean(axis=1, dtype=np.float32) for mask in (hit, dark)]
     return shares[0], shares[1]
-
-
-def _rays(coarse: SceneSpec, view: View) -> tuple[F32, F32, F32]:
-    """Origins (R, 3) at the near plane, directions (R, 3) and lengths (R,) of the rays of a view's image."""
-    camera = Camera.of(view, coarse)
-    direction = camera.rays().reshape(-1, 3)
-    along = direction @ camera.forward
-    near = coarse.view.near / along
-    origin = camera.origin + near[:, None] * direction
-    return origin.astype(np.float32), direction, (coarse.view.far / along - near).astype(np.float32)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -176,8 +167,7 @@ def _draw_views(spec: SceneSpec, number: int) -> tuple[Modification, list[View]]
     """A configuration, and its views; the first is that of the configuration's sample."""
     modification = sample_modification(spec, exposure.SEED, number)
     key = modification.key(spec.radiance_id)
-    first = (
-        0 if spec.groups else number
-    )  # a plan numbers each configuration's views from 0; without groups there is one configuration
+    # A plan numbers each configuration's views from 0, and a scene without groups has one configuration
+    first = 0 if spec.groups else number
     others = (COUNT + number * VIEWS + index for index in range(1, VIEWS))
     return modification, [sample_view(spec, key, exposure.SEED, index, modification) for index in (first, *others)]

@@ -140,7 +140,7 @@ def _open(file: Path) -> None:
 
 
 def _view(low: list[float], high: list[float]) -> list[list[float]]:
-    """From a corner of what is drawn to its middle; from beside it if it is flat."""
+    """The view from a corner of what is drawn to its middle; from beside it if it is flat."""
     middle = [(a + b) / 2 for a, b in zip(low, high, strict=True)]
     size = [b - a for a, b in zip(low, high, strict=True)]
     away = [0.45 * part if part > 1e-3 * max(size) else 0.9 * max(size) for part in size]

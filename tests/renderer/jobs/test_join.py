@@ -119,7 +119,7 @@ def test_workers_render_what_a_join_that_was_killed_had_planned(
     stores: tuple[SceneStore, SceneStore], tmp_path: Path, analytic: ModuleType
 ) -> None:
     class StopError(Exception):
-        """In place of a kill, after one job."""
+        """Stands for a kill, after one job."""
 
     def stop(_name: str, done: int, _total: int) -> None:
         if done == 1:

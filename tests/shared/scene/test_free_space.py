@@ -48,7 +48,7 @@ def origins(spec: SceneSpec, modification: Modification, count: int) -> np.ndarr
 
 
 def stands_in_the_open(points: np.ndarray, block: np.ndarray | None) -> np.ndarray:
-    """By hand: outside of the solid, and of the room that the object takes at `block`."""
+    """Whether it does, by hand: outside of the solid, and of the room that the object takes at `block`."""
     solid = (points[:, 0] < 1.5) & (points[:, 2] > 1)
     if block is None:
         return ~solid

@@ -86,7 +86,7 @@ def measured(filled: SceneStore, trained) -> Measured:
 
 @pytest.fixture(scope="session")
 def compared(measured: Measured) -> ReportContents:
-    """Of both runs and a denoiser against references, without times."""
+    """The comparison of both runs and a denoiser against references, without times."""
     runs, asked = [TrainedRun.load(run) for run in measured.runs], {"references": measured.references}
     with pytest.MonkeyPatch.context() as patch:  # the published network takes seconds for its features
         patch.setattr("photonfarm.trainer.compare.evaluate.load_inception", lambda *_: random_inception())
@@ -104,6 +104,6 @@ def reported(measured: Measured, compared: ReportContents, tmp_path_factory) -> 
 
 @pytest.fixture(scope="session")
 def contents(measured: Measured) -> ReportContents:
-    """Of one run, without references."""
+    """The contents of one run, without references."""
     first = [TrainedRun.load(measured.runs[0])]
     return gather_contents(measured.store, first, timed=False)

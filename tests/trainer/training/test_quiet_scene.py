@@ -79,7 +79,7 @@ class Trainer:
 
     @property
     def step(self) -> int:
-        """Of the checkpoint; 0 without one."""
+        """The step of the checkpoint; 0 without one."""
         with contextlib.suppress(StoreError):
             return int(checkpoint.load(self._run / CHECKPOINT)["step"])
         return 0

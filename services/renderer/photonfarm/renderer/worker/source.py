@@ -161,7 +161,7 @@ class ShareSource:
         return contextlib.nullcontext()
 
     def scenes_ahead(self) -> Mapping[str, str]:
-        """Of trainers nothing is known."""
+        """Nothing: without Redis no trainer is known."""
         return {}
 
     def take(self, paused: str | None, left: Mapping[str, str]) -> RenderArguments | None:

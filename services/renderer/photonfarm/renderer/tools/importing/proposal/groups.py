@@ -167,7 +167,7 @@ class _Search:
         return np.select([*cases.values()], [*cases], MOVES).astype(object)
 
     def _order(self, thing: Thing) -> tuple[float, int]:
-        """By volume, to three digits, so that things that are alike keep the file's order."""
+        """The order by volume, to three digits, so that things that are alike keep the file's order."""
         volume = np.maximum(thing.size, 0.02 * self.room.height).prod()
         return -float(f"{volume:.3g}"), int(self.pieces.shape[thing.pieces].min())
 

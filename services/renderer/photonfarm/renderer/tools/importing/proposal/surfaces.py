@@ -168,7 +168,7 @@ class Pieces:
         return number_components(np.column_stack([np.tile(piece, 2), cells]), len(among), among)
 
     def contacts(self, cell: float, group: Labels, above: float = -np.inf) -> Any:
-        """The cells `above` a height where groups (N,) meet, and where each is, counted: a sparse matrix (T + 1, T + 1).
+        """The number of cells `above` a height where groups (N,) meet, and where each is: sparse, (T + 1, T + 1).
 
         Its last row and column are those of the group −1.
         """

@@ -14,7 +14,7 @@ backend.load(threads=1)
 from photonfarm.renderer.strategy import measurement as measuring  # noqa: E402 - after the variant is set
 from photonfarm.renderer.strategy.candidates import GRID, PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
-from photonfarm.renderer.strategy.plan import TransportPlan, knows, lines, plan_of, plus_minus  # noqa: E402  # noqa: E402
+from photonfarm.renderer.strategy.plan import TransportPlan, has_measured, lines, plan_of, plus_minus  # noqa: E402  # noqa: E402
 from photonfarm.scene.spec import SceneSpec  # noqa: E402
 from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
 
@@ -99,7 +99,7 @@ def test_a_plan_that_is_written_asks_for_itself_and_for_no_measurement(seed: int
     again = plan_of(written, found, cached=True)
     assert (again.candidate, again.half_spp) == (first.candidate, first.half_spp)
     assert "transport" not in again.changes
-    assert knows(found, written)
+    assert has_measured(found, written)
     assert digest(written) == digest(first.spec)
 
 
@@ -142,7 +142,7 @@ def test_settings_of_which_no_sample_fits_into_the_present_cost_are_not_taken() 
 @pytest.mark.parametrize(("half_spp", "known"), [(1, True), (2, True), (9, True), (10, False), (256, False)])
 def test_a_measurement_holds_for_about_the_time_that_it_was_made_for(half_spp: int, known: bool) -> None:
     """It was made for 0.1 s: 9 samples of (1, 1) take 0.38 s."""
-    assert knows(measurement(), spec_with(half_spp=half_spp)) == known
+    assert has_measured(measurement(), spec_with(half_spp=half_spp)) == known
 
 
 def test_a_saving_is_a_ratio_of_times_to_equal_error() -> None:

@@ -38,8 +38,8 @@ def trace_photons(
 ) -> TracedPhotons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
-    ``power`` of a hit is what arrives there, before reflection, divided by the number of emitted paths (dead lights
-    emit none), so that sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
+    ``power`` of a hit is what arrives there, before reflection, divided by ``paths`` (those of dead lights
+    bring none), so that sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
     Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see ``lights.emission``) emit none.
 
     Nothing is compiled again for another seed, or for a scene that was edited in place. With a ``recorder`` of

@@ -59,7 +59,7 @@ log = logging.getLogger(__name__)
 SceneLoader = Callable[[SceneSpec], "LoadedScene"]
 
 OnProgress = Callable[[str, int, int], object]
-"""A callback with the phase of a job in words, how many of its parts are done, and how many there are; 0: no parts."""
+"""A callback with the phase of a job in words, how many of its parts are done, and how many it has, or 0."""
 
 
 def load_scene(spec: SceneSpec) -> LoadedScene:
@@ -221,7 +221,7 @@ def visibility_of(
 
 
 class _Rendering:
-    """One pass over a job's samples: each modification is applied once, and each new view's inputs rendered once."""
+    """One walk over a job's samples: each modification is applied once, and each new view's inputs rendered once."""
 
     def __init__(
         self,
@@ -253,11 +253,11 @@ class _Rendering:
             self._scene.apply(modification)
             is_new = modification_row in rows.new_modifications
             wants_photons = is_new or any(sample.view_row in new_views for sample in samples)
-            photons, thrown = (
+            photons, discarded = (
                 photons_of(self._scene, modification.key(self._spec.radiance_id)) if wants_photons else (None, 0)
             )
             if is_new:
-                self.redrawn += thrown
+                self.redrawn += discarded
                 if photons is not None:
                     self._out.photons(modification_row, photons)
             points = rebuild(self._cloud, modification)
@@ -286,8 +286,8 @@ class _Rendering:
                 self._out.radiance(sample.row, halves)
                 self.taken_over += 1
         estimates = halves_of(self._scene, [(sample.key, rows.views[sample.view_row]) for sample in left])
-        for sample, (halves, thrown) in zip(left, estimates, strict=True):
-            self.redrawn += thrown
+        for sample, (halves, discarded) in zip(left, estimates, strict=True):
+            self.redrawn += discarded
             self._out.radiance(sample.row, halves)
 
     def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:

@@ -10,9 +10,9 @@ BSDF at normal exitance, with its highlights (25 for a rough conductor). So it i
 diffuse reflection. It is exact for diffuse, plastic and roughplastic, and for twosided, bumpmap, normalmap and mask
 around them; for principled it is the base colour, whatever metallic and spec_trans are; blendbsdf blends, and a rough
 conductor in a blend adds its highlight. A texture is looked up without filtering. Two-sided materials return the
-reflectance of the visible side. From behind a one-sided one has albedo 0, as it renders black there. Mitsuba flags a
-BSDF as a whole: principled, mask, and blends with anything two-sided keep the albedo of their fronts, also where they
-render black.
+reflectance of the visible side. A one-sided material seen from behind has albedo 0, as it renders black there. Mitsuba
+flags a BSDF as a whole: principled, mask, and blends with anything two-sided keep the albedo of their fronts, also
+where they render black.
 
 **Normals** are interpolated shading normals in world coordinates, of unit length, as modelled: the back of a surface,
 two-sided or not, has the normal of its front. Bump and normal maps are part of the BSDF and not of the normals.

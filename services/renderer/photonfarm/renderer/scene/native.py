@@ -3,9 +3,9 @@
 Mitsuba has Embree build for scenes that never change: one hierarchy over all triangles, with spatial splits, 1 µs a
 triangle, at every edit. Embree's low quality, meant for dynamic scenes, makes one hierarchy per mesh and a small one
 above them: rebuilds are 4 to 6 times faster, whole edits of the room `room` take 14 instead of 29 ms, and images take
-0.9 to 1.02 times as long. Rays meet the same surfaces, except where two surfaces touch; and as guides are learned
-from such rays, whole images differ by their noise. So the quality cannot be configured: every worker sets it, as
-radiance must follow from keys alone.
+0.9 to 1.02 times as long. Rays meet the same surfaces, except where two surfaces touch; and as light paths learn from
+such rays where to start, whole images differ by their noise. So the quality cannot be configured: every worker sets it,
+as radiance must follow from keys alone.
 
 Embree's scene is found in the graph of a ray that is not yet traced, which names two addresses: Embree's entry point
 and the scene. Nothing is done unless the first is an address that libembree3 exports, so that the second must be the
@@ -53,7 +53,7 @@ def expect_changes(scene: Any) -> bool:
 
 
 def _open_embree() -> Any:
-    """The library libembree3 that Mitsuba has loaded, with the function needed; None if it is not loaded."""
+    """The library libembree3 that Mitsuba has loaded; None if it is not loaded, or lacks the function needed."""
     path = next(Path(mi.__file__).parent.glob("libembree3.so"), None) if mi.variant().startswith("llvm") else None
     library = path and ctypes.CDLL(str(path))
     return library if hasattr(library, _SET_QUALITY) else None

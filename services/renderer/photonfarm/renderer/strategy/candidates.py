@@ -79,7 +79,7 @@ Render: TypeAlias = Callable[[Candidate, int, int], F32]
 """(candidate, seed, samples per pixel) → one unbiased noisy image (H, W, 3) of one configuration and view."""
 
 
-def present(spec: SceneSpec) -> Candidate:
+def present_settings(spec: SceneSpec) -> Candidate:
     """The present settings of a spec."""
     t = spec.transport
     return Candidate(t.connections, t.light_ratio, t.guided_light, t.light_samples)

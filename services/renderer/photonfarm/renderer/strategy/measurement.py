@@ -32,7 +32,7 @@ from photonfarm.renderer.strategy.candidates import (
     ImageCost,
     MeasuredCandidate,
     Render,
-    present,
+    present_settings,
 )
 from photonfarm.renderer.strategy.content import LightReach, SceneContent, light_reach
 from photonfarm.renderer.strategy.noise import Purpose
@@ -147,7 +147,7 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
     The spec's settings are always among the measured ones. Raises SpecError and BackendError as loading does,
     IncompleteError, with the time that it takes, if the time is too short.
     """
-    budget, now, half_spp = Budget(seconds), present(spec), spec.transport.half_spp
+    budget, now, half_spp = Budget(seconds), present_settings(spec), spec.transport.half_spp
     with WorkLog(log) as work_log:
         work_log.begin(f"loading {spec.name}", budget.words)
         scene = PilotScene(spec, beside)

@@ -72,8 +72,8 @@ def training_weights(images: Sequence[F32], exposure: float) -> F32 | None:
     """e/√((e·b)² + 0.05) of a view, (H, W, 3), from images that serve no other purpose; None for a black view.
 
     Its square is the weight of a squared error in the trainer's relative loss, at the noise-free image. In expectation
-    the noise of targets adds to that loss their variance times this weight, and it adds to what is learned from n of
-    them the n-th part, as far as weights are alike where a network averages. The weight is the same in all channels,
+    the noise of a target adds its variance times this weight to the loss. A network that averages n targets of like
+    weights has an n-th of that in its result. The weight is the same in all channels,
     and its floor the same in all views, so that dark views count little.
     """
     if not np.any(images):
@@ -104,9 +104,9 @@ def pair_errors(pairs: Sequence[tuple[F32, F32]], weights: F32) -> tuple[list[fl
     Some light no technique finds well, such as a caustic seen in a mirror. With equal seeds all candidates have the
     same rare bright samples of it, and chance decides whether a short pilot has one. The shared noise of a pixel is the
     least (y_a − y_b)²/2 of all candidates. Where the worst 1 % of the pixels have more of it than all others together,
-    the difference is subtracted from each candidate's error. At worst, where what is left out outweighs the rest, the
-    choice is slower by the ratio of the candidates' times. In later rounds of a pilot the candidates are those still
-    measured.
+    what they have more, over the number of pixels, is subtracted from each candidate's error. At worst, where what is
+    left out outweighs the rest, the choice is slower by the ratio of the candidates' times. In later rounds of a pilot
+    the candidates are those still measured.
     """
     squares = [(((a.astype(np.float64) - b) * weights) ** 2 / 2).mean(axis=-1).ravel() for a, b in pairs]
     shared = np.sort(np.minimum.reduce(squares))

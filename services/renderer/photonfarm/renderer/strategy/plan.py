@@ -1,6 +1,8 @@
-"""The plan of a spec's light transport, with reasons: `photonfarm scene plan`.
+"""The transport settings that a spec should have, with reasons: `photonfarm scene plan`.
 
-For people it is told in sentences that claim no more than was shown.
+`measurement` says what each candidate costs and how much noise it leaves. Here the candidates are compared at the cost
+of the present settings, the significantly better ones are chosen, and sentences and tables tell people why. This plan
+has nothing to do with the plans of a store, which hold rows.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from photonfarm.renderer.strategy.candidates import (
     Saving,
     best,
     compare_at_cost,
-    present,
+    present_settings,
     saving,
 )
 from photonfarm.renderer.strategy.content import recommend_photons
@@ -32,10 +34,10 @@ from photonfarm.renderer.strategy.pilot import SUSPICIOUS
 from photonfarm.scene.spec import PhotonSpec, SceneSpec
 
 SIMILAR = 4.0
-"""The factor between times of half-estimates up to which a measurement still applies.
+"""The factor by which the time of a half-estimate may differ from the measured one, for the measurement to apply.
 
-An image has costs that do not grow with its samples, so the choice depends on half_spp. --write keeps the time of
-an image, up to that of one sample, so that the measurement still applies.
+An image has costs that do not grow with its samples, so the choice depends on half_spp. Settings that --write has put
+into the spec take about the same time, so their measurement is found again.
 """
 
 SpecTables = dict[str, dict[str, Any]]
@@ -50,7 +52,7 @@ class TransportPlan:
     measurement: Measurement
     cached: bool
     candidate: Candidate  # connections and light ratio
-    half_spp: int  # of about the cost of the spec's settings now
+    half_spp: int  # costs about what the spec's settings cost now
     photons: PhotonSpec
     photons_reason: str
     at_equal_cost: AtEqualCost  # all measured ones; empty if every view is black
@@ -75,7 +77,7 @@ class TransportPlan:
     @property
     def saving(self) -> Saving | None:
         """The saving over the spec's settings now; None if the plan keeps them, or nothing was measured."""
-        now = present(self.spec)
+        now = present_settings(self.spec)
         if self.candidate == now or not self.at_equal_cost:
             return None
         return saving(self.at_equal_cost[self.candidate], self.at_equal_cost[now])
@@ -97,9 +99,12 @@ class TransportPlan:
 def make_plan(
     spec: SceneSpec, beside: Path | None, purpose: Purpose, *, seconds: float, again: bool, log: Log
 ) -> TransportPlan:
-    """The plan of a spec for a purpose; a cached measurement of at least `seconds` is used, unless `again`."""
+    """The plan of a spec for a purpose; a cached measurement of at least `seconds` is used, unless `again`.
+
+    `beside` is the folder that the spec's files are relative to.
+    """
     kept = None if again else find(spec, purpose)
-    if kept is not None and kept.asked_s >= seconds and knows(kept, spec):
+    if kept is not None and kept.asked_s >= seconds and has_measured(kept, spec):
         return plan_of(spec, kept, cached=True)
     measurement = measure(spec, beside, purpose, seconds, log)
     try:
@@ -109,9 +114,9 @@ def make_plan(
     return plan_of(spec, measurement, cached=False)
 
 
-def knows(measurement: Measurement, spec: SceneSpec) -> bool:
+def has_measured(measurement: Measurement, spec: SceneSpec) -> bool:
     """Whether the spec's settings were measured, and at about their cost; if all is black, none need be."""
-    cost = measurement.costs.get(present(spec))
+    cost = measurement.costs.get(present_settings(spec))
     if cost is None:
         return not measurement.rows
     return 1 / SIMILAR <= cost.time_s(spec.transport.half_spp) / measurement.half_s <= SIMILAR
@@ -120,13 +125,13 @@ def knows(measurement: Measurement, spec: SceneSpec) -> bool:
 def plan_of(spec: SceneSpec, measurement: Measurement, *, cached: bool) -> TransportPlan:
     """The plan that follows from a measurement for a spec as it is now; its settings are among those measured.
 
-    It has the present settings, or others that are significantly better at the same cost. Rounding to a whole number of
-    samples changes the cost a little, and at the new cost another candidate may be better still. So the search goes on
-    until nothing is better, and a plan made for the result chooses it again. If the search comes back to earlier
-    settings, the present ones stay.
+    The plan has the present settings, or others that are significantly better at the same cost. Rounding to a whole
+    number of samples changes the cost a little, and at the new cost another candidate may be better still. So the
+    search goes on until nothing is better, and a plan made for the result chooses it again. If the search comes back to
+    earlier settings, the present ones stay.
     """
     photons = recommend_photons(spec.photons, measurement.reach, spec.transport.max_depth)
-    start = present(spec), spec.transport.half_spp
+    start = present_settings(spec), spec.transport.half_spp
     if not measurement.rows:
         return TransportPlan(spec, measurement, cached, PLAIN, spec.transport.half_spp, *photons, {})
     at_equal_cost, seen = _compare(measurement, *start), [start]
@@ -179,7 +184,7 @@ def lines(plan: TransportPlan) -> list[str]:
 
 
 def _verdict(plan: TransportPlan) -> str:
-    now = present(plan.spec)
+    now = present_settings(plan.spec)
     if not plan.at_equal_cost:
         return "nothing was measured: every view is black"
     if gain := plan.saving:
@@ -194,7 +199,11 @@ def _why(plan: TransportPlan, rows: Sequence[CandidateAtCost]) -> list[str]:
     """The reasons for the plan, and why it does not have the best measured settings, if it does not."""
     if not rows:
         return [BLACK]
-    chosen, now, half_spp = plan.at_equal_cost[plan.candidate], present(plan.spec), plan.spec.transport.half_spp
+    chosen, now, half_spp = (
+        plan.at_equal_cost[plan.candidate],
+        present_settings(plan.spec),
+        plan.spec.transport.half_spp,
+    )
     reasons = [*reasons_for(chosen, rows, plan.measurement.shared)]
     fastest = best(row for row in rows if row.fits)
     gain = saving(fastest, over=chosen)
@@ -240,7 +249,7 @@ def reasons_for(chosen: CandidateAtCost, rows: Sequence[CandidateAtCost], shared
 def plus_minus(value: float, spread: float | None) -> str:
     """A value and its standard error, "0.34 ± 0.02", to the same decimal place; the value alone without an error.
 
-    The place is that of the error's first digit, but tenths for errors of 1 to 10 and ones above.
+    The place is that of the error's first digit, but tenths for errors of 1 to 10, and whole numbers for larger ones.
     """
     if not spread:
         return f"{value:.3g}"
@@ -281,7 +290,7 @@ def legend(plan: TransportPlan) -> list[str]:
         meaning = "relMSE: relative mean squared error"
     return [
         f"{meaning}, of a half-estimate of half_spp samples per pixel, which takes the time that the spec's settings "
-        f"take now, {present(plan.spec)} at half_spp {plan.spec.transport.half_spp}",
+        f"take now, {present_settings(plan.spec)} at half_spp {plan.spec.transport.half_spp}",
         "error × time: relative to plain path tracing over the same views and seeds, ± one standard error; settings of "
         "fewer images were dropped early, and of those that are too costly the time does not pay for one sample",
     ]

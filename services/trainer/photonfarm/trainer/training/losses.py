@@ -3,9 +3,9 @@
 All losses are unbiased, and every change here must keep them so. Nothing may be clipped, compressed, or weighted by its
 own noise: each moves the minimum away from the clean image.
 
-The test averages a loss's gradient over noise of known mean. A network finds the clean image if that mean is zero
-there. If for any prediction it is also the gradient with the clean target, noise changes only the variance of a step
-[supplement 3.2, Lemma 1].
+The test averages a loss's gradient over noise of known mean. A network finds the clean image if the mean gradient is
+zero at that image. If for any prediction it is also the gradient with the clean target, noise changes only the variance
+of a step [supplement 3.2, Lemma 1].
 
 Shape letters: N draws of the noise, B batch, H W image.
 """
@@ -104,8 +104,8 @@ def _draw_noisy(clean: Tensor, generator: torch.Generator) -> Tensor:
 RELATIVE_EPSILON = 0.05
 """The ε of the relative loss, in squared exposed radiance: 0.22², where 0.5^2.2 ≈ 0.22 is the display's middle grey.
 
-Darker pixels count about as in the linear loss; with the white's 1 instead, the edges of lamps still outweighed the
-effect of their light on a room.
+Darker pixels count about as in the linear loss; with ε = 1, the square of white, the edges of lamps still outweighed
+the effect of their light on a room.
 """
 
 

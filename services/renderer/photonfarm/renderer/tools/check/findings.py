@@ -42,8 +42,9 @@ CUT_AT_ALL = 0.05
 
 
 _VIEWS = {"view.origin", "view.look_at", "view.far", "view.near", "view.fov_deg"}
+"""The keys of a spec that, where they are doubted, explain what cameras do not see."""
 _DARKNESS = {"transport.max_depth", "emitters", "scene"}
-"""Keys that, where they are doubted, explain what cameras do not see, and that it is dark."""
+"""Those that explain why pictures are dark."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,6 +150,7 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_trains_on_all_of_it_howeve
     """Neither store nor scene is there when training begins; it is killed three times while jobs are committed."""
     root, killed, scene_id = tmp_path / "store", tmp_path / "killed", analytic.spec.scene_id
     how = {"max_steps": 40, "replay_ratio": 2.0, "replay_buffer": 0, "poll_seconds": 0.02, "checkpoint_every": 3}
+    arrived = multiprocessing.Value("i", 0)  # samples that the run has trained with
 
     def grow() -> None:
         time.sleep(0.3)
@@ -159,12 +160,23 @@ def test_a_run_on_a_store_that_begins_empty_and_grows_trains_on_all_of_it_howeve
             scene.plan(Request(modifications=20, seed=seed), shard_rows=4)
         for job in range(scene.jobs()):
             commit(scene, job)
-            time.sleep(0.12)
+            end = time.monotonic() + 1.0  # for no run may be alive
+            while arrived.value < 4 * (job + 1) and time.monotonic() < end:
+                time.sleep(0.01)
+
+    def die_later(draws: int) -> Callable[[int, int], None]:
+        die_then = die_after(draws)
+
+        def count(drawn: int, samples: int) -> None:
+            arrived.value = samples
+            die_then(drawn, samples)
+
+        return count
 
     growing = threading.Thread(target=grow)
     growing.start()
     for step in sorted(random.Random(3).sample(range(5, 30), 3)):
-        last = {"on_draws": die_after(3 * step)}
+        last = {"on_draws": die_later(3 * step)}
         source = SceneReader(root, scene_id)
         assert ended_by(lambda s=source, k=last: train(s, tiny(**how), killed, Hooks(**k))) == -signal.SIGKILL
     growing.join()

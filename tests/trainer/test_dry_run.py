@@ -88,7 +88,7 @@ def test_memory_grows_with_pixels_batch_and_precision_and_the_state_is_five_time
 
 
 def test_the_time_of_a_whole_batch_is_that_of_the_timed_part_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dry_run, "SECONDS", 1e-6)
+    monkeypatch.setattr(dry_run, "TIMED_S", 1e-6)
     took = iter([5.0, 2.0, 9.0, 4.0, 3.0])  # first and second of one, whose time is not theirs, and three that count
     monkeypatch.setattr(dry_run, "_time_step", lambda *_: next(took))
     run = found(batch=8, max_steps=100)

@@ -88,12 +88,12 @@ def submit(
     from photonfarm.cli import show
     from photonfarm.farm import dry_run as dry
     from photonfarm.farm import submission
-    from photonfarm.farm.submission import hold_out_warning
+    from photonfarm.farm.hold_out_checks import find_hold_out_warning
     from photonfarm.scene.plausibility import warnings
     from photonfarm.scene.spec_loading import NamedSpec
 
     named = NamedSpec.load(spec)
-    for warning in filter(None, (*warnings(named), hold_out_warning(named.spec, store, request))):
+    for warning in filter(None, (*warnings(named), find_hold_out_warning(named.spec, store, request))):
         click.echo(f"warning: {warning}", err=True)
     result: submission.Submission
     if dry_run:

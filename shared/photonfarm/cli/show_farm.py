@@ -157,7 +157,7 @@ def print_document(farm: FarmProgress, store: str | Path) -> None:
         "queued": status.queued,
         "running": status.running,
         "workers": status.workers,
-        "left": status.left,
+        "left": status.skipped,
         "paused": status.paused,
         "doing": {name: asdict(activity) for name, activity in status.activities.items()},
         "failures": _list_failures(farm.queue.causes, store),

@@ -109,13 +109,14 @@ def slurm(
         click.echo("\n".join(scripts.values()), nl=False)
         return
     check_slurm()
-    from photonfarm.farm.submission import hold_out_warning, queue_missing, submit
+    from photonfarm.farm.hold_out_checks import find_hold_out_warning
+    from photonfarm.farm.submission import queue_missing, submit
     from photonfarm.scene.plausibility import warnings
     from photonfarm.store import Store
 
     planned = []
     for spec in named:
-        for warning in filter(None, (*warnings(spec), hold_out_warning(spec.spec, store, request))):
+        for warning in filter(None, (*warnings(spec), find_hold_out_warning(spec.spec, store, request))):
             click.echo(f"warning: {warning}", err=True)
         submission = submit(spec, store, None, request, retry=retry, shard_rows=shard_rows, workers=asked.workers)
         samples = format_count(submission.planned, "sample")

@@ -146,7 +146,7 @@ def _find_waits(farm: FarmProgress) -> Iterator[Wait]:
         if missing and not status.workers and farm.running is None:
             how = "none is alive; `photonfarm work` starts one, which also queues them"
             yield Wait("no_worker", missing, f"{missing} samples wait for a worker: {how}")
-        for scene_id, reasons in status.left.items():
+        for scene_id, reasons in status.skipped.items():
             if scene_id in names:
                 left = f"left by {len(reasons)} of {status.workers} workers: {next(iter(reasons.values()))}"
                 yield Wait("scene_left", 1, f"{names[scene_id]}: {left}")

@@ -17,10 +17,11 @@ from photonfarm.core.formatting import format_count
 from photonfarm.core.processes import command, free_port, tie
 from photonfarm.core.waiting import Log
 from photonfarm.farm.devices import CPU
+from photonfarm.farm.hold_out_checks import check_hold_out, choose_hold_out
 from photonfarm.farm.progress import FarmProgress
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.running_farm import WEB_PORT, announce
-from photonfarm.farm.submission import check_hold_out, choose_hold_out, submit, top_up
+from photonfarm.farm.submission import submit, top_up
 from photonfarm.farm.training import check_run, hold_out_of
 from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.hold_out import HOLD_OUT

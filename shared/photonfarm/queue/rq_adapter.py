@@ -1,7 +1,7 @@
 """All that we use of RQ, and the one module that imports it: its queue, jobs, executions, retries and failures.
 
-A worker of ours takes the place of RQ's: it renders instead of importing a function that Redis names, for one process
-keeps scenes loaded, and beats during a job, as RQ's SimpleWorker does not.
+Our workers replace RQ's: they call no function that Redis names, but render. A process keeps its scene loaded from job
+to job, as RQ's SimpleWorker would, and gives signs of life during a job, as that does not.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def take(
             continue
         if not queue.connection.lrem(queue.key, 1, name):  # another worker was faster
             continue
-        if (job := _job(queue, name)) is None:
+        if (job := _fetch_job(queue, name)) is None:
             continue
         with queue.connection.pipeline() as pipeline:
             execution = Execution.create(job, ttl_s, pipeline, worker)
@@ -79,8 +79,8 @@ def take(
     return None
 
 
-def _job(queue: Queue, name: str) -> Job | None:
-    """A job by its name; None if Redis has lost it, or it is not one of ours."""
+def _fetch_job(queue: Queue, name: str) -> Job | None:
+    """A job by its name; None if Redis has lost it, or it is not one of ours, which is logged."""
     try:
         job = Job.fetch(name, connection=queue.connection, serializer=JSONSerializer)
         if is_job_name(name) and job.func_name == FUNCTION:
@@ -104,7 +104,7 @@ def keep_alive(queue: Queue, execution: Execution, pipeline: Pipeline, ttl_s: in
 def finish(queue: Queue, execution: Execution) -> None:
     """End an execution whose job is done, of which nothing remains."""
     with queue.connection.pipeline() as pipeline:
-        execution.delete(_unread(queue, execution.job_id), pipeline)
+        execution.delete(_make_stub(queue, execution.job_id), pipeline)
         _forget(queue, execution.job_id, pipeline)
         pipeline.execute()
 
@@ -112,16 +112,16 @@ def finish(queue: Queue, execution: Execution) -> None:
 def fail(queue: Queue, execution: Execution, reason: str, *, counts: bool = True) -> bool:
     """End an execution whose job is not done: the job is queued again, at the end, or set aside after its last try.
 
-    Unless it `counts`, it is no try. Returns whether the job is set aside. Whoever calls first decides; a job that
-    Redis has lost is left to `reconcile`.
+    Unless the failure `counts`, the job has as many tries left as before. Returns whether this call has set it aside.
+    Of several calls for one execution only the first has an effect; a job that Redis has lost is left to `reconcile`.
     """
     if not queue.connection.zrem(queue.started_job_registry.key, execution.composite_key):
         return False
-    job, is_set_aside = _job(queue, execution.job_id), False
+    job, is_set_aside = _fetch_job(queue, execution.job_id), False
     with queue.connection.pipeline() as pipeline:
-        execution.delete(job or _unread(queue, execution.job_id), pipeline)
+        execution.delete(job or _make_stub(queue, execution.job_id), pipeline)
         if job is not None:
-            job.retries_left = (job.retries_left or 0) + (not counts)
+            job.retries_left = (job.retries_left or 0) + (not counts)  # RQ takes one off at each retry
             if job.should_retry:
                 job.retry(queue, pipeline)
             else:
@@ -170,12 +170,13 @@ def forget_failures(queue: Queue, scene_id: str = "") -> None:
 
 
 def _forget(queue: Queue, name: str, pipeline: Pipeline) -> None:
+    """Remove a job with its results, and from those that are set aside."""
     pipeline.zrem(queue.failed_job_registry.key, name)
     pipeline.delete(Job.key_for(name), Result.get_key(name))
 
 
-def _unread(queue: Queue, name: str) -> Job:
-    """A job of a name, whatever Redis holds of it."""
+def _make_stub(queue: Queue, name: str) -> Job:
+    """A job that is a name alone, which is all that ending an execution needs: Redis may have lost the rest."""
     job = Job(name, connection=queue.connection, serializer=JSONSerializer)
     job.origin = QUEUE
     return job
@@ -190,7 +191,7 @@ class QueueStatus:
     workers: int  # alive; those of this machine only if their process is
     failed: dict[str, Failure]  # those set aside, by job name
     paused: Mapping[str, str] = field(default_factory=dict)  # by worker: why it takes no jobs
-    left: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # by scene id and worker: why it skips it
+    skipped: Mapping[str, Mapping[str, str]] = field(default_factory=dict)  # by scene id and worker: why it skips it
     activities: Mapping[str, Activity] = field(default_factory=dict)  # by worker
 
 
@@ -198,16 +199,16 @@ def queue_status(connection: Redis) -> QueueStatus:
     """Jobs queued, running and failed, and workers; raises QueueError if Redis fails."""
     with redis_errors("asked for its status"):
         workers = read_workers(connection)
-        left: dict[str, dict[str, str]] = {}
+        skipped: dict[str, dict[str, str]] = {}
         for name, report in workers.items():
             for scene_id, reason in report.left.items():
-                left.setdefault(scene_id, {})[name] = reason
+                skipped.setdefault(scene_id, {})[name] = reason
         return QueueStatus(
             queued=connection.llen(QUEUE_KEY),
             running=sum(read_started(connection).values()),
             workers=len(workers),
             failed=read_failures(open_queue(connection)),
             paused={name: report.paused for name, report in workers.items() if report.paused},
-            left=left,
+            skipped=skipped,
             activities={name: report.doing for name, report in workers.items() if report.doing},
         )

@@ -33,8 +33,8 @@ def test_a_worker_leaves_a_scene_that_somebody_has_for_itself_until_it_is_free(
                 done = len(scene.committed_jobs())
                 analytic.wait_for(lambda: "takes no jobs of scene" in log.read_text(), 30)
                 if not share:
-                    analytic.wait_for(lambda: queue_status(connection).left)
-                    (reason,) = queue_status(connection).left[scene.scene_id].values()
+                    analytic.wait_for(lambda: queue_status(connection).skipped)
+                    (reason,) = queue_status(connection).skipped[scene.scene_id].values()
                     assert "store check --repair" in reason
                     jobs = open_queue(connection)
                     assert {jobs.fetch_job(name).retries_left for name in jobs.job_ids} == {TRIES - 1}

@@ -127,10 +127,10 @@ runpy.run_path(sys.argv[0], run_name="__main__")
         try:
             analytic.wait_for(lambda: len(new.committed_jobs()) == 2, 120)
             idle = lambda: queue_status(connection)  # noqa: E731
-            analytic.wait_for(lambda: idle().left.keys() == {ahead.scene_id, new.scene_id}, 60)
+            analytic.wait_for(lambda: idle().skipped.keys() == {ahead.scene_id, new.scene_id}, 60)
             report_consumed(connection, new.scene_id, 8)
             analytic.wait_for(lambda: not new.missing_jobs(), 60)
-            analytic.wait_for(lambda: idle().left.keys() == {ahead.scene_id}, 60)
+            analytic.wait_for(lambda: idle().skipped.keys() == {ahead.scene_id}, 60)
             status.callback(store.root, redis_server.url, as_json=False)
             assert len(ahead.committed_jobs()) == 3
             report_consumed(connection, ahead.scene_id, 6)
@@ -143,4 +143,4 @@ runpy.run_path(sys.argv[0], run_name="__main__")
     said = log.read_text()
     assert said.count(f"takes no jobs of scene {ahead.scene_id}: {reason}") == 1
     assert said.count(f"takes jobs of scene {ahead.scene_id} again") == 1
-    assert queue_status(connection).left == {}
+    assert queue_status(connection).skipped == {}

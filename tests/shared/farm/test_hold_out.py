@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from photonfarm.core.errors import SpecError
-from photonfarm.farm.submission import check_hold_out, choose_hold_out, submit
+from photonfarm.farm.hold_out_checks import check_hold_out, choose_hold_out
+from photonfarm.farm.submission import submit
 from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.scene.spec_loading import NamedSpec, load_spec

@@ -4,7 +4,7 @@ import pytest
 import store_samples as samples
 
 from photonfarm.farm import submission
-from photonfarm.farm.submission import rows_per_job, sample_seconds
+from photonfarm.farm.submission import choose_rows_per_job, estimate_sample_seconds
 from photonfarm.plan.request import SHARD_ROWS, Request
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
@@ -17,21 +17,21 @@ def spec_of(side: int, half_spp: int) -> SceneSpec:
 
 def test_thirty_two_costly_samples_give_every_worker_several_jobs() -> None:
     spec = spec_of(256, 64)
-    assert sample_seconds(spec) > submission.MOST_S
-    assert rows_per_job(spec, Request(modifications=32), workers=2) == 1
+    assert estimate_sample_seconds(spec) > submission.MOST_S
+    assert choose_rows_per_job(spec, Request(modifications=32), workers=2) == 1
 
 
 def test_jobs_of_a_large_plan_take_some_seconds() -> None:
     for side, half_spp in ((64, 4), (128, 8), (256, 16), (512, 64)):
         spec = spec_of(side, half_spp)
-        rows = rows_per_job(spec, Request(modifications=100_000), workers=8)
-        assert rows == 1 or rows * sample_seconds(spec) <= 1.5 * submission.MOST_S
-        assert rows in (1, SHARD_ROWS) or rows * sample_seconds(spec) >= submission.LEAST_S
+        rows = choose_rows_per_job(spec, Request(modifications=100_000), workers=8)
+        assert rows == 1 or rows * estimate_sample_seconds(spec) <= 1.5 * submission.MOST_S
+        assert rows in (1, SHARD_ROWS) or rows * estimate_sample_seconds(spec) >= submission.LEAST_S
 
 
 def test_a_configuration_is_not_split_over_jobs_if_one_holds_it() -> None:
     request = Request(modifications=1000, views_per_modification=3, passes=2)
-    assert rows_per_job(spec_of(64, 4), request, workers=2) % 6 == 0
+    assert choose_rows_per_job(spec_of(64, 4), request, workers=2) % 6 == 0
 
 
 def test_the_first_plan_fixes_the_size_and_a_later_one_asks_for_no_other(store: Store) -> None:

@@ -97,7 +97,7 @@ def test_workers_are_told_of_as_rq_does_for_a_time_and_again_after_redis_lost_th
         (worker,) = Worker.all(connection)
         assert (worker.name, worker.pid, worker.queue_names()) == ("a:b", os.getpid(), [QUEUE])
         status = queue_status(connection)
-        assert (status.workers, status.paused, status.left) == (
+        assert (status.workers, status.paused, status.skipped) == (
             1,
             {"a:b": "the disk is full"},
             {SCENE_ID: {"a:b": "no file"}},

@@ -33,12 +33,12 @@ from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import Learner, name_compile_errors
 
 METALS = 0.2
-"""The share of pixels whose specular albedo lets `guided_transport` sum light over their lobe."""
+"""The share of pixels with a specular albedo, over whose lobes `guided_transport` sums light; the others have none."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MadeUpScene:
-    """A cube of side 2 about the origin, seen from inside, whose points are as many as the spec's."""
+    """A cube of side 2 about the origin, seen from inside, with as many points as the spec's cloud."""
 
     spec: SceneSpec
     geometry: Geometry
@@ -49,6 +49,7 @@ class MadeUpScene:
         """The scene for a spec; always the same."""
         rng = np.random.default_rng(0)
         corners = np.array(list(product((-1.0, 1.0), repeat=3)), np.float32)
+        # Two opposite walls are enough: of the geometry, a network's frame has the bounding box and the area alone.
         faces = np.array([(0, 1, 3), (0, 3, 2), (4, 5, 7), (4, 7, 6)], np.uint32)
         geometry = Geometry(corners, faces, np.zeros(4, np.int32), np.array([STATIC], np.int16))
         axis, side = rng.integers(0, 3, spec.points), rng.choice([-1.0, 1.0], spec.points)
@@ -66,7 +67,7 @@ class MadeUpScene:
     def batch(self, size: int, settings: NetworkSettings) -> TrainingBatch:
         """A batch with all that the network reads: numbers uniform in [0, 1), flags of which half are set.
 
-        But cameras are within the cube, normals unit vectors, points and photons on its walls, and metals as usual.
+        But cameras are within the cube, points and photons on its walls, normals unit vectors, METALS of pixels metal.
         """
         spec, needs = self.spec, find_kind(settings.architecture).needs
         tensors = allocate_memory(SampleTensors(spec, needs.fields, points=settings.points), size)
@@ -81,7 +82,7 @@ class MadeUpScene:
             camera = Camera.of(View(origin - 0.5, target + 0.5), spec)
             inputs.world_to_camera[place] = torch.from_numpy(camera.world_to_camera)
         inputs.depth.add_(0.5)
-        _to_unit(inputs.normal)
+        _make_unit(inputs.normal)
         if inputs.points is not None:
             inputs.points.position[:] = _repeat_rows(self.cloud.position, inputs.points.position.shape[1])
             inputs.points.present.fill_(True)
@@ -93,12 +94,13 @@ class MadeUpScene:
             photons.present.fill_(True)
         if (guides := inputs.guides) is not None:
             guides.specular.mul_((torch.rand(guides.roughness.shape, generator=generator) < METALS)[..., None])
-            _to_unit(guides.mean_normal)
-            _to_unit(guides.beyond_normal)
+            _make_unit(guides.mean_normal)
+            _make_unit(guides.beyond_normal)
         return batch
 
 
-def _to_unit(vectors: Tensor) -> None:
+def _make_unit(vectors: Tensor) -> None:
+    """Turn vectors of numbers uniform in [0, 1) into unit vectors of all directions, in place."""
     vectors.sub_(0.5).div_(torch.linalg.vector_norm(vectors, dim=-1, keepdim=True))
 
 
@@ -126,7 +128,7 @@ class NetworkPart:
 
 
 def summarise(spec: SceneSpec, settings: NetworkSettings) -> list[NetworkPart]:
-    """The parts of a scene's network, which makes one image of a made-up sample for this.
+    """The parts of a scene's network, whose work is counted while it makes an image of a made-up sample.
 
     A multiply-add is two of the operations that torch's FlopCounterMode counts, which are those of convolutions and
     matrix products; sums, such as the mean over the points in a pixel, are not counted. Descriptors belong to points.
@@ -135,13 +137,14 @@ def summarise(spec: SceneSpec, settings: NetworkSettings) -> list[NetworkPart]:
     network = build(settings, scene.frame(settings), seed=0)
     with FlopCounterMode(display=False) as counter, torch.no_grad():
         network(scene.batch(1, settings).inputs)
-    counts = {name: sum(ops.values()) / 2e9 for name, ops in counter.get_flop_counts().items()}
+    gmacs_of = {module: sum(ops.values()) / 2e9 for module, ops in counter.get_flop_counts().items()}
     parameters, gmacs = dict.fromkeys(PARTS, 0), dict.fromkeys(PARTS, 0.0)
     for name, parameter in network.named_parameters():
         parameters[{**MODULES, "descriptor": "point branch"}.get(name.split(".")[0], OTHER)] += parameter.numel()
     for module, part in MODULES.items():
-        gmacs[part] += counts.get(f"{type(network).__name__}.{module}", 0.0)
-    gmacs[OTHER if parameters[OTHER] else "projection"] = counts["Global"] - sum(gmacs.values())
+        gmacs[part] += gmacs_of.get(f"{type(network).__name__}.{module}", 0.0)
+    # The rest is that of a user's own modules if there are any, and else of projection, which is no module.
+    gmacs[OTHER if parameters[OTHER] else "projection"] = gmacs_of["Global"] - sum(gmacs.values())
     return [NetworkPart(name, parameters[name], gmacs[name]) for name in PARTS if parameters[name] or gmacs[name]]
 
 
@@ -155,7 +158,7 @@ def format_summary(parts: list[NetworkPart]) -> str:
 # --------------------------------------------------------------------------------------------------------- the estimate
 
 TIMED_STEPS = 3
-SECONDS = 20.0
+TIMED_S = 20.0
 """The time that the timed steps may take together, about; where a whole batch takes longer, fewer samples are timed."""
 
 TIMED_BYTES = 2e9
@@ -180,7 +183,7 @@ class DryRun:
     state_bytes: int  # weights, gradients, the optimiser's memory, the average
     device: str
     timed_samples: int  # of each timed step
-    step_s: float  # of a whole batch: the median, over the timed samples times the batch
+    step_s: float  # of a whole batch: the timed steps' median, times `batch` / `timed_samples`
     peak_bytes: int | None  # torch's memory on a card at that; None on a CPU
 
     @property
@@ -205,22 +208,23 @@ class DryRun:
 
 
 def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
-    """The estimate for a scene and settings, from some seconds of steps on this machine; nothing is written.
+    """Estimate a training with a scene and settings by some seconds of steps on this machine; nothing is written.
 
     Raises SpecError for a device that is not there, and for a network that cannot be built or compiled.
     """
     torch.set_num_threads(settings.threads)
     scene, network, device = MadeUpScene.of(spec), settings.network, usable_device(settings.device)
     frame = scene.frame(network)
+    one_sample = scene.batch(1, network)
+    # Work is counted operation by operation as torch runs them, and a compiled network is one operation.
     learner = Learner(frame, settings.model_copy(update={"compile": "off"}), Ranks())
-    one = scene.batch(1, network)
-    flops, activations = count_work(learner, one)
-    state = count_state_bytes(learner)
+    flops, activation_bytes = count_work(learner, one_sample)
+    state_bytes = count_state_bytes(learner)
     if settings.compile != "off":
         learner = Learner(frame, settings, Ranks())
-    most = settings.batch if device.type == "cuda" else int(TIMED_BYTES / activations)
+    most = settings.batch if device.type == "cuda" else int(TIMED_BYTES / activation_bytes)
     with name_compile_errors(settings.compile):
-        samples, step_s, peak_bytes = time_steps(learner, scene, settings, device, most)
+        timed_samples, step_s, peak_bytes = time_steps(learner, scene, settings, device, most)
     return DryRun(
         scene=spec.name,
         architecture=network.architecture,
@@ -231,18 +235,18 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
         batch=settings.batch,
         steps=settings.max_steps,
         sample_flops=flops,
-        activation_bytes=activations,
-        sample_bytes=count_bytes(one),
-        state_bytes=state,
+        activation_bytes=activation_bytes,
+        sample_bytes=count_bytes(one_sample),
+        state_bytes=state_bytes,
         device=describe_device(device, network.precision),
-        timed_samples=samples,
+        timed_samples=timed_samples,
         step_s=step_s,
         peak_bytes=peak_bytes,
     )
 
 
-def count_work(learner: Learner, one: TrainingBatch) -> tuple[int, int]:
-    """The operations of a step on one sample, and the bytes kept from forward to backward, counted while it is taken.
+def count_work(learner: Learner, one_sample: TrainingBatch) -> tuple[int, int]:
+    """Take a step on one sample, and count its operations and the bytes that it keeps from forward to backward.
 
     What has the shape of weights, such as their copies in bfloat16, is there once a batch, and is left out.
     """
@@ -256,7 +260,7 @@ def count_work(learner: Learner, one: TrainingBatch) -> tuple[int, int]:
         return tensor
 
     with saved_tensors_hooks(note, lambda tensor: tensor), FlopCounterMode(display=False) as counter:
-        learner.step(0, one)
+        learner.step(0, one_sample)
     return counter.get_total_flops(), sum(kept.values())
 
 
@@ -272,22 +276,23 @@ def count_state_bytes(learner: Learner) -> int:
 def time_steps(
     learner: Learner, scene: MadeUpScene, settings: TrainSettings, device: torch.device, most: int
 ) -> tuple[int, float, int | None]:
-    """Take a few steps, of the whole batch if that takes no more than `SECONDS` and has no more than `most` samples.
+    """Take a few steps, of the whole batch if that takes no more than `TIMED_S` and has no more than `most` samples.
 
     Returns the samples of each, the seconds of a step of the whole batch, and the memory on a card.
     """
-    one = scene.batch(1, settings.network)
-    first = _time_step(learner, one, device)  # kernels are made and memory is taken
-    single = _time_step(learner, one, device) if first * (TIMED_STEPS + 2) < SECONDS else first
-    samples = max(1, min(settings.batch, int(SECONDS / (TIMED_STEPS + 1) / single), most))
+    one_sample = scene.batch(1, settings.network)
+    first_s = _time_step(learner, one_sample, device)  # with the making of kernels and the taking of memory
+    # again without these, if the steps that follow are then quick enough: this, one that warms up, and the timed ones
+    sample_s = _time_step(learner, one_sample, device) if first_s * (TIMED_STEPS + 2) < TIMED_S else first_s
+    samples = max(1, min(settings.batch, int(TIMED_S / (TIMED_STEPS + 1) / sample_s), most))
     batch = scene.batch(samples, settings.network)
-    _time_step(learner, batch, device)
+    _time_step(learner, batch, device)  # the warm-up for this size of batch
     on_card = device.type == "cuda"
     if on_card:
         torch.cuda.reset_peak_memory_stats(device)
     step_s = statistics.median(_time_step(learner, batch, device) for _ in range(TIMED_STEPS))
-    peak = torch.cuda.max_memory_allocated(device) if on_card else None
-    return samples, step_s * settings.batch / samples, peak
+    peak_bytes = torch.cuda.max_memory_allocated(device) if on_card else None
+    return samples, step_s * settings.batch / samples, peak_bytes
 
 
 def _time_step(learner: Learner, batch: TrainingBatch, device: torch.device) -> float:

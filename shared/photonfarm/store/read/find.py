@@ -53,11 +53,12 @@ class Query:
         """The query of the command line's options; raises SpecError for text that is neither key nor vector."""
         if sample is not None and not _KEY.fullmatch(sample):
             raise SpecError(f"--sample {sample!r}: a key of 32 hexadecimal digits is required")
-        vectors = _vector_or_key("--modification", modification, 4), _vector_or_key("--view", view, 6)
-        return cls(*vectors, None if sample is None else bytes.fromhex(sample), **others)
+        wanted = _parse_key_or_vector("--modification", modification, 4), _parse_key_or_vector("--view", view, 6)
+        return cls(*wanted, None if sample is None else bytes.fromhex(sample), **others)
 
 
-def _vector_or_key(option: str, text: str | None, multiple: int) -> F32 | Key | None:
+def _parse_key_or_vector(option: str, text: str | None, multiple: int) -> F32 | Key | None:
+    """A content key in hexadecimal digits, or a vector: six numbers of a view, a multiple of four of a modification."""
     if text is None:
         return None
     if _KEY.fullmatch(text.strip()):
@@ -109,9 +110,9 @@ def scene_or_spec(store: Store, named: str) -> SceneStore:
     Raises StoreError, which names the scenes that are there and how one of the spec's name differs from it, and
     SpecError for a file that is no spec.
     """
-    return store.scene(
-        check_scene(store, named, load_spec(named)) if is_spec_file(named) else scene_named(store, named)
-    )
+    if is_spec_file(named):
+        return store.scene(_find_scene_of_spec(store, load_spec(named), named))
+    return store.scene(scene_named(store, named))
 
 
 def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit: int = 20) -> Matches:
@@ -144,7 +145,7 @@ class Place:
     file: str  # its name in the store
     chunk: int  # the inner chunk of that shard
     index: int  # along the first axis of the plan's array
-    there: bool
+    there: bool  # whether it is written yet
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,9 +189,10 @@ class SceneMatch:
         self.nearest: float | None = None  # distance of the nearest, even if too far
         self.rows, self.distance = np.zeros(0, np.int64), np.zeros(0)
         if self._plans:
-            self._look(query)
+            self._search(query)
 
-    def _look(self, query: Query) -> None:
+    def _search(self, query: Query) -> None:
+        """Set `rows`, `distance` and `nearest`. Distances are computed once per modification and per view."""
         inputs = plans.content(self._plans)
         modification, view = inputs.column("sample_modification"), inputs.column("sample_view")
         rows = np.flatnonzero(modification != UNUSED)
@@ -205,28 +207,29 @@ class SceneMatch:
         if query.modification is not None and len(rows):
             distinct, place = np.unique(modification[rows], return_inverse=True)
             vectors = inputs.vectors("modification", distinct)
-            distance = self._from_modifications(vectors, query.modification)[place]
+            distance = self._modification_distances(vectors, query.modification)[place]
         if query.view is not None and len(rows):
             _, first, place = np.unique(view[rows], return_index=True, return_inverse=True)
-            seen = rows[first]  # a sample of each view
-            vectors = inputs.vectors("view", view[seen])
+            one_each = rows[first]  # one sample of each view
+            vectors = inputs.vectors("view", view[one_each])
             if isinstance(query.view, bytes):
-                of_view = inputs.vectors("modification", modification[seen])
-                keys = view_keys(modification_keys(self._scene.spec.radiance_id, of_view), vectors)
-                apart = _unless_equal(keys, query.view)
+                modifications = inputs.vectors("modification", modification[one_each])
+                keys = view_keys(modification_keys(self._scene.spec.radiance_id, modifications), vectors)
+                of_views = _key_distances(keys, query.view)
             else:  # the larger of the distances of position and look-at point
-                apart = np.linalg.norm((vectors - query.view.astype(np.float64)).reshape(-1, 2, 3), axis=-1).max(axis=1)
-            distance = np.maximum(distance, apart[place])
+                offsets = (vectors - query.view.astype(np.float64)).reshape(-1, 2, 3)
+                of_views = np.linalg.norm(offsets, axis=-1).max(axis=1)
+            distance = np.maximum(distance, of_views[place])
         if np.isfinite(distance).any():
             self.nearest = float(distance.min())
         fits = distance <= query.tolerance
         order = np.argsort(distance[fits], kind="stable")
         self.rows, self.distance = rows[fits][order], distance[fits][order]
 
-    def _from_modifications(self, vectors: F32, wanted: F32 | Key) -> F64:
-        """The distances of modifications, (N, G, 4), from the wanted one; infinite if other groups are present."""
+    def _modification_distances(self, vectors: F32, wanted: F32 | Key) -> F64:
+        """How far the farthest group of each, (N, G, 4), is from its wanted place; infinite if others are present."""
         if isinstance(wanted, bytes):
-            return _unless_equal(modification_keys(self._scene.spec.radiance_id, vectors), wanted)
+            return _key_distances(modification_keys(self._scene.spec.radiance_id, vectors), wanted)
         if wanted.size != vectors[0].size:
             return np.full(len(vectors), np.inf)
         target = wanted.reshape(vectors.shape[1:])
@@ -264,10 +267,11 @@ class SceneMatch:
             plan=plan.number,
             jobs=jobs,
             committed=tuple(job in self._committed for job in jobs),
-            places=tuple(self._places(rows)),
+            places=tuple(self._list_places(rows)),
         )
 
-    def _places(self, rows: dict[str, int]) -> list[Place]:
+    def _list_places(self, rows: dict[str, int]) -> list[Place]:
+        """Where each array has this sample, given its rows by kind; of radiance, only the array that has it."""
         places = []
         for name, array in schema.output_arrays(self._scene.spec).items():
             row = rows[array.kind]
@@ -275,13 +279,14 @@ class SceneMatch:
             job, chunk = divmod(row, plan.shard_rows)
             file = plan.shard(name, array, job)
             there = self._is_there(file, array, chunk, plan.shard_rows)
-            if there or name != "radiance_wide":  # few samples need that one
+            if there or name != "radiance_wide":  # which has only what float16 cannot hold
                 places.append(Place(name, file, chunk, row - plan.first_row, there))
-        if any(place.array == "radiance_wide" for place in places):  # and those have nothing in `radiance`
+        if any(place.array == "radiance_wide" for place in places):  # and then `radiance` has nothing
             places = [place for place in places if place.array != "radiance" or place.there]
         return places
 
     def _is_there(self, file: str, array: schema.ArraySchema, chunk: int, shard_rows: int) -> bool:
+        """Whether a shard has a chunk; a damaged one has none."""
         storage = self._scene.storage
         try:
             return storage.exists(file) and look_into(
@@ -291,16 +296,17 @@ class SceneMatch:
             return False
 
 
-def _unless_equal(keys: Sequence[Key], wanted: Key) -> F64:
+def _key_distances(keys: Sequence[Key], wanted: Key) -> F64:
+    """Distances of keys, as those of vectors: 0 of an equal key, and infinite of any other, (N,)."""
     return np.where([key == wanted for key in keys], 0.0, np.inf)
 
 
-FEW = 4
-"""Up to so many differing keys are named."""
+MOST_DIFFERENCES = 4
+"""The largest number of differing keys that a message names."""
 
 
-def check_scene(store: Store, name: str, spec: SceneSpec) -> str:
-    """The id of a spec's scene, which the store holds; StoreError if it does not. `name` is the spec's for its user."""
+def _find_scene_of_spec(store: Store, spec: SceneSpec, name: str) -> str:
+    """The id of a spec's scene; StoreError if the store does not have it. `name` is what the user calls the spec."""
     if not store.has_scene(spec.scene_id):
         where = store.storage.where
         raise StoreError(f"{where}: holds no samples of {name} (scene {spec.scene_id}); {describe_scenes(store, spec)}")
@@ -309,43 +315,43 @@ def check_scene(store: Store, name: str, spec: SceneSpec) -> str:
 
 def describe_scenes(store: Store, spec: SceneSpec) -> str:
     """The scenes that a store has, in words, and where one of the spec's name differs from it."""
-    alike = _alike(store, spec)
-    if not alike:
+    namesakes = _list_namesakes(store, spec)
+    if not namesakes:
         return list_scenes(store.storage)
-    more = f"; {len(alike) - 1} more have this name" if alike[1:] else ""
-    differ = describe_differences(alike[0].spec, spec)
-    return f"scene {alike[0].scene_id} of this name is there and differs in {differ}{more}"
+    more = f"; {len(namesakes) - 1} more have this name" if namesakes[1:] else ""
+    differences = describe_differences(namesakes[0].spec, spec)
+    return f"scene {namesakes[0].scene_id} of this name is there and differs in {differences}{more}"
 
 
 def note_first_plan(store: Store, spec: SceneSpec) -> str | None:
     """What to say of a scene's first plan where the store has another scene of this name; None where it has none."""
-    for nearest in _alike(store, spec):
-        differ = describe_differences(nearest.spec, spec)
-        return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {describe_samples(nearest)}"
-    return None
+    if not (namesakes := _list_namesakes(store, spec)):
+        return None
+    nearest, differ = namesakes[0], describe_differences(namesakes[0].spec, spec)
+    return f"scene {nearest.scene_id} of this name is another one, as {differ} differ: {describe_samples(nearest)}"
 
 
 def find_same_radiance(store: Store, spec: SceneSpec) -> str | None:
-    """The id of the other scene that has most complete samples of the same radiance id; None without one."""
+    """The id of that other scene of the spec's radiance id with the most complete samples; None if none has any."""
 
-    def complete(scene: SceneStore) -> int:
-        alike = scene.spec.radiance_id == spec.radiance_id and scene.scene_id != spec.scene_id
-        return scene.progress().committed_samples if alike else 0
+    def count_usable(scene: SceneStore) -> int:
+        is_usable = scene.spec.radiance_id == spec.radiance_id and scene.scene_id != spec.scene_id
+        return scene.progress().committed_samples if is_usable else 0
 
-    counted, _ = store.each(complete)
-    best = max(counted, key=lambda scene_id: counted[scene_id], default=None)
-    return best if best and counted[best] else None
+    usable, _ = store.each(count_usable)
+    most = max(usable, key=lambda scene_id: usable[scene_id], default=None)
+    return most if most and usable[most] else None
 
 
 def tell_apart(store: Store, scene_ids: Sequence[str]) -> str:
     """Scenes of one name in words: how many samples each has, and how it differs from the first."""
     first, *others = [store.scene(each) for each in scene_ids]
-    said = [f"{first.scene_id} ({describe_samples(first)})"]
-    said += [
+    described = [f"{first.scene_id} ({describe_samples(first)})"]
+    described += [
         f"{each.scene_id} ({describe_samples(each)}; {describe_differences(first.spec, each.spec)} differ)"
         for each in others
     ]
-    return ", ".join(said)
+    return ", ".join(described)
 
 
 def describe_samples(scene: SceneStore) -> str:
@@ -359,22 +365,25 @@ def describe_samples(scene: SceneStore) -> str:
 
 def describe_differences(there: SceneSpec, here: SceneSpec) -> str:
     """Where two specs differ in what ids cover, in words."""
-    said = [
-        "the scene's files" if key == "content" else f"{key} ({_say(a)} in the store, {_say(b)} asked for)"
-        for key, (a, b) in differing(there.identity(), here.identity()).items()
+    described = [
+        "the scene's files"
+        if key == "content"
+        else f"{key} ({_describe(old)} in the store, {_describe(new)} asked for)"
+        for key, (old, new) in differing(there.identity(), here.identity()).items()
     ]
-    return ", ".join(said[:FEW]) + (f" and {len(said) - FEW} more" if said[FEW:] else "")
+    more = len(described) - MOST_DIFFERENCES
+    return ", ".join(described[:MOST_DIFFERENCES]) + (f" and {more} more" if more > 0 else "")
 
 
-def _alike(store: Store, spec: SceneSpec) -> list[SceneStore]:
+def _list_namesakes(store: Store, spec: SceneSpec) -> list[SceneStore]:
     """The other scenes of a spec's name; the one that differs least from it is the first."""
-    there, _ = store.each(lambda scene: scene)
-    alike = [each for each in there.values() if each.spec.name == spec.name and each.scene_id != spec.scene_id]
-    return sorted(alike, key=lambda each: len(differing(each.spec.identity(), spec.identity())))
+    scenes, _ = store.each(lambda scene: scene)
+    namesakes = [each for each in scenes.values() if each.spec.name == spec.name and each.scene_id != spec.scene_id]
+    return sorted(namesakes, key=lambda each: len(differing(each.spec.identity(), spec.identity())))
 
 
-def _say(value: object) -> str:
+def _describe(value: object) -> str:
     if value is None:
-        return "not"
+        return "not"  # as in "not in the store"
     text = f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 40 else f"{text[:39]}…"

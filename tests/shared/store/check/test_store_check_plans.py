@@ -12,7 +12,8 @@ import pytest
 
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.farm.dry_run import rehearse
-from photonfarm.farm.submission import check_hold_out, submit
+from photonfarm.farm.hold_out_checks import check_hold_out
+from photonfarm.farm.submission import submit
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import TopUp
 from photonfarm.scene.spec_loading import NamedSpec

@@ -108,8 +108,8 @@ class Network(nn.Module):
 
     centre: Tensor
 
-    def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0, share: int = 1) -> None:
-        """Take `further` channels beside the image-space ones; the U-Net has the `share`-th part of the set width."""
+    def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0, narrower: int = 1) -> None:
+        """Take `further` channels beside the image-space ones; the U-Net is so many times `narrower` than set."""
         super().__init__()
         self.optics = frame.optics
         self.scale = frame.scale
@@ -117,7 +117,7 @@ class Network(nn.Module):
         self.coordinate_count = 3 + 6 * settings.octaves
         self.demodulation = settings.demodulation
         self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
-        width = max(settings.width // share, 1)
+        width = max(settings.width // narrower, 1)
         self.image_synthesis = ImageSynthesisLayer(further + IMAGE_CHANNELS, width, settings.precision)
 
     def forward(self, inputs: Inputs) -> Tensor:

@@ -1,12 +1,12 @@
 """The networks of the paper: light transport without and with photons, and the baselines [supplement 1, 4].
 
 Points → light transport → projection → image synthesis. The Light Transport Layer is two PointNet blocks over the
-scene's point cloud [supplement 1.1, Fig. 1]. The figure concatenates each point's features with the maximum over all
-points. Here the two halves stay apart, one row per point and one per cloud, until the end: W [l, g] = W_l l + W_g g is
-the same function at about half the work.
+scene's point cloud [supplement 1.1, Fig. 1]. The figure concatenates each point's features l with the maximum g over
+all points. Here the two stay apart until the end: W [l, g] = W_l l + W_g g, and W_g g is computed once per cloud, not
+once per point. It is the same function at about half the work.
 
-Of the baselines, `cnn` has no inputs but the image-space buffers, `denoise(1/k)` has part of a rendered image, and
-`feature_projection` has its scene's points.
+Of the baselines, `cnn` has no inputs but the image-space buffers, `denoise(1/k)` also has one of k pixels of a noisy
+image, and `feature_projection` has its scene's points.
 
 Shape letters: B batch, P points, K photon slots, F features of a point, L features of each point, G features of the
 cloud, H W image.
@@ -45,10 +45,11 @@ class Cnn(Network):
     """Image synthesis from the image-space channels alone [supplement Table 1, "CNN only"]."""
 
 
-SHARE = 2
-"""The divisor of a light U-Net's width: half as wide, it has about a quarter of the work.
+NARROWER = 2
+"""How many times narrower the denoiser's U-Net is than the others': half as wide, it has about a quarter of the work.
 
-Published times fit 1.50 s / k + 0.005 s, where the full U-Net takes 0.019 s [method 2, 4].
+This is inferred: the paper's times of `denoise(1/k)` fit 1.50 s / k for rendering + 0.005 s, where the full U-Net takes
+0.019 s [method 2, 4].
 """
 
 
@@ -60,7 +61,7 @@ class Denoiser(Network):
     """
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        super().__init__(settings, frame, further=3 + 1, share=SHARE)
+        super().__init__(settings, frame, further=3 + 1, narrower=NARROWER)
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """The noisy colour, zero where not kept, and the mask, (B, H, W, 3) and (B, H, W, 1)."""
@@ -94,14 +95,14 @@ class ResidualBlock(nn.Module):
 
     def forward(self, local: Tensor, shared: Tensor) -> Tensor:
         """(B, P, L) and (B, G) with L + G = 64 → (B, P, 32)."""
-        hidden = _make_linear(self.hidden, torch.relu(local), torch.relu(shared))
-        return _make_linear(self.shortcut, local, shared) + self.out(torch.relu(hidden))
+        hidden = _apply_split(self.hidden, torch.relu(local), torch.relu(shared))
+        return _apply_split(self.shortcut, local, shared) + self.out(torch.relu(hidden))
 
 
-def _make_linear(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
-    """Apply `layer` to each point's [local, shared], without building it."""
-    own, common = torch.split(layer.weight, [local.shape[-1], shared.shape[-1]], dim=1)
-    return functional.linear(local, own) + functional.linear(shared, common, layer.bias)[:, None]
+def _apply_split(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
+    """Apply `layer` to [local, shared] of each point, (B, P, L) and (B, G), without concatenating the two."""
+    local_weight, shared_weight = torch.split(layer.weight, [local.shape[-1], shared.shape[-1]], dim=1)
+    return functional.linear(local, local_weight) + functional.linear(shared, shared_weight, layer.bias)[:, None]
 
 
 def masked_max(x: Tensor, present: Tensor) -> Tensor:
@@ -111,7 +112,7 @@ def masked_max(x: Tensor, present: Tensor) -> Tensor:
 
 
 class LightTransportLayer(nn.Module):
-    """Features of each point that depend on the whole scene; the output is that of the second block.
+    """Features of each point that depend on the whole scene: the second block's own, and their maximum over points.
 
     Ours where the figure gives no details: weights start with variance 1 / inputs [LeCun et al. 1998], so that features
     of size 1 stay so. By torch's default, a third of that, they would enter the U-Net far below its other channels.
@@ -123,25 +124,24 @@ class LightTransportLayer(nn.Module):
         nn.init.kaiming_uniform_(self.preprocess.weight, nonlinearity="linear")
         self.blocks = nn.ModuleList([ResidualBlock(), ResidualBlock()])
 
-    def forward(self, varying: Tensor, fixed: Tensor, present: Tensor, reference: Tensor | None = None) -> Tensor:
+    def forward(self, varying: Tensor, fixed: Tensor, present: Tensor, base_cloud: Tensor | None = None) -> Tensor:
         """p_i and present (B, P) → f_i (B, P, 64).
 
-        p_i comes in two parts: values that differ between samples (B, P, F), and constants (P, F′). With a reference, a
-        cloud (P, F) of which all points are present, its maxima are subtracted, which is ours: the effect of a moved
-        lamp on them is small beside what all configurations have in common, and would be lost in the optimiser's
-        changes to that.
+        p_i comes in two parts: values that differ between samples (B, P, F), and constants (P, F′). The maxima of the
+        `base_cloud` (P, F), if given, are subtracted, which is ours: a moved lamp's effect on maxima is small beside
+        what all configurations have in common, and would be lost in the optimiser's changes to that.
         """
         samples = len(varying)
-        if reference is not None:
-            varying = torch.cat([varying, reference[None]])
+        if base_cloud is not None:  # one more sample, the last, with all points present
+            varying = torch.cat([varying, base_cloud[None]])
             present = torch.cat([present, present.new_ones(1, present.shape[1])])
-        own, common = torch.split(self.preprocess.weight, [varying.shape[-1], fixed.shape[-1]], dim=1)
-        local = functional.linear(varying, own) + functional.linear(fixed, common, self.preprocess.bias)
-        shared = local.new_zeros(len(local), 0)
+        w_varying, w_fixed = torch.split(self.preprocess.weight, [varying.shape[-1], fixed.shape[-1]], dim=1)
+        local = functional.linear(varying, w_varying) + functional.linear(fixed, w_fixed, self.preprocess.bias)
+        shared = local.new_zeros(len(local), 0)  # nothing yet, before the first block
         for block in self.blocks:
             local = block(local, shared)
             shared = masked_max(local, present)
-            if reference is not None:
+            if base_cloud is not None:
                 shared = torch.where(present.any(dim=1, keepdim=True), shared - shared[-1:], 0)
         local, shared = local[:samples], shared[:samples]
         return torch.cat([local, shared[:, None].expand_as(local)], dim=-1)
@@ -170,19 +170,19 @@ class LightTransport(Network):
     def point_features(self, points: PointInputs) -> Tensor:
         """f_i (B, P, 64) from p_i: current world position, then normal, albedo, emission and learnable descriptor."""
         fixed = torch.cat([self.appearance, self.descriptor], dim=1)
-        reference = self.coordinates(self.base) if self.relative else None
-        return self.light_transport(self.coordinates(points.position), fixed, points.present, reference)
+        base_cloud = self.coordinates(self.base) if self.relative else None
+        return self.light_transport(self.coordinates(points.position), fixed, points.present, base_cloud)
 
 
 class LightTransportPhotons(LightTransport):
     """The supplement's network with photons of the current configuration, "Ours (w/ photons)"; the design is ours.
 
-    Its inputs include the light gathered from them in windows of the image; and that of the widest window, times
+    Its inputs include the light that photons bring to windows of the image; and that of the widest window, times
     albedo, is the image that its output is added to. No input depends on the number of photons except by its noise.
     """
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        photon_light = PhotonLight(frame, settings.architecture)
+        photon_light = PhotonLight(frame, settings.architecture)  # first, as it refuses a scene without photons
         super().__init__(settings, frame, further=WIDTH + 3 * len(WINDOWS))
         self.photon_light = photon_light
 

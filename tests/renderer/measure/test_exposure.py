@@ -33,15 +33,15 @@ def pictures(values: np.ndarray, noise: float = 0.0) -> Pictures:
 @pytest.mark.parametrize(("radiance", "target"), [(1e-6, 0.1), (3e5, 0.95)])
 def test_pictures_of_one_radiance_get_the_exposure_of_the_formula(radiance: float, target: float) -> None:
     """(e · r)^(1/2.2) = t for e = t^2.2 / r."""
-    found = pictures(np.full((2, 8, 8, 3), radiance)).exposure(target)
+    found = pictures(np.full((2, 8, 8, 3), radiance)).find_exposure(target)
     assert found == pytest.approx(target**2.2 / radiance, rel=2e-4)
 
 
 def test_where_half_of_the_pixels_are_black_half_is_the_most() -> None:
     images = np.zeros((2, 8, 8, 3))
     images[:, :4] = 1
-    assert pictures(images).exposure(0.49) == pytest.approx(0.98**2.2, rel=2e-4)
-    assert pictures(images).exposure(0.51) is None
+    assert pictures(images).find_exposure(0.49) == pytest.approx(0.98**2.2, rel=2e-4)
+    assert pictures(images).find_exposure(0.51) is None
 
 
 def test_noise_is_taken_out_of_the_display_mean() -> None:
@@ -70,7 +70,7 @@ def test_other_images_of_a_scene_have_the_display_mean_that_was_wanted(quick: No
     assert told[0] == "rendering 16 views of cornell, 32 × 32, 2 × 8 spp"
     assert found.scene_id == cornell().scene_id
     assert found.low < found.exposure < (found.high or 0)
-    scene = LoadedScene.load(exposure.shrunk(cornell(), exposure.SIDE).model_copy(update={"exposure": 1.0}))
+    scene = LoadedScene.load(exposure.shrink_film(cornell(), exposure.SIDE).model_copy(update={"exposure": 1.0}))
     halves = np.stack(list(exposure._render_pairs(scene, 16, 32, Steps(16))))  # more samples
     assert display_values(np.float32(found.exposure) * halves.mean(axis=1)).mean() == pytest.approx(0.4, abs=0.004)
     again = propose(cornell().model_copy(update={"exposure": 9.0}), None, WorkLog(told.append), target=0.4, frames=16)
@@ -101,7 +101,7 @@ def test_what_is_lit_gets_the_target_if_that_is_enough(monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize(("film", "small"), [((64, 64), (64, 64)), ((1280, 720), (64, 32)), ((2048, 8), (64, 8))])
 def test_large_films_are_rendered_small(film: tuple[int, int], small: tuple[int, int]) -> None:
-    found = exposure.shrunk(cornell(width=film[0], height=film[1]), exposure.SIDE).film
+    found = exposure.shrink_film(cornell(width=film[0], height=film[1]), exposure.SIDE).film
     assert (found.width, found.height) == small
 
 

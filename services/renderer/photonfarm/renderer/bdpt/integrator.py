@@ -295,7 +295,7 @@ def trace(
     if lights is not None and options.traces_light:
         image, path = lanes.light()
         sequence = randomness.stream(dr.gather(mi.UInt32, lanes.keys, image), randomness.LIGHT)
-        note_splat = None if tally is None else tally.splats(image, options.light_ratio)
+        note_splat = None if tally is None else tally.make_note_splat(image, options.light_ratio)
         splat = Splat(splats, lanes.splat_scale, image * lanes.pixels, lanes.width, lanes.height, note_splat)
         rng = randomness.sampler(sequence, path + lanes.first_light_path)
         offset = randomness.sampler(randomness.stream(lanes.keys, randomness.SLOTS), lanes.first_light_path)
@@ -321,7 +321,7 @@ def trace(
     connectable = None
     if vertices is not None:
         first = lanes.partner(sample, randomness.places(keys, sample + lanes.first_sample, pixel))
-        note = None if tally is None else tally.connections_of(image, pixel)
+        note = None if tally is None else tally.make_note_connection(image, pixel)
         connectable = Connectable(vertices, lanes.counts[2], image, first, lanes.shifts, note)
     radiance, hit = trace_eye_paths(scene, lights, options, rng=rng, start=start, connectable=connectable)
 

@@ -58,17 +58,17 @@ def glass() -> dict[str, Any]:
 
 
 def planks(colour: Colour, rows: int = 16, size: int = 256) -> NDArray[np.float32]:
-    """Wooden boards along u, (size, size, 3): each its own tone, with grain and dark joints."""
+    """Wooden boards along u, two in each row, (size, size, 3): each its own tone, with grain and dark joints."""
     random = Stream(make_key("texture", "planks"), "tones")
     tone = 0.8 + 0.4 * random.uniform(rows, 2)
     grain = 1 + 0.10 * (random.uniform(size) - 0.5)
     v, u = np.meshgrid(np.arange(size), np.arange(size), indexing="ij")
     row = v * rows // size
     shift = (random.uniform(rows) * size).astype(int)[row]
-    half = ((u + shift) % size) * 2 // size
-    shade = tone[row, half] * grain[v]
-    edge = (v * rows % size < rows) | ((u + shift) % (size // 2) == 0)
-    return np.asarray(np.where(edge, 0.45, shade)[..., None] * np.array(colour), np.float32)
+    board = ((u + shift) % size) * 2 // size  # 0 or 1: which of the row
+    shade = tone[row, board] * grain[v]
+    joint = (v * rows % size < rows) | ((u + shift) % (size // 2) == 0)
+    return np.asarray(np.where(joint, 0.45, shade)[..., None] * np.array(colour), np.float32)
 
 
 def rug(field: Colour, figure: Colour, size: int = 128) -> NDArray[np.float32]:
@@ -132,13 +132,13 @@ def mesh(
 
 
 def rectangle_light(centre: Point, size: tuple[float, float], up: Point, radiance: Colour) -> dict[str, Any]:
-    """A one-sided rectangle across the axis `up` that shines against it; `size` along the two other axes, in order."""
+    """A rectangle that shines one way, against the axis `up`; `size` is along the two other axes, in their order."""
     axis = int(np.argmax(np.abs(up)))
     first, second = (i for i in range(3) if i != axis)
     down = -np.array(up, float)
     u = np.eye(3)[first] * size[0] / 2
     v = np.eye(3)[second] * size[1] / 2
-    if np.cross(u, v) @ down < 0:
+    if np.cross(u, v) @ down < 0:  # a map that mirrors would turn the normal
         v = -v
     to_world = np.eye(4)
     to_world[:3] = np.stack([u, v, down, np.array(centre, float)], axis=1)
@@ -150,8 +150,10 @@ def rectangle_light(centre: Point, size: tuple[float, float], up: Point, radianc
     }
 
 
-_GRID = (-1.0, -0.4, -1e-3, 1e-3, 0.4, 1.0)
-"""The coordinates of a rounded box's vertices on a face of the unit cube: the inner pair bounds the flat part."""
+_FACE_COORDINATES = (-1.0, -0.4, -1e-3, 1e-3, 0.4, 1.0)
+"""The grid on each face of the cube [−1, 1]³ whose points are the directions of a rounded box's vertices.
+
+Their signs say which corner a vertex belongs to, so the gap between −1e-3 and 1e-3 becomes the flat part of a face."""
 
 
 def box(size: Point, centre: Point) -> Any:
@@ -172,8 +174,8 @@ def legs(width: float, depth: float, height: float, thickness: float) -> list[An
 
 def rounded_box(size: Point, centre: Point, radius: float) -> Any:
     """A box with rounded edges: the Minkowski sum of a box and a sphere; smooth vertex normals fit it."""
-    u, v = (a.ravel() for a in np.meshgrid(_GRID, _GRID, indexing="ij"))
-    n = len(_GRID)
+    u, v = (a.ravel() for a in np.meshgrid(_FACE_COORDINATES, _FACE_COORDINATES, indexing="ij"))
+    n = len(_FACE_COORDINATES)
     corner = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     quads = np.stack([corner, corner + n, corner + n + 1, corner + 1], axis=1)
     vertices: list[NDArray[np.float64]] = []
@@ -181,7 +183,7 @@ def rounded_box(size: Point, centre: Point, radius: float) -> Any:
     for axis in range(3):
         for side in (-1.0, 1.0):
             cube = np.empty((len(u), 3))
-            cube[:, axis], cube[:, axis - 2], cube[:, axis - 1] = side, u, v
+            cube[:, axis], cube[:, axis - 2], cube[:, axis - 1] = side, u, v  # the next axes, in turn
             faces.append((quads if side > 0 else quads[:, ::-1]) + n * n * len(vertices))
             vertices.append(cube)
     direction = np.concatenate(vertices)
@@ -194,7 +196,7 @@ def rounded_box(size: Point, centre: Point, radius: float) -> Any:
 
 def lathe(profile: list[tuple[float, float]], sections: int = 32) -> Any:
     """A solid of revolution about y from its profile, (radius, height) from the bottom of the axis to the top of it."""
-    mesh = trimesh.creation.revolve(np.array(profile), sections=sections)
+    mesh = trimesh.creation.revolve(np.array(profile), sections=sections)  # about z
     mesh.apply_transform(trimesh.transformations.rotation_matrix(-np.pi / 2, (1, 0, 0)))
     return mesh
 

@@ -25,7 +25,7 @@ import numpy as np
 from photonfarm.renderer.bdpt.camera import ImageStack
 from photonfarm.renderer.bdpt.guiding.grid import SparseLanes
 from photonfarm.renderer.bdpt.guiding.starts import F64, Layout, StartGuide, table_of
-from photonfarm.renderer.bdpt.guiding.tally import Totals, column_of, tiles_of
+from photonfarm.renderer.bdpt.guiding.tally import Totals, tile_of, tiles_per_side
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, estimate_usefulness
 
 DEFAULT_SHARE = 0.35
@@ -107,13 +107,13 @@ class LightGuide:
 
 def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Totals, lanes: SparseLanes) -> LightGuide:
     """The guide that the images and the totals of a launch suggest, given default probabilities of lights [N]."""
-    tiles = tiles_of(lanes.images)
-    weight = _weights(images.radiance, lanes, tiles)
-    columns = lanes.images * tiles**2
+    side = tiles_per_side(lanes.images)
+    weight = _weights(images.radiance, lanes, side)
+    tile_count = lanes.images * side**2
 
     def weigh(squares: mi.Float) -> mi.Float:
-        column = dr.arange(mi.UInt32, dr.width(squares)) % columns
-        return dr.block_sum(squares * dr.gather(mi.Float, weight, column), columns)
+        tile = dr.arange(mi.UInt32, dr.width(squares)) % tile_count
+        return dr.block_sum(squares * dr.gather(mi.Float, weight, tile), tile_count)
 
     def read(*arrays: mi.Float) -> list[F64]:
         return [np.array(values, np.float64) for values in arrays]
@@ -125,18 +125,18 @@ def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Tot
     return LightGuide.of(StartGuide.of(layout, gain), table)
 
 
-def _weights(radiance: mi.Spectrum, lanes: SparseLanes, tiles: int) -> mi.Float:
+def _weights(radiance: mi.Spectrum, lanes: SparseLanes, side: int) -> mi.Float:
     """What the variance of pixels counts for in the error, for each tile of images [V·H·W]; 0 in black images."""
     pixel = dr.arange(mi.UInt32, dr.width(radiance))
     image = pixel // lanes.pixels
     within = pixel - image * lanes.pixels
     row = within // lanes.width
     x, y = (mi.Float(within - row * lanes.width) + 0.5) / lanes.width, (mi.Float(row) + 0.5) / lanes.height
-    column = column_of(image, x, y, tiles)
-    grey, pixels = (dr.zeros(mi.Float, lanes.images * tiles**2) for _ in range(2))
-    dr.scatter_add(grey, (radiance[0] + radiance[1] + radiance[2]) / 3, column)
-    dr.scatter_add(pixels, 1, column)
+    tile = tile_of(image, x, y, side)
+    grey, pixels = (dr.zeros(mi.Float, lanes.images * side**2) for _ in range(2))
+    dr.scatter_add(grey, (radiance[0] + radiance[1] + radiance[2]) / 3, tile)
+    dr.scatter_add(pixels, 1, tile)
     grey /= dr.maximum(pixels, 1)
-    mean = dr.repeat(dr.block_sum(grey, tiles**2), tiles**2) / tiles**2
+    mean = dr.repeat(dr.block_sum(grey, side**2), side**2) / side**2
     level = dr.square(grey) + EPSILON * dr.square(mean)
     return dr.select(level > 0, dr.rcp(level), 0)

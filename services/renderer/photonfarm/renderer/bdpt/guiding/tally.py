@@ -1,4 +1,4 @@
-"""Tallies what light paths add to images: splats by the cell that they started in, connections by that of their vertex.
+"""The tally from which a guide learns which starts of light paths and which of their vertices are useful.
 
 Index letters: T cells of starts; U cells of vertices; V images of a launch; C tiles of all of them.
 """
@@ -23,53 +23,56 @@ Totals: TypeAlias = "tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float]"
 """The sums of a tally, in device memory."""
 
 NoteConnection: TypeAlias = "Callable[[KeptVertex, mi.Spectrum, mi.Bool], None]"
-"""A function of kept vertices of light paths, what connections to them add, and which are made."""
+"""Notes connections: the vertices of light paths that they go to, what they add to images, and which are made."""
 
-COLUMNS = 64
+MOST_TILES = 64
 """The most tiles of all images together: each image is cut into equal tiles, whose brightness says how noise counts."""
 
 
-def tiles_of(images: int) -> int:
-    """The tiles along each side of an image, for so many images."""
-    return max(1, int(np.sqrt(COLUMNS / images)))
+def tiles_per_side(images: int) -> int:
+    """The number of tiles along each side of an image, for so many images."""
+    return max(1, int(np.sqrt(MOST_TILES / images)))
 
 
-def column_of(image: mi.UInt32, x: mi.Float, y: mi.Float, tiles: int) -> mi.UInt32:
-    """The number among the C of the tile at places in [0, 1)² of images."""
-    return (image * tiles + mi.UInt32(y * tiles)) * tiles + mi.UInt32(x * tiles)
+def tile_of(image: mi.UInt32, x: mi.Float, y: mi.Float, side: int) -> mi.UInt32:
+    """The number among the C tiles of the one at (x, y) in [0, 1)² of an image of ``side``² tiles."""
+    return (image * side + mi.UInt32(y * side)) * side + mi.UInt32(x * side)
 
 
 @dataclass(slots=True)
 class Tally:
-    """Sums over light paths by the cell that they started in, and over connections by the cell of their vertex."""
+    """Sums over light paths by the cell of their start, and over connections by the cell of their light vertex.
 
-    splat_squares: mi.Float  # [T·C]: of what splats add to pixels of tiles; means over eye paths and light paths
-    starts: mi.Float  # [T]: their number
-    edges: mi.Float  # [T]: edges that they were traced along, which is what they cost
-    connection_squares: mi.Float  # [U·C]: of what connections add to pixels of tiles; [C] without connections
-    connections: mi.Float  # [U]: their number
+    Weights make squares of both kinds what is added to a pixel's variance at one eye path per pixel, on average.
+    """
+
+    splat_squares: mi.Float  # [T·C]: of values of splats, by the tile that they fall in
+    starts: mi.Float  # [T]: number of light paths
+    edges: mi.Float  # [T]: number of edges of these paths, which is what they cost
+    connection_squares: mi.Float  # [U·C]: of values of connections, by the tile of the eye path; [C] without any
+    connections: mi.Float  # [U]: number of connections
     grid: Grid  # of the cells of vertices
     lanes: SparseLanes
-    tiles: int  # along each side of an image, C = V·tiles²
-    columns: int  # C
-    cells: mi.UInt32 = field(default_factory=mi.UInt32)  # that the launch's light paths started in
+    side: int  # tiles along each side of an image
+    tile_count: int  # C = V·side²
+    cells: mi.UInt32 = field(default_factory=mi.UInt32)  # of the start of each light path of the launch
 
     @classmethod
     def empty(cls, layout: Layout, grid: Grid, lanes: SparseLanes) -> Tally:
         """A tally of nothing, for a launch."""
-        tiles = tiles_of(lanes.images)
-        columns = lanes.images * tiles**2
+        side = tiles_per_side(lanes.images)
+        tile_count = lanes.images * side**2
         cells = CELLS if lanes.shifts is not None else 1
         return cls(
-            splat_squares=dr.zeros(mi.Float, layout.cells * columns),
+            splat_squares=dr.zeros(mi.Float, layout.cells * tile_count),
             starts=dr.zeros(mi.Float, layout.cells),
             edges=dr.zeros(mi.Float, layout.cells),
-            connection_squares=dr.zeros(mi.Float, cells * columns),
+            connection_squares=dr.zeros(mi.Float, cells * tile_count),
             connections=dr.zeros(mi.Float, cells),
             grid=grid,
             lanes=lanes,
-            tiles=tiles,
-            columns=columns,
+            side=side,
+            tile_count=tile_count,
         )
 
     @property
@@ -87,27 +90,28 @@ class Tally:
         """Note the edges that the light paths were traced along."""
         dr.scatter_add(self.edges, mi.Float(edges), self.cells)
 
-    def splats(self, image: mi.UInt32, light_ratio: mi.Float) -> NoteSplat:
-        """What notes the splats of light paths of these images, so many for each eye path."""
-        weight = dr.rsqrt(light_ratio * mi.Float(self.lanes.counts[2]))
+    def make_note_splat(self, image: mi.UInt32, light_ratio: mi.Float) -> NoteSplat:
+        """A function that adds splats to the tally; ``light_ratio`` is light paths per eye path of guided images."""
+        _, _, light_paths = self.lanes.counts  # as data, of which another number compiles nothing
+        weight = dr.rsqrt(light_ratio * mi.Float(light_paths))
 
         def note(position: mi.Point2f, value: mi.Spectrum, active: mi.Bool) -> None:
             x, y = position.x / self.lanes.width, position.y / self.lanes.height
-            column = column_of(image, x, y, self.tiles)
-            dr.scatter_add(self.splat_squares, _square(value * weight), self.cells * self.columns + column, active)
+            tile = tile_of(image, x, y, self.side)
+            dr.scatter_add(self.splat_squares, _square(value * weight), self.cells * self.tile_count + tile, active)
 
         return note
 
-    def connections_of(self, image: mi.UInt32, pixel: mi.UInt32) -> NoteConnection:
-        """What notes the connections of eye paths through these pixels of images."""
+    def make_note_connection(self, image: mi.UInt32, pixel: mi.UInt32) -> NoteConnection:
+        """A function that adds connections to the tally: of eye paths through these pixels of images."""
         row = pixel // self.lanes.width
         x, y = mi.Float(pixel - row * self.lanes.width) / self.lanes.width, mi.Float(row) / self.lanes.height
-        column, weight = column_of(image, x, y, self.tiles), float(1 / np.sqrt(self.lanes.eyes))
+        tile, weight = tile_of(image, x, y, self.side), float(1 / np.sqrt(self.lanes.eyes))
 
         def note(vertex: KeptVertex, value: mi.Spectrum, active: mi.Bool) -> None:
             cell = cell_of(self.grid, vertex.si)
-            active = active & (vertex.depth > 0)  # `&=` would change the caller's
-            dr.scatter_add(self.connection_squares, _square(value * weight), cell * self.columns + column, active)
+            active = active & (vertex.depth > 0)  # not `&=`, which would change the caller's mask
+            dr.scatter_add(self.connection_squares, _square(value * weight), cell * self.tile_count + tile, active)
             dr.scatter_add(self.connections, mi.Float(1), cell, active)
 
         return note

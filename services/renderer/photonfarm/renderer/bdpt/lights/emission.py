@@ -16,7 +16,7 @@ at y₀:
     spot                 uniform in its cone                                  ê = P/(2π(1 − cos θ))   c = 1
 
 P is the probability with which light paths choose the light (`emit_probability`), A the area, R the radius of a sphere
-around the scene's *present* bounding box.
+around the scene's current bounding box.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Lights:
     kinds: tuple[int, ...]  # [N]: kind of each light; fixed while the scene's topology is
     kind: mi.UInt32  # [N]: the same as data
     selection: Selection | None  # probabilities for next event estimation; None for a single light
-    alive: mi.Float  # by id: whether a single light shines, 1 or 0
+    alive: mi.Float  # by id: 1 if it shines, else 0: the probability of choosing a light that is the only one
     emit_cdf: mi.Float  # [N]: running sum of the probabilities for light paths, not normalised
     emission: mi.Float  # by id: ê of the table above, 0 where light paths never start
     axis: mi.Vector3f  # [N]: axis of a spot light's cone
@@ -88,6 +88,10 @@ class Lights:
         if self.only(kind):
             return mi.Bool(True)
         return dr.gather(mi.UInt32, self.kind, index) == kind
+
+    def is_at_infinity(self, index: LightIndex) -> mi.Bool:
+        """The mask of lanes whose light ``index`` is INFINITE or DIRECTION."""
+        return self.is_kind(index, INFINITE) | self.is_kind(index, DIRECTION)
 
     def nee_probability(self, emitter: mi.EmitterPtr, p: mi.Point3f) -> mi.Float:
         """The probability of choosing ``emitter`` for next event estimation at points ``p``; 0 for the null pointer."""
@@ -134,8 +138,7 @@ class Lights:
         if self.has(AREA):
             u = grid.map_area_to_square(n, d)
         if self.has(INFINITE) or self.has(DIRECTION):
-            at_infinity = self.is_kind(light, INFINITE) | self.is_kind(light, DIRECTION)
-            u = dr.select(at_infinity, grid.map_disk_to_square(d, (x - self.centre) / self.radius), u)
+            u = dr.select(self.is_at_infinity(light), grid.map_disk_to_square(d, (x - self.centre) / self.radius), u)
         if self.has(POSITION):
             axis, cutoff = dr.gather(mi.Vector3f, self.axis, light), dr.gather(mi.Float, self.cos_cutoff, light)
             u = dr.select(self.is_kind(light, POSITION), grid.map_cone_to_square(axis, cutoff, d), u)
@@ -173,7 +176,7 @@ def read_lights(scene: mi.Scene) -> Lights:
     emit = dr.select(total > 0, emit_weight / total, 0)
     axis, cos_cutoff = cones(parameters, emitters)
 
-    emission = emit / (dr.two_pi * (1 - cos_cutoff))  # positions; π·R² for lights at infinity, A·π for areas
+    emission = emit / (dr.two_pi * (1 - cos_cutoff))  # ê of lights with a position; the other kinds replace theirs
     emission = dr.select((kind == INFINITE) | (kind == DIRECTION), emit / (dr.pi * dr.square(radius)), emission)
     if AREA in kinds:
         area = column(n, [shapes[key].surface_area() if kinds[i] == AREA else 0 for i, key in enumerate(ids)])
@@ -226,7 +229,7 @@ class DirectSample:
     radiance_over_density: mi.Spectrum  # Le/p_NEE
     density: mi.Float  # p_NEE in solid angle with the selection; the selection alone for delta lights
     delta: mi.Bool  # no ray can hit this light
-    ratio_over_cos: mi.Float  # e/(p_NEE·cos₀) as in weights.next_event, without cos_x
+    ratio_over_cos: mi.Float  # e/(p_NEE·cos₀): the `ratio` of weights.next_event without its cos_x
     valid: mi.Bool
 
 
@@ -242,16 +245,16 @@ def sample_direct(lights: Lights, si: mi.SurfaceInteraction3f, rng: RandomNumber
     density = probability * ds.pdf
     valid = active & (density > 0) & (dr.max(weight) > 0)
 
-    at_infinity = lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION)
     delta = lights.is_kind(index, POSITION) | lights.is_kind(index, DIRECTION) | ds.delta
-    shape_factor = mi.Float(1)  # e/(ê·cos₀): 1, p_ω or 1/r²
+    # c/cos₀ of the table above. A point light has 1/r² too, from solid angle to area at x: p_NEE of an area cancels it
+    shape_factor = mi.Float(1)
     shape_factor = dr.select(lights.is_kind(index, INFINITE), ds.pdf, shape_factor)
     shape_factor = dr.select(lights.is_kind(index, POSITION), dr.rcp(dr.square(ds.dist)), shape_factor)
     ratio = lights.emission_factor(emitter) * shape_factor / density * lights.gain(emitter, ds, ds.n, si.p, valid)
     return DirectSample(
         d=ds.d,
         p=ds.p,
-        at_infinity=at_infinity,
+        at_infinity=lights.is_at_infinity(index),
         radiance_over_density=dr.select(valid, weight / probability, 0),
         density=density,
         delta=delta,
@@ -320,8 +323,8 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
     else:
         drawn = lights.guided.draw(path, paths, rng)
         index, cell, gain = drawn.light, drawn.cell, drawn.gain
-        far = lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION)
-        u_position = dr.select(far, drawn.direction, drawn.position)  # at infinity it is the disk that is guided
+        far = lights.is_at_infinity(index)  # there the guided square is the disk, a position (see `guiding.grid`)
+        u_position = dr.select(far, drawn.direction, drawn.position)
         u_direction = dr.select(far, drawn.position, drawn.direction)
     emitter = dr.gather(mi.EmitterPtr, lights.pointers, index)
     factor = lights.emission_factor(emitter) * gain
@@ -333,7 +336,7 @@ def sample_emission(lights: Lights, rng: Sampler, path: mi.UInt32, paths: mi.UIn
         p_direction=mi.Float(1),
         sample=dr.zeros(mi.DirectionSample3f, n),
         is_area=lights.is_kind(index, AREA),
-        at_infinity=lights.is_kind(index, INFINITE) | lights.is_kind(index, DIRECTION),
+        at_infinity=lights.is_at_infinity(index),
         delta=lights.is_kind(index, POSITION) | lights.is_kind(index, DIRECTION),
         valid=factor > 0,
         cell=cell,

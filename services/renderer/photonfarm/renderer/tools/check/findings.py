@@ -160,7 +160,7 @@ def _check_brightness(spec: SceneSpec, samples: Samples) -> Iterator[Finding]:
     mean = float(samples.images.display_means(spec.exposure).mean())
     if MEANS[0] <= mean <= MEANS[1]:
         return
-    better = samples.images.exposure(TARGET)
+    better = samples.images.find_exposure(TARGET)
     remedy = "too much is black for any exposure" if better is None else f"{better:.2g} would give {TARGET:g}"
     yield Finding(
         "exposure",

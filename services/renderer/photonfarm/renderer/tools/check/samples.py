@@ -141,7 +141,7 @@ class Samples:
 
 def shrink_spec(spec: SceneSpec) -> SceneSpec:
     """The spec as it is loaded for a check."""
-    return exposure.shrunk(spec, SIDE).model_copy(update={"points": min(spec.points, POINTS)})
+    return exposure.shrink_film(spec, SIDE).model_copy(update={"points": min(spec.points, POINTS)})
 
 
 def render(scene: LoadedScene, spec: SceneSpec, cloud: BasePointCloud, work: WorkLog) -> Samples:

@@ -141,7 +141,7 @@ def _list_facts(check: SceneCheck) -> list[tuple[str, str]]:
     cameras, images, points = check.measured.samples.cameras, check.measured.samples.images, check.spec.points
     holders = ", ".join(name for name, _ in cameras.holders()[:3])
     median, low = np.percentile(cameras.seen, [50, 5])
-    better = images.exposure(TARGET)
+    better = images.find_exposure(TARGET)
     return [
         ("cameras inside objects", f"{percent(cameras.inside_share)}{holders and f' ({holders})'}"),
         ("cameras that look through a wall from outside", percent(cameras.behind.mean())),

@@ -1,7 +1,7 @@
 """`photonfarm scene exposure`: the exposure that gives a scene's pictures a wanted mean brightness.
 
-Brightness is the display mean: the mean of clip(exposure · I, 0, 1)^(1/2.2) over pixels, channels and views. It grows
-with the exposure, so bisection finds the exposure in images that are rendered once.
+Brightness is the display mean: the mean of clip(exposure · I, 0, 1)^(1/2.2) over pixels, channels and views, where I is
+the radiance. It grows with the exposure, so images are rendered once, and bisection finds their exposure.
 
 Shape letters: N views, H W image.
 """
@@ -30,7 +30,7 @@ TARGET = 0.45
 """The display mean of a picture that is neither dark nor bright."""
 
 FRAMES = 48
-"""The default number of views: their brightness differs so much that less noise would not help."""
+"""The default number of views. Their differences in brightness make most of the error, so less noise would not help."""
 
 SIDE = 64
 """The pixels along the longer side: the display mean hardly depends on the resolution."""
@@ -42,7 +42,7 @@ RANGE = (-40.0, 40.0)
 """The range of the search, as powers of 2."""
 
 EXACT = 1e-4
-"""The range of powers at which the search ends."""
+"""The search ends when its range of powers is no wider than this."""
 
 SEED = 0
 """The master seed of configurations and views, the same as the default of `submit`."""
@@ -63,8 +63,8 @@ class Proposal:
     high: float | None
     standard_error: float  # of the display mean, over views
     noise: float  # the amount by which noise would lower the display mean; it is taken out
-    present: float  # the spec's exposure
-    present_mean: float  # the display mean at that
+    present: float  # the exposure that the spec has now
+    present_mean: float  # the display mean at `present`
     frames: int
     half_spp: int
 
@@ -96,14 +96,14 @@ class Pictures:
         image.
         """
         whole = self.noisy_means(exposure)
-        halves = [_means(self.halves[:, half], exposure) for half in (0, 1)]
+        halves = [_measure_means(self.halves[:, half], exposure) for half in (0, 1)]
         return whole + (whole - np.mean(halves, axis=0))
 
     def noisy_means(self, exposure: float) -> NDArray[np.float64]:
         """The display mean of each view's whole image with its noise, (N,)."""
-        return _means(self.halves.mean(axis=1), exposure)
+        return _measure_means(self.halves.mean(axis=1), exposure)
 
-    def exposure(self, target: float) -> float | None:
+    def find_exposure(self, target: float) -> float | None:
         """The exposure at which the mean over all views is `target`; None if none is high enough."""
         low, high = RANGE
         if self.display_means(2**high).mean() < target:
@@ -114,7 +114,8 @@ class Pictures:
         return float(2 ** ((low + high) / 2))
 
 
-def _means(images: F32, exposure: float) -> NDArray[np.float64]:
+def _measure_means(images: F32, exposure: float) -> NDArray[np.float64]:
+    """The display mean of each image (N, H, W, 3), (N,)."""
     shown = display_values((np.float32(exposure) * images).astype(np.float32))
     return shown.mean(axis=(1, 2, 3), dtype=np.float64)
 
@@ -130,50 +131,47 @@ def propose(
 ) -> Proposal:
     """Render some views, each of a random configuration of its own, and search for the exposure.
 
-    The backend must have been loaded. Raises SpecError as loading does, and DarkError where too much is black for any
-    exposure to reach the target; with `least` only if less than that share of pixels is lit, and else what is lit gets
-    the target.
+    `scene.backend.load` must have been called. Raises SpecError as loading does, and DarkError if so much is black that
+    no exposure reaches the target. Given `least`, it is raised only if less than this share of the pixels is lit;
+    otherwise the target holds for the lit pixels.
     """
-    small = shrunk(spec, SIDE).model_copy(update={"exposure": 1.0})  # with the same views whatever it is
+    small = shrink_film(spec, SIDE).model_copy(update={"exposure": 1.0})  # so that the spec's changes no view
     spp = PATHS // (small.film.width * small.film.height)
     scene, steps = LoadedScene.load(small, beside), Steps(frames, slow=1)
     size = f"{small.film.width} × {small.film.height}"
     work.begin(f"rendering {frames} views of {spec.name}, {size}, 2 × {spp} spp", steps.words)
     pictures = Pictures(np.stack(list(_render_pairs(scene, frames, spp, steps))))
-    exposure = pictures.exposure(target)
+    exposure = pictures.find_exposure(target)
     if exposure is None:
-        reached = float(pictures.display_means(2 ** RANGE[1]).mean())
-        exposure = None if reached < (target if least is None else least) else pictures.exposure(target * reached)
-        if exposure is None or not reached:
+        lit = float(pictures.display_means(2 ** RANGE[1]).mean())  # the share of what is not black: it is white now
+        if least is not None and lit >= least:
+            exposure = pictures.find_exposure(target * lit)
+        if exposure is None or not lit:
             raise DarkError(
                 f"{spec.name}: no exposure gives a display mean of {target:g}: too much is black, and the mean stays "
-                f"below {reached:.3g}"
+                f"below {lit:.3g}"
             )
-        target *= reached
-    return _proposal(spec, pictures, target, exposure, spp)
-
-
-def _proposal(spec: SceneSpec, pictures: Pictures, target: float, exposure: float, half_spp: int) -> Proposal:
+        target *= lit
     means = pictures.display_means(exposure)
     error = Estimate.of(means).standard_error or 0.0
     return Proposal(
         scene_id=spec.scene_id,
         target=target,
         exposure=exposure,
-        low=pictures.exposure(target - error) or 0.0,
-        high=pictures.exposure(target + error),
+        low=pictures.find_exposure(target - error) or 0.0,
+        high=pictures.find_exposure(target + error),
         standard_error=error,
         noise=float(np.mean(means - pictures.noisy_means(exposure))),
         present=spec.exposure,
         present_mean=float(pictures.display_means(spec.exposure).mean()),
         frames=len(means),
-        half_spp=half_spp,
+        half_spp=spp,
     )
 
 
-def shrunk(spec: SceneSpec, side: int) -> SceneSpec:
-    """The spec on a film of `side` pixels at most along the longer side, without photons."""
-    times = -(-max(spec.film.width, spec.film.height) // side)
+def shrink_film(spec: SceneSpec, side: int) -> SceneSpec:
+    """The spec without photons, and with a film of at most `side` pixels along its longer side, in multiples of 8."""
+    times = -(-max(spec.film.width, spec.film.height) // side)  # rounded up
     width, height = (max(8, pixels // times // 8 * 8) for pixels in (spec.film.width, spec.film.height))
     photons = spec.photons.model_copy(update={"paths": 0})
     return spec.model_copy(update={"film": Film(width=width, height=height), "photons": photons})

@@ -79,9 +79,9 @@ def test_a_run_ends_in_the_same_weights_to_the_bit_with_fewer_reads(
 def test_by_default_a_cpu_keeps_none_and_a_card_leaves_a_quarter_free(monkeypatch: pytest.MonkeyPatch) -> None:
     assert TrainSettings().resident_gb == "auto"
     assert "resident_gb" in KEYS
-    assert not ResidentSamples(CPU, "auto").keeps_any
+    assert not ResidentSamples(CPU, "auto").makes_batches
     card = ResidentSamples(torch.device("cuda"), "auto")
-    assert card.keeps_any
+    assert card.makes_batches
     free = [0]
     monkeypatch.setattr(resident.torch.cuda, "mem_get_info", lambda _: (free[0], 1000))
     found = []

@@ -42,7 +42,7 @@ def test_a_cpu_is_said_to_have_no_tf32_and_its_setting_stays_as_it_is(monkeypatc
         assert torch.backends.cudnn.allow_tf32 is before
         for precision in ("tf32", "float32", "bfloat16"):
             round_convolutions(torch.device("cuda"), precision)
-            assert torch.backends.cudnn.allow_tf32 is (precision == "tf32")
+            assert torch.backends.cudnn.allow_tf32 is (precision != "float32")
 
 
 @pytest.mark.skipif(not HAS_CUDA, reason="there is no CUDA device, and only such have TF32")
@@ -50,7 +50,7 @@ def test_on_cuda_tf32_is_that_of_the_network_that_makes_the_image_and_of_its_gra
     for precision in ("tf32", "float32", "bfloat16"):
         network = NetworkSettings(width=4, precision=precision)
         train(make_source(24), tiny(network=network, device="cuda"), run / precision)
-        assert torch.backends.cudnn.allow_tf32 is (precision == "tf32")
+        assert torch.backends.cudnn.allow_tf32 is (precision != "float32")
 
 
 @pytest.mark.skipif(HAS_CUDA, reason="there is a CUDA device")

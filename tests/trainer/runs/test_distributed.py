@@ -154,7 +154,7 @@ def test_all_processes_go_back_together_and_keep_the_same_average(make_source, t
             told = [*learner.predicting.parameters(), *learner.network.parameters()]
             sums = [weight.double().abs().sum().item() for weight in told]
             with (tmp_path / f"{os.environ['RANK']}.jsonl").open("a") as file:
-                file.write(json.dumps([number, value, learner.rate(number), sums]) + "\n")
+                file.write(json.dumps([number, float(value), learner.rate(number), sums]) + "\n")
             return value
 
         Learner.step, source.read = step, spoilt  # in a process of its own

@@ -19,6 +19,7 @@ from photonfarm.core.keys import Key, Stream
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, map_tensors
+from photonfarm.trainer.runs.devices import is_asynchronous
 
 FREE_SHARE = 0.25
 """The share of a card's memory that stays free with "auto".
@@ -47,9 +48,9 @@ class TrainingBatch:
         return cls(tuple(rows), tuple(units), Inputs.of(tensors, noisy), target)
 
     def to(self, device: torch.device) -> TrainingBatch:
-        """The same batch on a device; itself on the CPU."""
-        inputs = map_tensors(lambda tensor: tensor.to(device), self.inputs)
-        return TrainingBatch(self.rows, self.units, inputs, self.target.to(device))
+        """The same batch on a device; itself on the CPU. A card may still be copying, as by `Inputs.to`."""
+        target = self.target.to(device, non_blocking=is_asynchronous(device))
+        return TrainingBatch(self.rows, self.units, self.inputs.to(device), target)
 
     def for_training(self) -> TrainingBatch:
         """The batch with targets that no input depends on: itself, unless its inputs hold noisy colour.
@@ -112,9 +113,9 @@ class ResidentSamples:
         self._bytes = 0
 
     @property
-    def keeps_any(self) -> bool:
-        """Whether there is a limit above 0."""
-        return self._device.type == "cuda" if self._limit_bytes is None else self._limit_bytes > 0
+    def makes_batches(self) -> bool:
+        """Whether batches come from here: on a card, so that no step copies one, or where any samples may be kept."""
+        return is_asynchronous(self._device) or bool(self._limit_bytes)
 
     @property
     def rows(self) -> tuple[int, ...]:
@@ -131,6 +132,8 @@ class ResidentSamples:
         Its tensors are its own. Values are those of the store's samples, to the bit, wherever they were kept.
         """
         moved = fresh.to(self._device)
+        if fresh.rows and is_asynchronous(self._device):  # whose memory may hold other samples from now on
+            torch.cuda.current_stream(self._device).synchronize()
         parts = {row: _take_one(moved, place) for place, row in enumerate(fresh.rows)}
         for row, part in parts.items():
             if self._has_room(needed := count_bytes(part)):

@@ -56,7 +56,7 @@ class Feed:
         """
         self._source, self._settings, self._clock = source, settings, clock
         self._needs = needs or find_kind(settings.network.architecture).needs
-        self._resident = resident if resident is not None and resident.keeps_any else None
+        self._resident = resident if resident is not None and resident.makes_batches else None
         self.spec, self.base = source.spec, source.base()
         points = settings.network.points
         self._dataset = SceneDataset(source, self._needs.fields, exposure=self.spec.exposure, points=points)

@@ -15,7 +15,7 @@ V = sigmoid(r(receiver) · s(sender) + b)
 For metals the light is summed over the directions that their lobe reflects; nothing is learned there. Light that points
 send to each other was tried, and brings nothing at equal time (docs/results/networks.md).
 
-Shape letters: B batch, L lit points, H W image, N receivers, C numbers of a surface.
+Shape letters: B batch, L lit points, H W image, N receivers, Q glossy squares of pixels, C numbers of a surface.
 """
 
 from __future__ import annotations
@@ -27,18 +27,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from photonfarm.core.records import LIT_POINTS
-from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, require
+from photonfarm.trainer.networks.inputs import SQUARE, Inputs, SceneFrame, require
 from photonfarm.trainer.networks.network import add_octaves
-
-COARSE = 4
-"""The side, in pixels, of the squares for which diffuse light is summed: it changes little between neighbours."""
-
-GLOSSY = 0.2
-"""The directional albedo above which a pixel's glossy lobe is summed over the points.
-
-Glossy lobes are those that are neither diffuse nor followed by rays. Metals and rough glass exceed it, and coats at
-grazing angles. Summing all lobes of plastics and varnish took a third of a training step and gained nothing.
-"""
 
 SHARPEST = 0.075
 """The least roughness of a glossy lobe: a narrower lobe would fall between points."""
@@ -79,12 +69,13 @@ class LearnedVisibility(nn.Module):
         self.open = nn.Parameter(torch.tensor(OPEN))
 
     def surfaces(self, position: Tensor, normal: Tensor) -> Tensor:
-        """The features of a surface: its place, in sines and cosines, and its normal, (N, C)."""
+        """The features of surfaces: their places, in sines and cosines, and their normals, (…, N, C)."""
         return torch.cat([add_octaves(position / self._scale, OCTAVES), normal], dim=-1)
 
     def forward(self, receivers: Tensor, senders: Tensor) -> Tensor:
-        """The visibility of each sender from each receiver, (N, C) and (L, C) → (N, L)."""
-        return torch.sigmoid(self.receiver(receivers) @ self.sender(senders).T + self.open)
+        """The visibility of each sender from each receiver, (B, N, C) and (B, L, C) → (B, N, L)."""
+        logits = torch.baddbmm(self.open, self.receiver(receivers), self.sender(senders).mT)
+        return logits.sigmoid_()
 
 
 def _factors(std: float | None = None) -> nn.Sequential:
@@ -121,62 +112,73 @@ class LitPoints(nn.Module):
     def forward(self, inputs: Inputs) -> list[Tensor]:
         """Diffuse light if nothing hid a point, diffuse light, and light by other lobes, (B, H, W, 3) each.
 
-        The last is 0 where other lobes reflect less than `GLOSSY`.
+        The last is 0 where other lobes reflect less than `inputs.GLOSSY`.
         """
-        images = [self._of_sample(inputs, place) for place in range(len(inputs.depth))]
-        return [torch.stack(parts) for parts in zip(*images, strict=True)]
-
-    def _of_sample(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
         points, guides = require(inputs.points), require(inputs.guides)
-        source, there = points.position[place, : self._count] - self.centre, points.present[place, : self._count, None]
-        sent = self.albedo * there * guides.point_light[place, : self._count] / math.pi
+        source, there = points.position[:, : self._count] - self.centre, points.present[:, : self._count, None]
+        sent = self.albedo * there * guides.point_light[:, : self._count] / math.pi
         if 0 <= self._max_depth < PATH_EDGES:
             sent = torch.zeros_like(sent)
-        rays, surface, normal = self._surfaces(inputs, place)
-        unhidden, light = self._diffuse(surface, normal, source, sent)
-        glossy = (guides.specular[place] - guides.throughput[place]).mean(-1) > GLOSSY
-        gloss = torch.zeros_like(surface)
-        if glossy.any():
-            at = surface[glossy], normal[glossy], rays[glossy], guides.roughness[place][glossy]
-            gloss[glossy] = self._lobes(*at, source, sent)
-        return unhidden, light, gloss
+        surfaces = self._surfaces(inputs)
+        unhidden, light = self._diffuse(*surfaces[1:], source, sent)
+        return [unhidden, light, self._gloss(inputs, surfaces, source, sent)]
 
-    def _surfaces(self, inputs: Inputs, place: int) -> tuple[Tensor, Tensor, Tensor]:
-        """The ray, position and normal of each pixel's surface, (H, W, 3) each."""
-        guides, to_camera = require(inputs.guides), inputs.world_to_camera[place]
-        rays = self._optics.rays(to_camera[None])[0]
-        eye = -to_camera[:, :3].T @ to_camera[:, 3] - self.centre
-        distance = guides.mean_depth[place] / (rays @ to_camera[2, :3])
-        return rays, eye + rays * distance[..., None], functional.normalize(guides.mean_normal[place], dim=-1)
+    def _surfaces(self, inputs: Inputs) -> tuple[Tensor, Tensor, Tensor]:
+        """The ray, position and normal of each pixel's surface, (B, H, W, 3) each."""
+        guides, to_camera = require(inputs.guides), inputs.world_to_camera
+        rays = self._optics.rays(to_camera)
+        eye = -(to_camera[:, :, :3].mT @ to_camera[:, :, 3:]).mT - self.centre
+        distance = guides.mean_depth / (rays * to_camera[:, None, None, 2, :3]).sum(-1)
+        at = eye[:, None] + rays * distance[..., None]
+        return rays, at, functional.normalize(guides.mean_normal, dim=-1)
 
     def _diffuse(self, surface: Tensor, normal: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
-        """The points' light without and with learned visibility, (H, W, 3) each."""
-        at, facing = (_pool(image).reshape(-1, 3) for image in (surface, normal))
+        """The points' light without and with learned visibility, (B, H, W, 3) each."""
+        at, facing = (_pool(image).flatten(1, 2) for image in (surface, normal))
         arriving = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, sent), dim=-1)
-        height, width = surface.shape[0] // COARSE, surface.shape[1] // COARSE
-        coarse = arriving.reshape(1, height, width, 6).permute(0, 3, 1, 2)
-        fine = functional.interpolate(coarse, scale_factor=COARSE, mode="bilinear")[0].permute(1, 2, 0)
+        height, width = surface.shape[1] // SQUARE, surface.shape[2] // SQUARE
+        coarse = arriving.view(-1, height, width, 6).permute(0, 3, 1, 2)
+        fine = functional.interpolate(coarse, scale_factor=SQUARE, mode="bilinear").permute(0, 2, 3, 1)
         return fine[..., :3], fine[..., 3:]
 
     def arriving(self, at: Tensor, facing: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
-        """Light without and with learned visibility at surfaces (N, 3) with normals `facing` (N, 3): (N, 3) each.
+        """Light without and with learned visibility at surfaces (B, N, 3) with normals `facing`, (B, N, 3) each.
 
-        The points are at `source` and send so much, (L, 3) each.
+        The points are at `source` and send so much, (B, L, 3) each.
         """
         factors, surfaces = self.form_factors(at, facing, source), self.visibility.surfaces
-        seen = factors * self.visibility(surfaces(at, facing), surfaces(source, self.normal))
+        senders = surfaces(source, self.normal.expand_as(source))
+        seen = factors * self.visibility(surfaces(at, facing), senders)
         return factors @ sent, seen @ sent
 
+    @torch.no_grad()
     def form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
-        """cos θ cos θ′ A / (π r²) between surfaces (N, 3) with normals `facing` (N, 3) and each point, (N, L)."""
+        """cos θ cos θ′ A / (π r²) between surfaces (B, N, 3) with normals `facing` and each point, (B, N, L)."""
         leaves, squared = self._between(at, source)
-        cosines = (facing @ source.T - (facing * at).sum(-1, keepdim=True)).clamp(min=0) * leaves
-        return cosines / (squared * squared) * (self._area / math.pi)
+        cosines = _height(facing, at, source).clamp_(min=0).mul_(leaves)
+        return cosines.div_(squared.square_()).mul_(self._area / math.pi)
+
+    @torch.no_grad()
+    def _gloss(self, inputs: Inputs, surfaces: tuple[Tensor, Tensor, Tensor], source: Tensor, sent: Tensor) -> Tensor:
+        """Light by other lobes, (B, H, W, 3), summed for the pixels of glossy squares alone, as these are few."""
+        guides = require(inputs.guides)
+        glossy, square = guides.find_glossy(), guides.list_glossy_squares()
+        height, width = glossy.shape[1] // SQUARE, glossy.shape[2] // SQUARE
+        side = torch.arange(SQUARE, device=square.device)
+        corner = square // width * (width * SQUARE**2) + square % width * SQUARE
+        pixel = (corner[:, None, None] + side[:, None] * glossy.shape[2] + side).flatten()
+        images = (image.flatten(0, 2).index_select(0, pixel) for image in (*surfaces, guides.roughness[..., None]))
+        rays, at, normal, roughness = (image.view(-1, SQUARE**2, image.shape[-1]) for image in images)
+        sample = square // (height * width)
+        light = self._lobes(at, normal, rays, roughness, source.index_select(0, sample), sent.index_select(0, sample))
+        gloss = torch.zeros_like(guides.specular)
+        gloss.flatten(0, 2).index_copy_(0, pixel, light.flatten(0, 1))
+        return gloss.masked_fill_(~glossy[..., None], 0)
 
     def _lobes(
         self, at: Tensor, normal: Tensor, rays: Tensor, roughness: Tensor, source: Tensor, sent: Tensor
     ) -> Tensor:
-        """The mean of the points' light over a lobe about the mirrored ray, (N, 3).
+        """The mean of the points' light over a lobe about the mirrored ray, (Q, N, 3), of roughness (Q, N, 1).
 
         The lobe is a von Mises–Fisher distribution; each point has the weight of its solid angle. Its κ is 1 / (2 α²):
         Beckmann's normals of roughness α have 2 / α² about the surface's normal, and mirroring doubles their angles.
@@ -184,21 +186,29 @@ class LitPoints(nn.Module):
         mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
         leaves, squared = self._between(at, source)
         distance = squared.sqrt()
-        cosine = (mirrored @ source.T - (mirrored * at).sum(-1, keepdim=True)) / distance
-        sharpness = 0.5 / roughness.clamp(min=SHARPEST)[:, None] ** 2
-        weight = (sharpness * (cosine - 1)).clamp(min=LEAST_LOGARITHM).exp() * leaves / (squared * distance)
+        sharpness = 0.5 / roughness.clamp(min=SHARPEST) ** 2
+        weight = _height(mirrored, at, source).div_(distance).sub_(1).mul_(sharpness).clamp_(min=LEAST_LOGARITHM)
+        weight.exp_().mul_(leaves).div_(squared.mul_(distance))
         return (weight @ sent) / weight.sum(-1, keepdim=True).clamp(min=1e-12)
 
     def _between(self, at: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
-        """Distance × cosine at each point's front, at least 0, and the squared distance, (N, L) each.
+        """Distance × cosine at each point's front, at least 0, and the squared distance, (B, N, L) each.
 
         The square is at least a point's area over π, so that no near point outweighs all others.
         """
-        leaves = (at @ self.normal.T - (source * self.normal).sum(-1)).clamp(min=0)
-        squared = (at * at).sum(-1, keepdim=True) + (source * source).sum(-1) - 2 * at @ source.T
-        return leaves, squared.clamp(min=self._area / math.pi)
+        back = torch.cat([self.normal.expand_as(source), -(source * self.normal).sum(-1, keepdim=True)], dim=-1)
+        one = torch.ones_like(at[..., :1])
+        squares = torch.cat([-2 * source, (source * source).sum(-1, keepdim=True)], dim=-1)
+        leaves = torch.cat([at, one], dim=-1) @ back.mT
+        squared = torch.baddbmm((at * at).sum(-1, keepdim=True), torch.cat([at, one], dim=-1), squares.mT)
+        return leaves.clamp_(min=0), squared.clamp_(min=self._area / math.pi)
+
+
+def _height(direction: Tensor, at: Tensor, source: Tensor) -> Tensor:
+    """direction · (source − at) of surfaces (B, N, 3) and points (B, L, 3), (B, N, L)."""
+    return torch.baddbmm(-(direction * at).sum(-1, keepdim=True), direction, source.mT)
 
 
 def _pool(image: Tensor) -> Tensor:
-    """Means over squares of pixels, (H, W, 3) → (H/4, W/4, 3)."""
-    return functional.avg_pool2d(image.permute(2, 0, 1)[None], COARSE)[0].permute(1, 2, 0)
+    """Means over squares of pixels, (B, H, W, 3) → (B, H/4, W/4, 3)."""
+    return functional.avg_pool2d(image.permute(0, 3, 1, 2), SQUARE).permute(0, 2, 3, 1)

@@ -9,6 +9,7 @@ Shape letters: B batch, P points, H W image, C channels.
 from __future__ import annotations
 
 import math
+from contextlib import nullcontext
 from itertools import pairwise
 
 import torch
@@ -17,7 +18,7 @@ from torch.nn import functional
 
 from photonfarm.trainer.networks.inputs import Inputs, SceneFrame
 from photonfarm.trainer.networks.projection import footprint, project_mean
-from photonfarm.trainer.runs.devices import round_convolutions
+from photonfarm.trainer.runs.devices import is_asynchronous, round_convolutions
 from photonfarm.trainer.runs.settings import NetworkSettings, Precision
 
 HALVINGS = 3
@@ -28,8 +29,8 @@ class ConvBlock(nn.Module):
 
     def __init__(self, width: int) -> None:
         super().__init__()
-        self.first = _make_convolution(width, width)
-        self.second = _make_convolution(width, width)
+        self.first = Convolution(width, width)
+        self.second = Convolution(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) → (B, C, H, W)."""
@@ -48,15 +49,15 @@ class ImageSynthesisLayer(nn.Module):
         super().__init__()
         self.precision = precision
         widths = [width << level for level in range(HALVINGS + 1)]
-        self.enter = nn.ModuleList(_make_convolution(a, b) for a, b in pairwise([channels_in, *widths]))
+        self.enter = nn.ModuleList(Convolution(a, b) for a, b in pairwise([channels_in, *widths]))
         self.encode = nn.ModuleList(ConvBlock(w) for w in widths)
-        self.join = nn.ModuleList(_make_convolution(fine + coarse, fine) for fine, coarse in pairwise(widths))
+        self.join = nn.ModuleList(Convolution(fine + coarse, fine) for fine, coarse in pairwise(widths))
         self.decode = nn.ModuleList(ConvBlock(w) for w in widths[:-1])
-        self.out = _make_convolution(width, 3)
+        self.out = Convolution(width, 3)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, channels_in, H, W) → (B, 3, H, W), exposed linear radiance."""
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.precision == "bfloat16"):
+        with torch.autocast(x.device.type, torch.bfloat16) if self.precision == "bfloat16" else nullcontext():
             x = self._features(x)
         return self.out(x.float())
 
@@ -73,8 +74,25 @@ class ImageSynthesisLayer(nn.Module):
         return x
 
 
-def _make_convolution(channels_in: int, channels_out: int) -> nn.Conv2d:
-    return nn.Conv2d(channels_in, channels_out, kernel_size=3, padding=1)
+CARD_CHANNELS = 8
+"""The divisor of a convolution's channels for which cards have quick ones in every precision."""
+
+
+class Convolution(nn.Conv2d):
+    """A 3×3 convolution that keeps the size; on a card with further channels of zeros, which change nothing."""
+
+    def __init__(self, channels_in: int, channels_out: int) -> None:
+        super().__init__(channels_in, channels_out, kernel_size=3, padding=1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(B, C, H, W) → (B, C′, H, W)."""
+        more_in, more_out = (-count % CARD_CHANNELS for count in (self.in_channels, self.out_channels))
+        if not is_asynchronous(x.device) or not (more_in or more_out):
+            return super().forward(x)
+        weight = functional.pad(self.weight, (0, 0, 0, 0, 0, more_in, 0, more_out))
+        bias = None if self.bias is None else functional.pad(self.bias, (0, more_out))
+        padded = functional.pad(x, (0, 0, 0, 0, 0, more_in))
+        return functional.conv2d(padded, weight, bias, padding=1)[:, : self.out_channels]
 
 
 IMAGE_CHANNELS = 10

@@ -108,7 +108,7 @@ def _apply_split(layer: nn.Linear, local: Tensor, shared: Tensor) -> Tensor:
 def masked_max(x: Tensor, present: Tensor) -> Tensor:
     """The maximum over present points, (B, P, F) and (B, P) → (B, F); zero if no point is present."""
     maximum = x.masked_fill(~present[..., None], -torch.inf).amax(dim=1)
-    return torch.where(present.any(dim=1, keepdim=True), maximum, 0)
+    return maximum.masked_fill(~present.any(dim=1, keepdim=True), 0)
 
 
 class LightTransportLayer(nn.Module):
@@ -142,7 +142,7 @@ class LightTransportLayer(nn.Module):
             local = block(local, shared)
             shared = masked_max(local, present)
             if base_cloud is not None:
-                shared = torch.where(present.any(dim=1, keepdim=True), shared - shared[-1:], 0)
+                shared = (shared - shared[-1:]).masked_fill(~present.any(dim=1, keepdim=True), 0)
         local, shared = local[:samples], shared[:samples]
         return torch.cat([local, shared[:, None].expand_as(local)], dim=-1)
 

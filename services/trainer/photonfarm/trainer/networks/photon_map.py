@@ -9,10 +9,10 @@ Shape letters: B batch, K photon slots, H W image.
 from __future__ import annotations
 
 import math
+from functools import cache
 
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks.inputs import Inputs, SceneFrame, require
@@ -64,7 +64,7 @@ def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Te
     rays, forward = optics.rays(world_to_camera), world_to_camera[:, None, None, 2, :3]
     along, facing = (rays * forward).sum(dim=-1), (rays * normal).sum(dim=-1).abs()
     area = (depth / optics.focal_px) ** 2 * along / facing.clamp(min=GRAZING)
-    return torch.where(facing < GRAZING, 0, area)
+    return area.masked_fill(facing < GRAZING, 0)
 
 
 def arrives_on_seen_side(position: Tensor, direction: Tensor, normal: Tensor, world_to_camera: Tensor) -> Tensor:
@@ -80,21 +80,21 @@ def gather_light(power: Tensor, kept: Footprint, area: Tensor) -> list[Tensor]:
     The result is zero if there is no surface nearby.
     """
     B, H, W = area.shape
-    landed = power.flatten(0, 1).index_select(0, kept.point)
-    flux = power.new_zeros(B * H * W, 3).index_add(0, kept.pixel, landed).view(B, H, W, 3)
-    both = torch.cat([flux * (area > 0)[..., None], area[..., None]], dim=-1).permute(0, 3, 1, 2)
+    flux = kept.sum(power, B * H * W).view(B, H, W, 3) * (area > 0)[..., None]
+    both = torch.cat([flux, area[..., None]], dim=-1).permute(0, 3, 1, 2)
     maps = []
     for share in WINDOWS:
-        around = _blur(both, max(round(0.5 * (share * W - 1)), 1)).permute(0, 2, 3, 1)
+        beside = max(round(0.5 * (share * W - 1)), 1)
+        across, down = (_make_blur(size, beside, both.dtype, both.device) for size in (W, H))
+        around = (down @ (both @ across)).permute(0, 2, 3, 1)
         seen = around[..., 3:]
-        maps.append(around[..., :3] / torch.where(seen > 0, seen, torch.inf) / math.pi)
+        maps.append(around[..., :3] / seen.masked_fill(~(seen > 0), math.inf) / math.pi)
     return maps
 
 
-def _blur(x: Tensor, beside: int) -> Tensor:
-    """Means over squares with so many pixels on each side of a pixel, three times, (B, C, H, W); zero outside."""
-    side = 2 * beside + 1
-    for _ in range(3):
-        x = functional.avg_pool2d(x, (1, side), 1, (0, beside))
-        x = functional.avg_pool2d(x, (side, 1), 1, (beside, 0))
-    return x
+@cache
+def _make_blur(size: int, beside: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """The matrix (size, size) of means over so many places on each side, taken three times; zero outside."""
+    place = torch.arange(size, dtype=torch.float64)
+    near = ((place[:, None] - place).abs() <= beside).double() / (2 * beside + 1)
+    return torch.linalg.matrix_power(near, 3).to(device, dtype)

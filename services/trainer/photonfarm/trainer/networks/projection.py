@@ -13,6 +13,7 @@ from torch import Tensor
 
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
+from photonfarm.trainer.runs.devices import is_asynchronous
 from photonfarm.trainer.runs.settings import Occlusion
 
 
@@ -36,8 +37,11 @@ class Optics:
 
     def rays(self, world_to_camera: Tensor) -> Tensor:
         """Unit world directions through the pixel centres, (B, H, W, 3): normalise(T⁻¹ K⁻¹ (u+.5, v+.5, 1))."""
-        x = (torch.arange(self.width).to(world_to_camera) + 0.5 - 0.5 * self.width) / self.focal_px
-        y = (torch.arange(self.height).to(world_to_camera) + 0.5 - 0.5 * self.height) / self.focal_px
+        columns, rows = (
+            torch.arange(n, device=world_to_camera.device).to(world_to_camera) for n in (self.width, self.height)
+        )
+        x = (columns + 0.5 - 0.5 * self.width) / self.focal_px
+        y = (rows + 0.5 - 0.5 * self.height) / self.focal_px
         right, down, forward = (world_to_camera[:, None, None, i, :3] for i in range(3))
         direction = x[:, None] * right + y[:, None, None] * down + forward
         return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
@@ -45,10 +49,29 @@ class Optics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Footprint:
-    """The pixel of each point; one entry per kept point."""
+    """The pixel of each kept point.
 
-    point: Tensor  # (K,) int64 index into B·P
+    On a processor there is one entry per kept point. A card would be waited for to learn how many these are: there it
+    has all points, and those left out lie in any pixel and count nothing.
+    """
+
     pixel: Tensor  # (K,) int64 index into B·H·W
+    point: Tensor | None = None  # (K,) int64 index into B·P; None: all in their order
+    left_out: Tensor | None = None  # (K,) bool; None: no entry is
+
+    def sum(self, values: Tensor, pixels: int) -> Tensor:
+        """The sum of the kept points' values in each of B·H·W `pixels`: (B, P, C) → (B·H·W, C)."""
+        return values.new_zeros(pixels, values.shape[-1]).index_add(0, self.pixel, self._take(values.flatten(0, 1)))
+
+    def count(self, pixels: int) -> Tensor:
+        """The number of kept points in each of B·H·W `pixels`, (B·H·W, 1) float."""
+        ones = torch.ones(len(self.pixel), 1, device=self.pixel.device)
+        ones = ones if self.left_out is None else ones.masked_fill_(self.left_out[:, None], 0)
+        return torch.zeros(pixels, 1, device=self.pixel.device).index_add(0, self.pixel, ones)
+
+    def _take(self, values: Tensor) -> Tensor:
+        values = values if self.point is None else values.index_select(0, self.point)
+        return values if self.left_out is None else values.masked_fill(self.left_out[:, None], 0)
 
 
 @torch.no_grad()
@@ -69,18 +92,28 @@ def footprint(
     is_exact = optics.occlusion == "exact"
     x, y, z = (position @ world_to_camera[:, :, :3].mT + world_to_camera[:, None, :, 3]).unbind(-1)
     ahead = (present & seen if is_exact else present) & (z > 0)
-    z = torch.where(ahead, z, 1)  # avoids division by zero; dropped below
+    z = z.masked_fill(~ahead, 1)  # avoids division by zero; dropped below
     column = torch.floor(optics.focal_px * x / z + 0.5 * optics.width)
     row = torch.floor(optics.focal_px * y / z + 0.5 * optics.height)
-    inside = ahead & (column >= 0) & (column < optics.width) & (row >= 0) & (row < optics.height)
-    sample, point = inside.nonzero(as_tuple=True)
-    u, v = column[sample, point].long(), row[sample, point].long()
+    kept = ahead & (column >= 0) & (column < optics.width) & (row >= 0) & (row < optics.height)
+    u, v = (each.masked_fill(~kept, 0).long() for each in (column, row))
+    pixel = v * optics.width + u
     if not is_exact:
-        surface = depth[sample, v, u]
-        behind = (1 / surface - 1 / z[sample, point]) / (1 / optics.near - 1 / optics.far)
-        in_sight = (surface == 0) | (behind <= optics.tolerance)
-        sample, point, u, v = (index[in_sight] for index in (sample, point, u, v))
-    return Footprint(point=sample * position.shape[1] + point, pixel=(sample * optics.height + v) * optics.width + u)
+        surface = depth.flatten(1).gather(1, pixel)
+        behind = (1 / surface - 1 / z) / (1 / optics.near - 1 / optics.far)
+        kept &= (surface == 0) | (behind <= optics.tolerance)
+    return _of_kept(kept, pixel, optics.height * optics.width)
+
+
+def _of_kept(kept: Tensor, pixel: Tensor, pixels: int) -> Footprint:
+    """The footprint of kept points (B, P), each in one of `pixels` of its image."""
+    samples, points = kept.shape
+    first = torch.arange(samples, device=kept.device)[:, None] * pixels
+    if is_asynchronous(kept.device):
+        anywhere = torch.arange(points, device=kept.device) % pixels  # sums are slow where all go to one pixel
+        return Footprint((first + torch.where(kept, pixel, anywhere)).flatten(), left_out=~kept.flatten())
+    point = kept.flatten().nonzero().flatten()
+    return Footprint((first + pixel).flatten().index_select(0, point), point)
 
 
 def project_mean(features: Tensor, kept: Footprint, height: int, width: int) -> Tensor:
@@ -88,8 +121,6 @@ def project_mean(features: Tensor, kept: Footprint, height: int, width: int) -> 
 
     Differentiable in the features; a point that is not in the footprint contributes nothing, in value or gradient.
     """
-    B, _, C = features.shape
-    pixels = B * height * width
-    total = features.new_zeros(pixels, C).index_add(0, kept.pixel, features.flatten(0, 1).index_select(0, kept.point))
-    count = torch.bincount(kept.pixel, minlength=pixels).clamp(min=1).to(features.dtype)
-    return (total / count[:, None]).view(B, height, width, C)
+    pixels = len(features) * height * width
+    mean = kept.sum(features, pixels) / kept.count(pixels).clamp(min=1).to(features.dtype)
+    return mean.view(len(features), height, width, -1)

@@ -20,7 +20,7 @@ from photonfarm.core.statistics import Estimate, clean_error, clean_error_having
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks import predict_image
-from photonfarm.trainer.networks.inputs import Inputs, map_tensors
+from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.networks.network import Network
 
 Predictor = Callable[[TrainingBatch], F32]
@@ -63,13 +63,12 @@ class DevicePredictor:
     @torch.no_grad()
     def __call__(self, batch: TrainingBatch) -> F32:
         """A batch's images."""
-        inputs = map_tensors(lambda tensor: tensor.to(self.device), batch.inputs)
-        images: F32 = self.images(inputs).cpu().numpy()
+        images: F32 = self.images(batch.inputs.to(self.device)).cpu().numpy()
         return images
 
     def of_its_own(self, inputs: Inputs) -> Inputs:
         """A copy of these inputs on the predictor's device, which outlives their batch."""
-        return map_tensors(lambda tensor: tensor.to(self.device, copy=True), inputs)
+        return inputs.to(self.device, copy=True)
 
     @torch.no_grad()
     def wall_s(self, inputs: Inputs) -> float:

@@ -30,8 +30,8 @@ def usable_device(name: str) -> torch.device:
     """The device of this name, "cpu", "cuda" or "cuda:N"; for "auto", cuda if there is one and otherwise the cpu.
 
     On CUDA float32 then means float32 in this process: by torch's default convolutions round their factors to TF32,
-    whose mantissa has 10 bits. That is done where a network is asked for it, by `round_convolutions`. Raises SpecError
-    if torch cannot use the device.
+    whose mantissa has 10 bits. That is done where a network is asked for it, by `round_convolutions`. The quickest
+    convolution is found by trying all when a shape is first seen. Raises SpecError if torch cannot use the device.
     """
     if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", name):
         raise SpecError(f"device = {name!r}: must be auto, cpu, cuda or cuda:N")
@@ -42,16 +42,23 @@ def usable_device(name: str) -> torch.device:
         raise SpecError(f"device = {name!r}: cannot be used here: {str(error).splitlines()[0]}") from error
     if device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False
+        torch.backends.cudnn.benchmark = True
     return device
+
+
+def is_asynchronous(device: torch.device) -> bool:
+    """Whether a device works on while Python hands it more, so that to read a number from it is to wait: a card."""
+    return device.type != "cpu"
 
 
 def round_convolutions(device: torch.device, precision: Precision) -> None:
     """Let convolutions on CUDA round their factors to TF32 from now on, or not; their sums are float32 either way.
 
-    The setting is the process's, and a gradient's convolutions heed it too. So a network sets it before each image.
+    With bfloat16 that is the last convolution, whose inputs have fewer digits than TF32 already. The setting is the
+    process's, and a gradient's convolutions heed it too. So a network sets it before each image.
     """
     if device.type == "cuda":
-        torch.backends.cudnn.allow_tf32 = precision == "tf32"
+        torch.backends.cudnn.allow_tf32 = precision != "float32"
 
 
 def describe_device(device: torch.device, precision: Precision = "float32") -> str:
@@ -117,20 +124,20 @@ class Ranks:
             with self._others_there():
                 distributed.all_reduce(torch.zeros(()))
 
-    def average_gradients(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> float:
-        """The loss over the joint batch, whose gradient the weights get; `count` of its samples are of this process."""
+    def average_gradients(self, weights: Sequence[nn.Parameter], loss: Tensor, count: int) -> Tensor:
+        """The loss over the joint batch, (), whose gradient the weights get; `count` of its samples are here."""
         if self.size == 1:
-            return loss.item()
+            return loss.detach()
         gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in weights]
         sums = torch.cat([*(g.flatten() for g in gradients), loss.detach().reshape(1)]) * count
-        sums = torch.cat([sums, sums.new_tensor([count])])
+        sums = torch.cat([sums, sums.new_full((1,), count)])
         with self._others_there():
             distributed.all_reduce(sums)
         self.within_step = False
         *means, mean_loss = torch.split(sums[:-1] / sums[-1], [*(g.numel() for g in gradients), 1])
         for weight, mean in zip(weights, means, strict=True):
             weight.grad = mean.view_as(weight)
-        return mean_loss.item()
+        return mean_loss[0]
 
     @contextmanager
     def lead(self) -> Iterator[None]:

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.trainer.data.batch import TrainingBatch
@@ -75,8 +75,7 @@ class WeightAverage:
         such as the running means of batch normalisation, are copied.
         """
         decay = min(self._decay, (1 + self._steps) / (10 + self._steps))
-        for mean, weight in zip(self.network.parameters(), network.parameters(), strict=True):
-            mean.lerp_(weight, 1 - decay)
+        torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), 1 - decay)
         for kept, buffer in zip(self.network.buffers(), network.buffers(), strict=True):
             kept.copy_(buffer)
         self._steps += 1
@@ -163,10 +162,10 @@ class Learner:
         """The learning rate of step `number`."""
         return self.rate_factor * compute_rate(number, self._settings)
 
-    def step(self, number: int, batch: TrainingBatch) -> float:
-        """Take an optimiser step on this process' part of a batch [supplement 3.1]; returns the whole batch's loss.
+    def step(self, number: int, batch: TrainingBatch) -> Tensor:
+        """Take an optimiser step on this process' part of a batch [supplement 3.1]; returns the whole batch's loss, ().
 
-        The loss is the same in all processes. If it is not finite, nothing has changed.
+        The loss is the same in all processes, and lies on the device: no step waits for a card.
         """
         for options in self.optimiser.param_groups:
             options["lr"] = self.rate(number)
@@ -174,12 +173,11 @@ class Learner:
         batch = batch.to(self._device).for_training()
         loss = self._loss(predict_image(self.network, batch.inputs), batch.target)
         torch.autograd.backward(loss)
-        value = self._ranks.average_gradients(list(self.network.parameters()), loss, len(batch.rows))
-        if math.isfinite(value):
-            self.optimiser.step()
-            if self.average is not None:
-                self.average.take(self.network)
-        return value
+        mean_loss = self._ranks.average_gradients(list(self.network.parameters()), loss, len(batch.rows))
+        self.optimiser.step()
+        if self.average is not None:
+            self.average.take(self.network)
+        return mean_loss
 
     def state(self) -> dict[str, Any]:
         """The weights, their average if there is one, and the optimiser's state, for a checkpoint."""

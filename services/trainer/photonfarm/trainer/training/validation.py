@@ -180,7 +180,7 @@ class GoodState:
 
         Raises DivergedError as `go_back` does.
         """
-        value = self._learner.step(number, batch)
+        value = float(self._learner.step(number, batch))
         if math.isfinite(value):
             return value
         self.go_back(f"step {number}: the loss is {value} on rows {list(batch.rows)}")

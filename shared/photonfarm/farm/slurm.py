@@ -22,7 +22,7 @@ SIGNAL_S = 60
 """The seconds before the time limit at which SLURM sends TERM, or up to a minute earlier, as it may."""
 
 WORKER_TASK = '"${SLURM_ARRAY_JOB_ID}_$SLURM_ARRAY_TASK_ID"'
-"""A worker's task, for the shell. One of an array's has the array's own SLURM_JOB_ID, by which SLURM means them all."""
+"""A worker's task as the shell writes it. Its SLURM_JOB_ID may be the array's own, which for SLURM is all the tasks."""
 
 TRAINER_TASK = '"$SLURM_JOB_ID"'
 """The trainer's job, for the shell."""
@@ -155,7 +155,7 @@ task={task}
 near_limit=
 on_term() {{
     case $(squeue --noheader --jobs "$task" --format %T 2>/dev/null) in
-        RUNNING | SIGNALING) near_limit=yes; kill -TERM "$process" ;;
+        RUNNING | SIGNALING) near_limit=yes; kill -TERM "$process" ;; # SIGNALING: SLURM has just sent this TERM
         '') kill -TERM "$process" ;; # SLURM does not answer
     esac
 }}
@@ -214,7 +214,8 @@ def launch(scripts: Mapping[str, str], logs: Path) -> Launch:
     workers, trainer = _submit(files[WORKERS]), None
     if TRAINER in files:
         try:
-            trainer = _submit(files[TRAINER], f"--dependency=after:{workers.partition(';')[0]}_0")
+            array = workers.partition(";")[0]  # without its cluster, which a dependency does not name
+            trainer = _submit(files[TRAINER], f"--dependency=after:{array}_0")
         except SchedulerError as error:
             raise SchedulerError(f"{error}. The workers are submitted, as job {workers}") from error
     return Launch(workers, trainer, {name: str(file) for name, file in files.items()}, str(logs))

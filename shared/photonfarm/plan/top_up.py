@@ -97,7 +97,7 @@ def _candidates(planned: PlannedViews, views: Rows, count: Rows) -> SamplesToPla
     modification = planned.known.vectors("modification", modification_row)
     view = planned.known.vectors("view", planned.view_row[views])
     of_sample = np.repeat(np.arange(len(views)), count)
-    number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)
+    number = np.arange(len(of_sample)) - np.repeat(np.cumsum(count) - count, count)  # from 0 in each view
     pass_ = (planned.next_pass[views][of_sample] + number).astype(np.int32)
     keys = sample_keys(planned.spec.radiance_id, modification[of_view[of_sample]], view[of_sample], pass_)
     return SamplesToPlan(
@@ -166,11 +166,13 @@ def _select(planned: PlannedViews, where: Sequence[str]) -> Mask:
                     number = len(planned.known.plans)
                     raise SpecError(f"where plan={value}: the scene has {number} plans, numbered from 0")
                 first, rows = planned.known.plans[value]
-                selected &= np.isin(planned.view_row, rows.sample_view[rows.sample_view >= first])
+                own = rows.sample_view >= first  # samples of views that the plan itself added
+                selected &= np.isin(planned.view_row, rows.sample_view[own])
             case "rows":
                 within = (planned.sample_row >= value[0]) & (planned.sample_row <= value[1])
                 selected &= np.isin(planned.view_row, planned.sample_view[within])
             case "modification" | "view":
+                # Keys take time, so only those of views that are still selected are made
                 keys = planned.view_keys(selected) if kind == "view" else planned.modification_keys(selected)
                 selected[selected] = [key.hex().startswith(value) for key in keys]
             case "held-out":

@@ -35,6 +35,11 @@ def job_name(scene_id: str, job: int) -> str:
     return f"{scene_id}-{job}"
 
 
+def scene_of(name: str) -> str:
+    """The scene id in a job's name; of other text, what is before its last hyphen."""
+    return name.rpartition("-")[0]
+
+
 class RenderArguments(NamedTuple):
     """The scene and the number of a job."""
 

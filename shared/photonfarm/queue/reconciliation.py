@@ -13,7 +13,7 @@ from redis.exceptions import LockError
 
 from photonfarm.core.errors import QueueError
 from photonfarm.queue.connection import redis_errors
-from photonfarm.queue.job import job_name
+from photonfarm.queue.job import job_name, scene_of
 from photonfarm.queue.rq_adapter import add, fail_lost, forget_failures, open_queue
 from photonfarm.queue.workers import read_started, serve
 from photonfarm.store import SceneStore, Store
@@ -54,7 +54,7 @@ def fill_seldom(store: Store, connection: Redis, *, scene_id: str | None = None,
         if filled is None:
             return "waits"
         if filled.queued:
-            return "queued"
+            return "queued"  # not kept for the others, as all of that may soon be taken
         look: Look = "waits" if filled.under_way else "nothing"
         connection.set(key, look, px=int(1000 * every_s))
         return look
@@ -108,9 +108,10 @@ def _fill(store: Store, connection: Redis, only: str | None) -> _Filled:
     queue = open_queue(connection)
     fail_lost(queue)
     queued = queue.get_job_ids()
-    under_way = {*queued, *(entry.partition(":")[0] for entry in read_started(connection))}
+    started = [entry.partition(":")[0] for entry in read_started(connection)]  # from `<name>:<execution>`
+    under_way = {*queued, *started}
     busy = under_way.union(queue.failed_job_registry.get_job_ids(cleanup=False))
-    queued_of = Counter(name.rpartition("-")[0] for name in queued)
+    queued_of = Counter(map(scene_of, queued))
     missing = _missing(store, only)  # after the rest: what has left the queue since is committed
     wanted = [
         (scene_id, job)

@@ -23,7 +23,7 @@ from rq.serializers import JSONSerializer
 
 from photonfarm.queue.connection import redis_errors
 from photonfarm.queue.failures import Failure, shorten
-from photonfarm.queue.job import FUNCTION, QUEUE, QUEUE_KEY, TRIES, is_job_name, job_name
+from photonfarm.queue.job import FUNCTION, QUEUE, QUEUE_KEY, TRIES, is_job_name, job_name, scene_of
 from photonfarm.queue.workers import Activity, decode_text, read_started, read_workers
 
 AT_ONCE = 500
@@ -64,7 +64,7 @@ def take(
     """
     pages = (queue.get_job_ids(first, AT_ONCE) for first in range(0, len(queue), AT_ONCE))
     for name in chain.from_iterable(pages):
-        scene = name.rpartition("-")[0]
+        scene = scene_of(name)
         if scene in leave or scene_id not in (None, scene):
             continue
         if not queue.connection.lrem(queue.key, 1, name):  # another worker was faster

@@ -70,5 +70,5 @@ def test_a_single_value_tells_nothing_of_its_error() -> None:
 
 def test_a_time_buys_whole_samples_and_one_at_least() -> None:
     cost = ImageCost(fixed_s=1.0, sample_s=2.0)
-    assert [cost.bought(s) for s in (0.5, 3.0, 5.9, 6.1, 1e9)] == [1, 1, 2, 3, 65536]
+    assert [cost.samples_for(s) for s in (0.5, 3.0, 5.9, 6.1, 1e9)] == [1, 1, 2, 3, 65536]
     assert [cost.pays(s) for s in (2.3, 2.5)] == [False, True]

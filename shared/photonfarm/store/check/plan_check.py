@@ -114,7 +114,7 @@ def _check_plan(scene: CheckedScene, folder: str) -> Iterator[Finding]:
         yield scene.finding(Cause.PLAN, str(error).partition(": ")[2], document)
         return
     scene.shard_rows = scene.shard_rows or about.shard_rows
-    remedy = plans.rewritten(about.request)
+    remedy = plans.remedy_for(about.request)
     for name in plans.INPUTS:
         if detail := _describe_damage(scene.storage, f"{folder}/{name}", group, name):
             yield scene.finding(Cause.PLAN_INPUTS, f"{detail}; {remedy}", f"{folder}/{name}")

@@ -98,14 +98,14 @@ class ObjectStorage:
         with os_errors(name):
             for _ in range(REPLACED_TIMES):
                 try:
-                    return patiently(lambda: self._copied(name, anew=anew), times=TRANSFER_TIMES)
+                    return patiently(lambda: self._copy_once(name, anew=anew), times=TRANSFER_TIMES)
                 except FileNotFoundError:
-                    return self._cache.path(name, None)
+                    return self._cache.path(name, None)  # where nothing is, as whoever opens it learns
                 except PreconditionError:  # replaced in the meantime
                     continue
         raise OSError(errno.EAGAIN, "is being replaced again and again", name)
 
-    def _copied(self, name: str, *, anew: bool) -> Path:
+    def _copy_once(self, name: str, *, anew: bool) -> Path:
         about = obstore.head(self._objects, name)
         copy = self._cache.path(name, _version(about))
         if anew or not self._cache.has(copy, about["size"]):
@@ -280,7 +280,7 @@ class ObjectStorage:
                     return True
                 if holder is not None and not replace:
                     return False
-                raise
+                raise  # and try again: there is no object yet, or the one to be replaced is another by now
             return True
 
         with os_errors(name):

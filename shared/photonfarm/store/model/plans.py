@@ -18,15 +18,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from photonfarm.core.errors import CorruptError, SpecError, store_errors
 from photonfarm.core.keys import Key
 from photonfarm.core.models import sentences
-from photonfarm.plan.request import (
-    UNUSED,
-    Expansion,
-    Joined,
-    PlannedContent,
-    PlannedRows,
-    Request,
-    expand,
-)
+from photonfarm.plan.request import UNUSED, Expansion, Joined, PlannedContent, PlannedRows, Request, expand
 from photonfarm.plan.top_up import TopUp, expand_top_up
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
@@ -212,7 +204,7 @@ def load_all(storage: Storage, scene: str, loaded: list[StoredPlan], *, until: i
         names = storage.names(f"{scene}/{PLANS}")
         times = sum(name.startswith(FORGOTTEN) for name in names)
         kept = [plan for plan in loaded if plan.forgotten == times]
-        end = _counted(storage, scene, names, len(kept)) if until is None else until
+        end = _count_by_names(storage, scene, names, len(kept)) if until is None else until
         all_plans = kept + [replace(_load(storage, scene, n), forgotten=times) for n in range(len(kept), end)]
         for number, plan in enumerate(all_plans):
             if markers.withdrawn_file(plan.folder).rpartition("/")[2] in names:
@@ -237,11 +229,11 @@ def count(storage: Storage, scene: str) -> int:
     A last plan that is still being written does not count. This shows only in a bucket, where the folder is claimed
     first, and its zarr.json comes last.
     """
-    return _counted(storage, scene, storage.names(f"{scene}/{PLANS}"), 0)
+    return _count_by_names(storage, scene, storage.names(f"{scene}/{PLANS}"), 0)
 
 
-def _counted(storage: Storage, scene: str, names: list[str], loaded: int) -> int:
-    """The number of plans by the names in their folder; the first `loaded` are known to be there."""
+def _count_by_names(storage: Storage, scene: str, names: list[str], loaded: int) -> int:
+    """The number of plans by the names in their folder, as `folder` makes them; the first `loaded` are known."""
     numbers = [name for name in names if name.isascii() and name.isdecimal()]
     count = max((int(name) + 1 for name in numbers if name == f"{int(name):0{NAME_DIGITS}d}"), default=0)
     if count <= loaded:
@@ -255,14 +247,14 @@ def _load(storage: Storage, scene: str, number: int) -> StoredPlan:
     """A plan; raises CorruptError if it is missing or not as it was written."""
     name = folder(scene, number)
     group, about = open_plan(storage, name)
-    with _unreadable(storage, name, rewritten(about.request)):
+    with _unreadable(storage, name, remedy_for(about.request)):
         rows = PlannedRows(*(schema.read_input(storage, f"{name}/{each}", group[each]) for each in INPUTS))
     known = {each.name: getattr(about, each.name) for each in fields(about)}
     named = int(np.count_nonzero(rows.sample_modification != UNUSED))
     return StoredPlan(**known, number=number, folder=name, rows=rows, named=named)
 
 
-def rewritten(request: AnyRequest) -> str:
+def remedy_for(request: AnyRequest) -> str:
     """The remedy for damaged inputs of a plan."""
     return findings.rejoin(request.store) if isinstance(request, Joined) else findings.REWRITE
 

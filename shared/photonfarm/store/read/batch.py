@@ -14,15 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.keys import Key, seed_of
-from photonfarm.core.records import (
-    F32,
-    BasePointCloud,
-    Guides,
-    Photons,
-    ViewBuffers,
-    Visibility,
-    arrays_of,
-)
+from photonfarm.core.records import F32, BasePointCloud, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
@@ -136,7 +128,7 @@ class Batch:
     """Samples in their stored types; `SceneReader.read_batch` fills it."""
 
     spec: SceneSpec
-    radiance: NDArray[np.float16]  # (B, 2, H, W, 3) linear × 1/`scale`, halves A and B; NaN: see `wide`
+    radiance: NDArray[np.float16]  # (B, 2, H, W, 3) linear × 1/`scale`, halves A and B; NaN if it is in `wide`
     of_view: dict[str, NDArray[Any]]  # (B, …) by name: buffers and bits of what is seen, and guides; or none of these
     rows: NDArray[np.int64]  # (B,) row of each sample, of its view and of its modification
     view_rows: NDArray[np.int64]
@@ -150,7 +142,8 @@ class Batch:
         of_view = [name for name, array in arrays.items() if array.kind == "view"]
         names = [name for name in of_view if (guides if name in GUIDE_NAMES else buffers)]
         memory = {name: np.empty((size, *arrays[name].shape), arrays[name].dtype) for name in ("radiance", *names)}
-        return cls(spec, memory.pop("radiance"), memory, *np.zeros((3, size), np.int64))
+        rows, view_rows, modification_rows = np.zeros((3, size), np.int64)
+        return cls(spec, memory.pop("radiance"), memory, rows, view_rows, modification_rows)
 
     def __len__(self) -> int:
         """The number of samples that it holds, or has memory for."""
@@ -184,10 +177,10 @@ class Batch:
 
     def visibility(self, place: int) -> Visibility:
         """Which points and photons the view of one sample sees, unpacked into new memory."""
-        seen = [
-            np.unpackbits(self.of_view[name][place], count=count, bitorder="little").view(np.bool_)
+        seen = {
+            name: np.unpackbits(self.of_view[name][place], count=count, bitorder="little").view(np.bool_)
             if count
             else np.zeros(0, np.bool_)
             for name, count in schema.bit_counts(self.spec).items()
-        ]
-        return Visibility(*seen)
+        }
+        return Visibility(points=seen["point_seen"], photons=seen["photon_seen"])

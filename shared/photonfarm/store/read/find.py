@@ -201,7 +201,7 @@ class SceneMatch:
         if query.job is not None:
             rows = rows[rows // self._plans[0].shard_rows == query.job]
         if query.sample is not None:
-            wanted = np.frombuffer(query.sample, "<u8")
+            wanted = np.frombuffer(query.sample, "<u8")  # a key as two numbers, which are compared at once
             rows = rows[(inputs.column("sample_key")[rows].view("<u8") == wanted).all(axis=1)]
         distance = np.zeros(len(rows))
         if query.modification is not None and len(rows):

@@ -15,7 +15,7 @@ import mitsuba as mi
 from photonfarm.renderer.bdpt.randomness import Sampler
 
 NoteSplat: TypeAlias = "Callable[[mi.Point2f, mi.Spectrum, mi.Bool], None]"
-"""A function of places in the crop window, what is added there, and which of it is."""
+"""A function of places in the crop window, what is added there if each pixel has one light path, and which is."""
 
 SENSORS = ("PerspectiveCamera", "ThinLensCamera")
 

@@ -21,8 +21,8 @@ from photonfarm.renderer.bdpt.lights.emission import DirectSample, Lights, hit_d
 from photonfarm.renderer.bdpt.randomness import SHIFTS, Sampler
 from photonfarm.renderer.bdpt.recording import loop_once
 
-_MAX_SURVIVAL = 0.95
-_NEAR_VERTICES = 2
+_MAX_SURVIVAL = 0.95  # as in Mitsuba's `path`
+_NEAR_VERTICES = 2  # the eye vertices that make all n_C connections
 
 
 @dataclass(slots=True)
@@ -121,7 +121,8 @@ def _bounce(
         p_direct, p_emission = hit_densities(scene, lights, emitter, si, s.ray.o, s.before, s.active & ~first)
         if options.light_samples > 1:
             p_direct *= dr.select(depth == 2, mi.Float(options.light_samples), 1)
-        arrived_dvc = dr.select(depth == 2, 0, dr.select(si.is_valid(), dvc, s.dvc))  # no t=1 for direct light
+        # No t=1 for direct light; and in the sky a ray arrives at no surface, so that its dVC is still that before
+        arrived_dvc = dr.select(depth == 2, 0, dr.select(si.is_valid(), dvc, s.dvc))
         w = dr.select(first, 1, weights.hit_emitter(p_direct, p_emission, s.dvcm, arrived_dvc))
         emitted = emitter.eval(si, s.active)
         radiance += dr.select(dr.max(emitted) > 0, s.throughput * emitted * w, 0)
@@ -287,7 +288,7 @@ def connect_all(scene: mi.Scene, options: PathOptions, connectable: Connectable,
 def _connect(scene: mi.Scene, options: PathOptions, own: OwnVertex, vertex: KeptVertex) -> mi.Spectrum:
     """One connection (Georgiev 2012, §4.3): both vertices' BSDFs, G without its cosines, visibility and weight."""
     ctx = mi.BSDFContext()
-    active = own.active & (vertex.depth > 0)
+    active = own.active & vertex.is_there
     active &= own.depth + vertex.depth + 1 <= options.max_depth
     si, other = own.si, vertex.si
 

@@ -33,7 +33,12 @@ class KeptVertex:
     counted_dvcm: mi.Float  # count · dVCM on arrival, with the count of the technique that joins the vertex before
     dvc: mi.Float  # on arrival: see weights.py
     count: mi.Float  # of the technique that joins this vertex
-    depth: mi.UInt32  # edges from the light
+    depth: mi.UInt32  # edges from the light; 0 where there is no vertex
+
+    @property
+    def is_there(self) -> mi.Bool:
+        """Whether there is a vertex: none is where no path of the image reached one that a connection could reach."""
+        return self.depth > 0
 
     def record(self) -> Record:
         """Everything in it, as it lies in memory."""
@@ -75,11 +80,11 @@ class KeptVertices:
         return cls(numbers, slots)
 
     def draw(self, slot: mi.UInt32, active: mi.Bool) -> KeptVertex:
-        """The kept vertices of the paths in slots; their depth is 0 if no path of the image has one."""
+        """The kept vertices of the paths in slots; all or none of an image's slots have one."""
         return self.read(dr.gather(mi.UInt32, self.slots, slot, active), active)
 
     def read(self, path: mi.UInt32, active: mi.Bool) -> KeptVertex:
-        """The kept vertex of light path ``path``; its depth is 0 if there is none."""
+        """The kept vertex of light path ``path``, if there is one."""
         p, n, frame_n, frame_s, wi, throughput, dp_du, dp_dv = (
             dr.gather(mi.Vector4f, self.numbers, path * _QUADS + k, active) for k in range(_QUADS)
         )

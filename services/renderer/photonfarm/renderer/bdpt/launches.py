@@ -130,6 +130,11 @@ class Lanes:
         return self.images, self.width, self.height, self.samples, self.light_paths, self.poses is not None
 
     @property
+    def has_connections(self) -> bool:
+        """Whether eye paths of the launch are connected to light paths."""
+        return self.shifts is not None
+
+    @property
     def pixels(self) -> int:
         """The number of pixels of one image."""
         return self.width * self.height

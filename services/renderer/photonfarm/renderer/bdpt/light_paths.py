@@ -30,7 +30,7 @@ from photonfarm.renderer.bdpt.lights.emission import AREA, Emission, Lights, sam
 from photonfarm.renderer.bdpt.randomness import Sampler
 from photonfarm.renderer.bdpt.recording import loop_once
 
-_MAX_SURVIVAL = 0.95
+_MAX_SURVIVAL = 0.95  # as in Mitsuba's `path`
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,15 +50,8 @@ class PathOptions:
     @property
     def kind(self) -> tuple[int, ...]:
         """The numbers for which the kernels are compiled."""
-        return (
-            self.max_depth,
-            self.rr_depth,
-            self.connections,
-            self.connects,
-            self.traces_light,
-            self.light_samples,
-            self.useful is not None,
-        )
+        counts = self.max_depth, self.rr_depth, self.connections, self.light_samples
+        return *counts, self.connects, self.traces_light, self.useful is not None
 
     def usefulness(self, si: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
         """How useful light vertices are for connections, 1 on average; 1 for all where it is not known."""
@@ -130,17 +123,17 @@ def first_state(scene: mi.Scene, lights: Lights, start: Emission, rng: Sampler, 
     active &= hit.is_valid()
     dvcm, dvc = start_weights(start, lights, start.ray(hit.t), dr.square(hit.t), active)
     return LightState(
-        active,
-        rng,
-        start.ray,
-        hit,
-        mi.Spectrum(start.throughput),
-        dvcm,
-        dvc,
-        mi.Float(1),
-        mi.UInt32(1),
-        mi.Float(0),
-        kept,
+        active=active,
+        rng=rng,
+        ray=start.ray,
+        hit=hit,
+        throughput=mi.Spectrum(start.throughput),
+        dvcm=dvcm,
+        dvc=dvc,
+        count=mi.Float(1),  # next event estimation, which joins the vertex on the light
+        depth=mi.UInt32(1),
+        weight=mi.Float(0),
+        kept=kept,
     )
 
 

@@ -27,7 +27,7 @@ from photonfarm.renderer.bdpt.launches import Launch
 LIGHT, EYE, PAIRING, PHOTONS, PIXELS, LEARNING, SLOTS = range(7)
 """What a sequence is for, as a part of its seed."""
 
-_ULP = 1 / (1 << 24)
+_ULP = 1 / (1 << 24)  # the step between the numbers in [0, 1) that are made here
 
 SHIFTS = 64
 """The number of depths with a shift of their own; deeper eye vertices reuse them, which only correlates them."""
@@ -66,7 +66,7 @@ class Sampler:
 
     def next_1d(self) -> mi.Float:
         """A number in [0, 1)."""
-        seed = self._next_seed()
+        seed = self._next_seed()  # and as in `next_2d`, whose first coordinate this is
         return _unit(_scramble(dr.brev(_scramble(self.index, seed)), _mix(seed)))
 
     def next_independent(self) -> mi.Float:
@@ -101,12 +101,8 @@ def shifts(seeds: Sequence[int], launch: Launch, connections: int) -> mi.UInt32:
 
     There is one for each image of a launch, depth and connection, uniform below the number of light paths.
     """
-    table = [
-        np.random.default_rng([seed, PAIRING, launch.first_sample]).integers(
-            launch.light_paths, size=SHIFTS * connections
-        )
-        for seed in seeds
-    ]
+    generators = [np.random.default_rng([seed, PAIRING, launch.first_sample]) for seed in seeds]
+    table = [each.integers(launch.light_paths, size=SHIFTS * connections) for each in generators]
     return mi.UInt32(np.concatenate(table).tolist())  # a list: Dr.Jit compiles again for each alignment of numpy's
 
 

@@ -109,13 +109,13 @@ class ImageCost:
         """Whether a time pays for about one sample per pixel: for LEAST_SAMPLES."""
         return seconds >= self.time_s(LEAST_SAMPLES)
 
-    def bought(self, seconds: float) -> int:
+    def samples_for(self, seconds: float) -> int:
         """The samples per pixel that a time pays for, as a whole number of at least 1."""
         return int(np.clip(round((seconds - self.fixed_s) / self.sample_s), 1, MOST_SAMPLES))
 
     def per_sample_s(self, seconds: float) -> float:
         """The time of each of the samples per pixel that a time pays for."""
-        samples = self.bought(seconds)
+        samples = self.samples_for(seconds)
         return self.time_s(samples) / samples
 
 
@@ -198,7 +198,7 @@ def compare_at_cost(measured: Iterable[MeasuredCandidate], spp: int, seconds: fl
     by_candidate = {one.candidate: one for one in measured}
     plain, found = by_candidate[PLAIN], {}
     for one in by_candidate.values():
-        samples = one.cost.bought(seconds)
+        samples = one.cost.samples_for(seconds)
         relative_cost = one.errors.ratio * one.cost.per_sample_s(seconds) / plain.cost.per_sample_s(seconds)
         relative = one.errors.relative_spread(plain.errors)
         found[one.candidate] = CandidateAtCost(

@@ -170,7 +170,8 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         half_s = costs[now].time_s(half_spp)
 
         left_s = max(budget.left_s, 0.0)
-        image_s = FIRST_ROUND * left_s / (2 + max(1.0, SCOUTS / len(timed)))  # for one of each candidate in each view
+        images = 2 + max(1.0, SCOUTS / len(timed))  # of each candidate in each view: a pair, and its share of scouts
+        image_s = FIRST_ROUND * left_s / images  # for one of each candidate in each view
         fixed_s, sample_s = sum(cost.fixed_s for cost in timed.values()), sum(cost.sample_s for cost in timed.values())
         spp = int(np.clip((image_s / LEAST_VIEWS - fixed_s) / sample_s, 1, half_spp))
         views = int(np.clip(image_s / (fixed_s + spp * sample_s), LEAST_VIEWS, MOST_VIEWS))
@@ -215,7 +216,7 @@ def _shrink_film(scene: PilotScene, target_s: float) -> None:
         if image_s <= target_s or min(film.width, film.height) < 64 or image_s > 0.7 * before:
             return
         before = image_s
-        scene.use_film(Film(width=film.width // 16 * 8, height=film.height // 16 * 8))
+        scene.use_film(Film(width=film.width // 16 * 8, height=film.height // 16 * 8))  # half, a multiple of 8
 
 
 # -------------------------------------------------------------------------------------- kept measurements

@@ -107,7 +107,7 @@ class _Rounds:
     ) -> None:
         """Compile, and render the images that give each view's weights."""
         self._views, self._costs, self._later_s, self._spp, self._clock = views, costs, later_s, spp, clock
-        self._seeds = [count(seed + 1_000_003 * v) for v in range(len(views))]
+        self._seeds = [count(seed + 1_000_003 * v) for v in range(len(views))]  # far apart, so that no two meet
         self._errors: dict[Candidate, dict[int, list[float]]] = {c: {} for c in costs}  # of an image, by view and pair
         self._seconds: dict[Candidate, list[float]] = {c: [] for c in costs}  # of an image
         self._block_sums = {c: BlockSums() for c in costs}

@@ -148,6 +148,7 @@ def _compare(measurement: Measurement, candidate: Candidate, half_spp: int) -> A
 
 
 def _better(measurement: Measurement, candidate: Candidate, half_spp: int) -> tuple[Candidate, int] | None:
+    """The best settings at the cost of these, if they are significantly better; None if not."""
     candidates = _compare(measurement, candidate, half_spp)
     chosen = best(one for one in candidates.values() if one.fits)
     if chosen.candidate == candidate or not saving(chosen, over=candidates[candidate]).significant:
@@ -199,11 +200,7 @@ def _why(plan: TransportPlan, rows: Sequence[CandidateAtCost]) -> list[str]:
     """The reasons for the plan, and why it does not have the best measured settings, if it does not."""
     if not rows:
         return [BLACK]
-    chosen, now, half_spp = (
-        plan.at_equal_cost[plan.candidate],
-        present_settings(plan.spec),
-        plan.spec.transport.half_spp,
-    )
+    chosen, now = plan.at_equal_cost[plan.candidate], present_settings(plan.spec)
     reasons = [*reasons_for(chosen, rows, plan.measurement.shared)]
     fastest = best(row for row in rows if row.fits)
     gain = saving(fastest, over=chosen)
@@ -212,7 +209,7 @@ def _why(plan: TransportPlan, rows: Sequence[CandidateAtCost]) -> list[str]:
             f"{fastest.candidate} was measured {plus_minus(gain.factor, gain.spread)} times as fast; less than "
             f"{CLEAR:g} standard errors or {WORTHWHILE:.0%} are not worth a change"
         )
-    if plan.half_spp != half_spp:
+    if plan.half_spp != (half_spp := plan.spec.transport.half_spp):
         reasons.append(f"half_spp {plan.half_spp} costs about what {half_spp} does with the spec's settings, {now}")
     return reasons
 

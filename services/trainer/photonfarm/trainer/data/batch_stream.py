@@ -24,9 +24,10 @@ class RoundSampler:
     """Draws each row once a round, in random order, and a row that was drawn less often up to `catch_up` times more.
 
     Some time after the last arrival all rows have been drawn equally often, to within one. Two simpler ways are worse.
-    Uniform draws from a growing set would favour early rows, by r ln(n_end/n_then). Drawing the least drawn rows first
-    would train on each new shard alone until it had caught up, and the network would forget the others. Here new rows
-    come more often, but never alone; only a `catch_up` above the draws of every row gives that strict order.
+    Uniform draws from a growing set would favour early rows: with r draws for each arrival, row n of n_end would be
+    drawn r·ln(n_end/n) times. Drawing the least drawn rows first would train on each new shard alone until it had
+    caught up, and the network would forget the others. Here new rows come more often, but never alone; only a
+    `catch_up` above the draws of every row gives that strict order.
 
     Draws depend on the seed, the order of arrival, and the number of rows that had arrived at each draw, and on nothing
     else.
@@ -167,7 +168,10 @@ class BatchStream:
         return batch
 
     def drop(self) -> None:
-        """Drop this process's batches that were read ahead, so that other rows can be read; other ranks keep theirs."""
+        """Drop this process's batches that were read ahead, so that it can read others to validate; then `ask_again`.
+
+        Other ranks keep theirs.
+        """
         for _ in self._asked:
             self._feed.take()
 

@@ -32,9 +32,10 @@ class SceneFrame:
     """The constants of a scene by which inputs are normalised to values near 1; all ours, as the supplement gives none.
 
     Positions are taken about the centre of the geometry's bounding box and, like depths, divided by half its diagonal.
-    Emission is divided by its root mean square over the cloud: lamps, few points among many, stand out so far that
-    maxima over the points encode their places before any step. With `emission = log` that is done once more with
-    log(1 + emission): lamps and far brighter windows then stand out alike. Normals, rays and albedo are near 1 anyway.
+    Emission is divided by its root mean square over the cloud: lamps, few points among many, stand out so far that the
+    maxima over points, by which networks pool, encode the lamps' places even before training. With `emission = log`
+    that is done once more with log(1 + emission): lamps and far brighter windows then stand out alike. Normals, rays
+    and albedo are near 1 anyway.
     """
 
     optics: Optics
@@ -191,12 +192,12 @@ class Inputs:
         """The inputs that a `SceneDataset` has read, (B, …) by field, in the same memory; and noisy colour."""
         inputs = cls(tensors["world_to_camera"], tensors["depth"], tensors["albedo"], tensors["normal"], noisy=noisy)
         if POINTS[0] in tensors:
-            inputs = replace(inputs, points=PointInputs(*(tensors[name] for name in POINTS)))
+            inputs = replace(inputs, points=PointInputs(*(tensors[name] for name in POINTS)))  # in their order
         if PHOTONS[0] in tensors:
             arrays = {name.removeprefix("photon_"): tensors[name] for name in (*PHOTONS, "photon_seen")}
             inputs = replace(inputs, photons=PhotonInputs(**arrays, present=arrays["bounce"] >= 0))
         if GUIDES[0] in tensors:
-            inputs = replace(inputs, guides=GuideInputs(*(tensors[name] for name in GUIDES)))
+            inputs = replace(inputs, guides=GuideInputs(**{name: tensors[name] for name in GUIDES}))
         return inputs
 
     def to(self, device: torch.device, *, copy: bool = False) -> Inputs:

@@ -121,7 +121,7 @@ def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Tot
     splat_squares, started, edges, connection_squares, connections = totals
     splats, joined = read(weigh(splat_squares), weigh(connection_squares))
     gain = estimate_gains(layout, splats, float(joined.sum()), *read(started, edges, probability))
-    table = None if lanes.shifts is None else estimate_usefulness(joined, *read(connections))
+    table = estimate_usefulness(joined, *read(connections)) if lanes.has_connections else None
     return LightGuide.of(StartGuide.of(layout, gain), table)
 
 

@@ -137,13 +137,14 @@ class GuidedStarts:
     def draw(self, path: mi.UInt32, paths: mi.UInt32, rng: Sampler) -> DrawnStart:
         """Starts of the light paths ``path`` among ``paths`` [1]."""
         layout, last = self.layout, self.layout.cells - 1
+        # 48 bits: a cell may be far smaller than a path's share of [0, 1), and a Float would know few places in it
         fine = mi.Float64(rng.next_1d()) + mi.Float64(rng.next_independent()) / (1 << 24)
         below = mi.Point2f(rng.next_independent(), rng.next_independent())
         place = (mi.Float64(path) + fine) / mi.Float64(paths)
         target = place * dr.gather(mi.Float64, self.cdf, mi.UInt32(last))
         cell = mi.UInt32(dr.binary_search(0, last, lambda i: dr.gather(mi.Float64, self.cdf, i) <= target))
         start = dr.gather(mi.Float64, self.cdf, dr.maximum(cell, 1) - 1, cell > 0)
-        rest = (target - start) / (dr.gather(mi.Float64, self.cdf, cell) - start)
+        rest = (target - start) / (dr.gather(mi.Float64, self.cdf, cell) - start)  # the place in the cell, in [0, 1)
         inside = point_on_curve(mi.UInt32(dr.clip(rest, 0, 1 - 2.0**-33) * 4294967296.0), below)
         square = cell // layout.positions**2
         light = square // layout.directions**2

@@ -23,7 +23,8 @@ Totals: TypeAlias = "tuple[mi.Float, mi.Float, mi.Float, mi.Float, mi.Float]"
 """The sums of a tally, in device memory."""
 
 NoteConnection: TypeAlias = "Callable[[KeptVertex, mi.Spectrum, mi.Bool], None]"
-"""Notes connections: the vertices of light paths that they go to, what they add to images, and which are made."""
+"""Notes connections: the vertices of light paths that they go to, the radiance that each adds to its eye path's
+estimate, and which are made."""
 
 MOST_TILES = 64
 """The most tiles of all images together: each image is cut into equal tiles, whose brightness says how noise counts."""
@@ -43,7 +44,12 @@ def tile_of(image: mi.UInt32, x: mi.Float, y: mi.Float, side: int) -> mi.UInt32:
 class Tally:
     """Sums over light paths by the cell of their start, and over connections by the cell of their light vertex.
 
-    Weights make squares of both kinds what is added to a pixel's variance at one eye path per pixel, on average.
+    Values are weighted so that the sums of squares of both kinds estimate the same: the variance of a pixel, the mean
+    over an image's pixels, at one eye path per pixel.
+
+    - A splat of the value v adds v/n_T to its pixel, with n_T light paths per eye path. Then the n_T light paths per
+      pixel add n_T·E[v²]/n_T² to its variance, and the mean of v²/n_T over the light paths of the tally estimates that.
+    - A connection's value v is added to one pixel, whose variance gets E[v²]: the mean of v² over eye paths.
     """
 
     splat_squares: mi.Float  # [T·C]: of values of splats, by the tile that they fall in
@@ -62,7 +68,7 @@ class Tally:
         """A tally of nothing, for a launch."""
         side = tiles_per_side(lanes.images)
         tile_count = lanes.images * side**2
-        cells = CELLS if lanes.shifts is not None else 1
+        cells = CELLS if lanes.has_connections else 1
         return cls(
             splat_squares=dr.zeros(mi.Float, layout.cells * tile_count),
             starts=dr.zeros(mi.Float, layout.cells),
@@ -91,9 +97,9 @@ class Tally:
         dr.scatter_add(self.edges, mi.Float(edges), self.cells)
 
     def make_note_splat(self, image: mi.UInt32, light_ratio: mi.Float) -> NoteSplat:
-        """A function that adds splats to the tally; ``light_ratio`` is light paths per eye path of guided images."""
+        """A function that adds splats to the tally; ``light_ratio`` is n_T, of the images that will be guided."""
         _, _, light_paths = self.lanes.counts  # as data, of which another number compiles nothing
-        weight = dr.rsqrt(light_ratio * mi.Float(light_paths))
+        weight = dr.rsqrt(light_ratio * mi.Float(light_paths))  # its square: the mean of v²/n_T over light paths
 
         def note(position: mi.Point2f, value: mi.Spectrum, active: mi.Bool) -> None:
             x, y = position.x / self.lanes.width, position.y / self.lanes.height
@@ -106,11 +112,12 @@ class Tally:
         """A function that adds connections to the tally: of eye paths through these pixels of images."""
         row = pixel // self.lanes.width
         x, y = mi.Float(pixel - row * self.lanes.width) / self.lanes.width, mi.Float(row) / self.lanes.height
-        tile, weight = tile_of(image, x, y, self.side), float(1 / np.sqrt(self.lanes.eyes))
+        tile = tile_of(image, x, y, self.side)
+        weight = float(1 / np.sqrt(self.lanes.eyes))  # its square: the mean of v² over eye paths
 
         def note(vertex: KeptVertex, value: mi.Spectrum, active: mi.Bool) -> None:
             cell = cell_of(self.grid, vertex.si)
-            active = active & (vertex.depth > 0)  # not `&=`, which would change the caller's mask
+            active = active & vertex.is_there  # not `&=`, which would change the caller's mask
             dr.scatter_add(self.connection_squares, _square(value * weight), cell * self.tile_count + tile, active)
             dr.scatter_add(self.connections, mi.Float(1), cell, active)
 

@@ -129,7 +129,8 @@ class Lights:
     ) -> mi.Float:
         """The density of light paths from the point ``ds`` of a light to ``x``, over that of the default sampling.
 
-        ``ds`` is seen from ``x``, ``n`` is the light's normal there.
+        ``ds`` is seen from ``x``. ``n`` is the light's normal there on the side that shines, as light paths start about
+        it: a sample's own, and of hits the shading normal, as vertex normals may be opposite to the faces' ``si.n``.
         """
         if self.guided is None:
             return mi.Float(1)
@@ -163,6 +164,7 @@ def read_lights(scene: mi.Scene) -> Lights:
     weights = [sampling_weight(emitter, params) for emitter, params in zip(emitters, parameters, strict=True)]
     for i, key in enumerate(ids):
         if kinds[i] == AREA and shapes[key].is_mesh():
+            # Others are left to hits: Mitsuba samples them with wrong densities or normals, as these functions say
             has_densities = is_flat(shapes[key]) & (is_unfolded(shapes[key]) if is_textured(emitters[i]) else True)
             weights[i] = dr.select(has_densities, weights[i], 0)
         elif kinds[i] == AREA and shapes[key].class_name() == "Cylinder":
@@ -187,20 +189,9 @@ def read_lights(scene: mi.Scene) -> Lights:
     dr.scatter(alive, dr.select(weight > 0, mi.Float(1), 0), index)
     dr.scatter(emission_by_id, emission, index)
     dr.eval(alive, emit_cdf, emission_by_id, kind, axis, cos_cutoff)
+    spheres = Spheres.of([shapes.get(key) for key in ids])
     return Lights(
-        pointers,
-        n,
-        kinds,
-        kind,
-        selection,
-        alive,
-        emit_cdf,
-        emission_by_id,
-        axis,
-        cos_cutoff,
-        centre,
-        radius,
-        Spheres.of([shapes.get(key) for key in ids]),
+        pointers, n, kinds, kind, selection, alive, emit_cdf, emission_by_id, axis, cos_cutoff, centre, radius, spheres
     )
 
 
@@ -280,7 +271,7 @@ def hit_densities(
     reference.p = origin
     ds = mi.DirectionSample3f(scene, si, reference)
     p_direction = emitter.pdf_direction(reference, ds, active)
-    c = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)  # of the table above
+    c = dr.select(si.is_valid(), dr.abs(dr.dot(si.n, ds.d)), p_direction)  # of the table above; |cos| has no side
     emission = lights.emission_factor(emitter) * c * lights.gain(emitter, ds, si.sh_frame.n, vertex, active)
     return lights.nee_probability(emitter, vertex) * p_direction, emission
 
@@ -357,7 +348,7 @@ def _start_on_area(
 ) -> None:
     ps = out.emitter.get_shape().sample_position(mi.Float(0), u_position, mask)
     if lights.spheres is not None:
-        ps.n = lights.spheres.normal(index, ps)
+        ps.n = lights.spheres.normal(index, ps)  # of samples of positions alone: others and hits have right normals
     si = mi.SurfaceInteraction3f(ps, dr.zeros(mi.Color0f))
     if lights.guided is not None:
         si.sh_frame = grid.frame_about(ps.n)

@@ -23,12 +23,9 @@ _SAMPLES = 4  # of each light in each cell
 _DEFENSIVE = 0.2  # share of the probability that follows the sampling weights
 _GRID_KEY = 0x5E1EC7
 _FLAT = 1e-4  # largest 1 − |cos| between a vertex normal and its face's normal at which a mesh light counts as flat
-_PROBES = (
-    (1 / 3, 1 / 3, 1 / 3),
-    (0.8, 0.1, 0.1),
-    (0.1, 0.8, 0.1),
-    (0.1, 0.1, 0.8),
-)  # points of each face that are looked up
+_PROBES = ((1 / 3, 1 / 3, 1 / 3), (0.8, 0.1, 0.1), (0.1, 0.8, 0.1), (0.1, 0.1, 0.8))
+"""The points of each face that are looked up, in barycentric coordinates."""
+
 
 LightIndex: TypeAlias = "mi.Int32 | mi.UInt32"
 """Numbers of lights; ``dr.binary_search`` finds signed ones."""

@@ -35,7 +35,7 @@ class Map:
 
     values: images.Image
     lie: Lie | None = None
-    file: Path | None = None  # an image that is taken as it is, in place of the values
+    file: Path | None = None  # an image that Mitsuba reads as it is; the values are its own, or not decoded: (0, 0, C)
 
 
 def constant(*values: float) -> Map:
@@ -130,10 +130,11 @@ class Writer:
             top = SubElement(top, "bsdf")
         return top
 
-    def normals(self, part: Map, strength: float, name: str, *, mirrored: bool, of_all: bool = False) -> Map:
-        """A normal map of a strength, of x and y or `of_all` of what turns a normal.
+    def normals(self, part: Map, strength: float, name: str, *, mirrored: bool, from_flat: bool = False) -> Map:
+        """A normal map of a strength, which by glTF's rule is a factor on x and y.
 
-        Mitsuba's frame is right-handed where images lie mirrored, too.
+        With `from_flat`, as Blender reads MTL, normals go so far from the flat (0, 0, 1) to those of the map. Mitsuba's
+        frame is right-handed where images lie mirrored, too, so y is turned over there.
         """
         (a, b, _), (c, d, _) = (part.lie or Lie()).rows
         if b or c or min(a, d) < 0:
@@ -141,7 +142,7 @@ class Writer:
         if strength == 1 and not mirrored:
             return part
         vectors = (2 * part.values - 1) * np.array([strength, -strength if mirrored else strength, 1], np.float32)
-        if of_all:
+        if from_flat:
             vectors[..., 2] = 1 + strength * (vectors[..., 2] - 1)
         return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.lie)
 

@@ -139,6 +139,7 @@ class Lamps:
         for (x, y, z), flux, sine in self._discs:
             cosine = y * np.cos(down) + np.sin(down) * (z * np.cos(along) - x * np.sin(along))
             disc = cosine >= math.sqrt(1 - sine**2)
+            # Irradiance is the sum of radiance · cosine · solid angle, of a pixel sin(down)·2π²/(height·width)
             values[disc] += flux / (disc * cosine * np.sin(down)).sum() * height * width / (2 * math.pi**2)
         return str(images.save_radiance(values.astype(np.float32), self._scratch / "sky.exr"))
 
@@ -225,7 +226,7 @@ class Lamps:
 
 
 def _intensity(lamp: Lamp, strength: Floats) -> Floats:
-    """The radiant intensity of a point, and of a sphere of the lamp's radius."""
+    """The radiant intensity: of a sphere π·r² times its radiance, and of a point P/(4π), or P/π if not normalized."""
     if lamp["normalize"]:
         return strength / (4 * math.pi)
     return strength * (lamp["shadow_soft_size"] ** 2 or 1 / math.pi)

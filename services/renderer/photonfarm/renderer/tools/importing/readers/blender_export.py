@@ -190,7 +190,7 @@ def _emission(shader: Any, place: str) -> list[float]:
     if kind in ("ADD_SHADER", "MIX_SHADER"):
         one, other = (_emission(source(part), place) for part in list(shader.inputs)[-2:])
         share = _constant(shader.inputs[0], place)[0] if kind == "MIX_SHADER" else 0.5
-        scale = 1 if kind == "MIX_SHADER" else 2
+        scale = 1 if kind == "MIX_SHADER" else 2  # a sum is twice an even mix
         return [scale * ((1 - share) * a + share * b) for a, b in zip(one, other, strict=True)]
     if shader is not None:
         say("light", shader.bl_label, "is not carried over", place)

@@ -23,6 +23,7 @@ _SHADERS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
 }
 """The shaders that the Principled BSDF can stand for: which input becomes which of its own, and its other values."""
 
+# Inputs of the Principled BSDF that have to be 0, those of other shaders, and those that may be images
 _NEUTRAL = ("Subsurface Weight", "Sheen Weight", "Anisotropic", "Diffuse Roughness", "Thin Film Thickness")
 _SPECIAL = ("Roughness", "Anisotropy", "Thin Film Thickness")
 _COLOURS, _NUMBERS = ("Base Color", "Emission Color"), ("Roughness", "Metallic")
@@ -48,7 +49,7 @@ def prepare(material: Any, lose: Lose) -> None:
     surface = _make_principled(tree, node, lose)
     tree.links.new(surface.outputs[0], output.inputs["Surface"])
     for part in surface.inputs:
-        unfit = _unfit(part)
+        unfit = _find_unfit(part)
         if part.name in _NEUTRAL and (part.is_linked or part.default_value > 0):
             lose("colour", part.name, "is not carried over")
             for link in part.links:
@@ -104,7 +105,8 @@ def _mix(tree: Any, node: Any, lose: Lose) -> Any:
     if place < 0 or (place == 1 and not adds and share.is_linked):
         effect = "light" if "EMISSION" in kinds else "colour"
         lose(effect, node.bl_label, "only the heavier of its two shaders is carried over; bake it to images to keep it")
-        return _make_principled(tree, pair[not adds and share.default_value > 0.5], lose)
+        heavier = 0 if adds or share.default_value <= 0.5 else 1
+        return _make_principled(tree, pair[heavier], lose)
     made = _make_principled(tree, pair[1 - place], lose)
     if adds:
         if made.inputs["Emission Strength"].default_value > 0 or made.inputs["Emission Strength"].is_linked:
@@ -116,7 +118,7 @@ def _mix(tree: Any, node: Any, lose: Lose) -> Any:
         if made.inputs["Alpha"].default_value < 1 or made.inputs["Alpha"].is_linked:
             lose("colour", "Alpha", "of what is mixed with something transparent is not carried over")
         _give(share, made.inputs["Alpha"])
-        made.inputs["Alpha"].default_value = abs(place - share.default_value)
+        made.inputs["Alpha"].default_value = abs(place - share.default_value)  # the share is that of the second shader
     return made
 
 
@@ -125,7 +127,7 @@ def _say_tint(transparent: Any, lose: Lose) -> None:
         lose("colour", transparent.bl_label, "lets all colours through")
 
 
-def _unfit(part: Any) -> Any:
+def _find_unfit(part: Any) -> Any:
     """The node that an input is linked to, if the exporter would not write what it makes; else None."""
     node, name = source(part), part.name
     if node is None or node.type in ("RGB", "VALUE") or (node.type == "VERTEX_COLOR" and name == "Base Color"):

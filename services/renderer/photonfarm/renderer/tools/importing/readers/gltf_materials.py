@@ -163,7 +163,7 @@ class Materials:
         """A normal map of its strength."""
         node = entry.get("normalTexture")
         strength = node.get("scale", 1.0) if node else 1.0
-        part = self._map(node, [strength and 1.0] * 3, _RGB)
+        part = self._map(node, [strength and 1.0] * 3, _RGB)  # of strength 0, no image is read
         return writer.normals(part, strength, _TRANSFORM, mirrored=look.mirrored) if part.lie else None
 
     def _surface(self, entry: Node, colour: Map, painted: bool, writer: Writer) -> tuple[str, dict[str, Map]]:
@@ -184,6 +184,7 @@ class Materials:
             if coated and (clear or not thick):
                 writer.lose(_COAT, "glass has no coat of its own")
             if clear:
+                # A solid's colour is met twice: where light enters and where it leaves
                 tint = constant(*parts["base_color"].values.ravel() ** (0.5 if thick else 1))
                 glass = {"int_ior": parts["eta"], "specular_transmittance": tint}
                 return "dielectric" if thick else "thindielectric", glass

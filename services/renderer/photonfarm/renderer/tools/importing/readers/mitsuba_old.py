@@ -22,7 +22,7 @@ from photonfarm.renderer.tools.importing.changes import Changes, Effect
 Colour = NDArray[np.float64]
 """Linear sRGB, (3,)."""
 
-_HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_HUMP = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")  # where words meet in camelCase, which is snake_case in Mitsuba 3
 
 _NEAREST = {"roughdiffuse": "diffuse", "sky": "sunsky", "sun": "sunsky"}
 """The usual counterparts of what Mitsuba 3 has not."""
@@ -70,7 +70,7 @@ class Upgrade:
             if new in _UNSEEN or (kind, new) == ("roughdiffuse", "alpha"):
                 node.remove(part)
             elif part.tag not in ("default", "bsdf") and (part.tag, node.tag) != ("ref", "shape"):
-                self.names[new] = old
+                self.names[new] = old  # of other parts, names are the author's own
                 is_base = kind in ("diffuse", "roughdiffuse") and new == "diffuse_reflectance"
                 part.set("name", "reflectance" if is_base else new)
 
@@ -145,7 +145,7 @@ def value_of(node: Element, name: str) -> str:
 
 
 def _take(node: Element, name: str, otherwise: str) -> str:
-    """The value of a property, which is taken out."""
+    """The value of a property in small letters, which is taken out."""
     property_ = elements.child(node, name)
     if property_ is None:
         return otherwise

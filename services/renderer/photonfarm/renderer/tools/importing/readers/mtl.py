@@ -31,15 +31,22 @@ _RELIEFS = ("norm", "map_bump", "bump")
 _EFFECTS: dict[str, Effect | None] = {"disp": "geometry", "map_ka": None}  # of what is not carried over; else colour
 
 _OPTION = re.compile(
-    r"-(?:(type|imfchan)\s+(\S+)|(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?=\s)){0,3}))\s+",
+    r"-(?:(type|imfchan)\s+(\S+)"
+    r"|(\w+)((?:\s+(?:on|off|[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?)(?=\s)){0,3}))\s+",
     re.IGNORECASE,
 )
-"""An option before the name of an image: one word, or up to three numbers."""
+"""An option before the name of an image: these two with a word, others with up to three of on, off and numbers.
 
-_OPTIONS = re.compile(
-    r"(o|s|bm) [-+.\de ]*|(clamp|blendu|blendv|boost|texres) .*|(?!(o|s|bm) )\w+ (off|[0. ]*)|mm [0.]+ 1[0.]*"
+A number ends at a space, as names of images may begin with digits.
+"""
+
+_CARRIED_OPTION = re.compile(
+    r"(o|s|bm) [-+.\de ]*"  # carried over, with numbers
+    r"|(clamp|blendu|blendv|boost|texres) .*"  # carried over, or about filters
+    r"|(?!(o|s|bm) )\w+ (off|[0. ]*)"  # any other that changes nothing: off, or 0
+    r"|mm [0.]+ 1[0.]*"  # a base of 0 and a gain of 1
 )
-"""The options that have their meaning here, or none by what they speak of or by their values."""
+"""The options, as `name values`, that have their meaning here, or none by what they speak of or by their values."""
 
 _GLASS, _MIRRORS, _LIT = (4, 6, 7, 9), (3, 5, 8), range(1, 10)
 """The models of illumination that are glass, those that reflect the scene, and those of what light and shadows meet."""
@@ -50,6 +57,7 @@ WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 _GREY = (0.7, 0.7, 0.7)  # the reflectance of what has no colour
 _SMOOTH = 0.2  # gloss up to this α is Mitsuba's `roughplastic`, which loses light above; `principled` gains some
 _SHINES = 0.02  # gloss is modelled from this specular reflectance on
+_LEAST_ETA = 1.01  # the least index of refraction of `principled`, and here of glass
 
 
 def statements(file: Path) -> Iterator[tuple[int, str, str]]:
@@ -173,7 +181,14 @@ class Material:
     def put(self, top: Element, stem: Path) -> Element | None:
         """Make a Mitsuba material of an empty element; the emitter of what shines with it.
 
-        Names of images that are changed begin with `stem`.
+        Names of images that are changed begin with `stem`. By `illum` and opacity, which is `d` or 1 − `Tr`:
+
+            illum     is textured    opacity 1       below 1               0
+            glass     no             opaque, said    clear glass           clear glass
+            glass     yes            opaque, said    a mask of it, said    opaque, said
+            others    either         opaque          a mask of it          see `_dissolve`
+
+        Clear glass would show neither images nor colours of vertices.
         """
         writer = Writer(stem, self.changes, f"material {self.name!r}")
         for key, (_, word, _) in self.lines.items():
@@ -186,7 +201,7 @@ class Material:
         opacity, glow = self._opacity(illum), self._glow()
         tint = self.cut("tf", WHITE) if opacity else WHITE
         if illum in _GLASS and opacity and not self._is_textured:
-            glass = {"int_ior": self._eta(1.01), "specular_transmittance": constant(*tint)}
+            glass = {"int_ior": self._eta(_LEAST_ETA), "specular_transmittance": constant(*tint)}
             writer.put_surface(top, "thindielectric", glass)
             self.say(None, "illum", "becomes clear glass without a thickness, of Ni and Tf; Ke shines in full")
             return writer.light(glow, None, "map_Ke")
@@ -243,7 +258,7 @@ class Material:
             self.changes.lose("colour", word, "images are not there", f"{self.file.name}: line {line}: {rest}")
             return None
         for name, value in options.items():
-            if not _OPTIONS.fullmatch(f"{name} {value}"):
+            if not _CARRIED_OPTION.fullmatch(f"{name} {value}"):
                 self.say("colour", f"{word} -{name}", "is an option that is not carried over")
         return file, _lie(options), [*_floats(options, "bm"), 1.0][0]
 
@@ -268,7 +283,7 @@ class Material:
         return Map(np.float32(opacity) * grey.clip(0, 1), lie)
 
     def _dissolve(self, illum: float) -> float:
-        """Its `d`, or 1 − `Tr`, unless that hides what is there to be seen."""
+        """Its `d`, or 1 − `Tr`. A 0 by `Tr`, or beside images or `Ke`, is hardly meant, and 1 but for clear glass."""
         d, tr = self.lines.get("d"), self.cut("tr", (0.0,))[0]
         opacity = self.cut("d", (1 - tr,))[0]
         if d and d[2].lower().startswith("-halo") and opacity < 1:
@@ -302,7 +317,7 @@ class Material:
                 return None
             self.say(None, word, "has the colours of a normal map, and is taken for one")
         part = Map(values, lie, file if _is_plain(file) else None)
-        return writer.normals(part, strength, f"{word} -s", mirrored=self.mirrored, of_all=True)
+        return writer.normals(part, strength, f"{word} -s", mirrored=self.mirrored, from_flat=True)
 
     def _put_gloss(self, place: Element, illum: float, writer: Writer) -> None:
         """Put what lies below opacity: diffuse, with the gloss of plastic or without."""
@@ -317,6 +332,7 @@ class Material:
         if illum in _MIRRORS and not is_pbr:
             self.say("colour", f"illum {illum:g}", "reflects as plastic does here, and not as a mirror")
         if is_glossy:
+            # `roughplastic` has the colour of Ks, which is left out beside `Pr` and its like
             is_tinted = max(ks) - min(ks) > 0.1 * max(ks) and not (is_plastic or is_pbr)
             said = "becomes the gloss of plastic, by Ns" + ", without its colour" * is_tinted
             self.say("colour" if is_tinted else None, "Ks", said)
@@ -346,11 +362,11 @@ class Material:
         return parts
 
     def _eta(self, otherwise: float) -> Map:
-        """Its index of refraction."""
+        """Its index of refraction; where it is too small, the least of glass, or 1.5 of gloss, which `Ks` states."""
         eta = self._number("ni", 1.5)
-        if eta < 1.01:
+        if eta < _LEAST_ETA:
             self.say(None, f"Ni {eta:g}", f"is no index of what refracts, and is taken for {otherwise:g}")
-        return constant(eta if eta >= 1.01 else otherwise)
+        return constant(eta if eta >= _LEAST_ETA else otherwise)
 
     def _colour(self) -> Map:
         image = self.image("map_kd")

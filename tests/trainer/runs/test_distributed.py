@@ -149,7 +149,7 @@ def test_all_processes_go_back_together_and_keep_the_same_average(make_source, t
                 sample.radiance[:] = np.nan
             return sample
 
-        def step(learner: Learner, number: int, batch: Any) -> float:
+        def step(learner: Learner, number: int, batch: Any) -> torch.Tensor:
             value = honest(learner, number, batch)
             told = [*learner.predicting.parameters(), *learner.network.parameters()]
             sums = [weight.double().abs().sum().item() for weight in told]
@@ -166,9 +166,9 @@ def test_all_processes_go_back_together_and_keep_the_same_average(make_source, t
     assert followed[0] == followed[1]
     assert len(followed[0]) == 20
     records = [json.loads(line) for line in (run / METRICS).read_text().splitlines()]
-    recovered = [(record["cause"], record["step"]) for record in records if record["kind"] == "recovered"]
-    assert [step for cause, step in recovered if cause == "loss"] == [1, 11]
-    assert "held-out error" in [cause for cause, _ in recovered]
+    recovered = [(r["cause"], r["step"], r["back_to"]) for r in records if r["kind"] == "recovered"]
+    assert [told for told in recovered if told[0] == "loss"] == [("loss", 4, 0), ("loss", 12, 10)]
+    assert "held-out error" in [cause for cause, *_ in recovered]
 
 
 @pytest.mark.parametrize(("fault", "ended"), [("store", [4, 0]), ("step", [4, 7]), ("loss", [8, 8])])

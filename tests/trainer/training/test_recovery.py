@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -20,12 +21,18 @@ from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, METRICS
 from photonfarm.trainer.training import loop
-from photonfarm.trainer.training.learner import DivergedError
+from photonfarm.trainer.training.good_state import NEXT, SNAPSHOT_EVERY
+from photonfarm.trainer.training.learner import DivergedError, Learner
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.validation import NEXT, UP_TO_WHITE, Validation, compare, validate
+from photonfarm.trainer.training.recent_losses import FACTOR, LOOK_EVERY
+from photonfarm.trainer.training.validation import UP_TO_WHITE, Validation, compare, validate
 
 TOO_HIGH = {"learning_rate": 0.05, "max_steps": 30}
 """Of a rate by which the tiny network diverges, for as long as it takes to find a lower one."""
+
+
+RISING = {"learning_rate": 0.05, "seed": 1, "schedule": "cosine", "warm_up": 0.5}
+"""Of a rate that rises until the tiny network diverges, after some 50 steps."""
 
 
 def records(run: Path, kind: str) -> list[dict[str, Any]]:
@@ -192,19 +199,52 @@ def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
     assert not (tmp_path / "without" / GOOD).exists()
 
 
-def test_a_loss_that_is_not_finite_once_costs_a_run_what_it_learned_since_its_last_validation(
-    make_source, tiny, run, monkeypatch
+def test_a_run_whose_rate_rises_until_it_diverges_is_caught_within_thirty_steps_each_time_and_ends_well(
+    make_source, tiny, run, tmp_path, monkeypatch
 ) -> None:
-    monkeypatch.setattr(loop, "LOG_EVERY", 1)
-    settings = tiny(validate_every=4, validation_samples=3)
-    assert train(spoilt(make_source(24), lambda reads: reads == 27), settings, run).reason == "steps"
-    (found,) = [record for record in records(run, "recovered") if record["cause"] == "loss"]
-    step = found.pop("step")
-    wanted = {"kind": "recovered", "cause": "loss", "errors": None, "recoveries": 1, "rate_factor": 0.5}
-    assert found == {**wanted, "back_to": 4 * (step // 4)}
+    """No validation on the way finds it."""
+    losses, honest = [], Learner.step
+
+    def step(learner: Learner, number: int, batch: Any) -> torch.Tensor:
+        losses.append(loss := honest(learner, number, batch))
+        return loss
+
+    settings = tiny(**RISING, max_steps=300, validate_every=300, checkpoint_every=100)
+    without = train(make_source(48), settings.model_copy(update={"recover": False}), tmp_path / "without")
+    monkeypatch.setattr(Learner, "step", step)
+    outcome = train(make_source(48), settings, run)
+    found = [record for record in records(run, "recovered") if record["cause"] == "loss"]
+    assert len(found) >= 2
+    for before, record in pairwise([{"step": 0}, *found]):
+        assert record["back_to"] >= record["step"] - SNAPSHOT_EVERY - 30
+        since, limit = range(before["step"], record["step"]), FACTOR * record["losses"]["usual"]
+        assert next(n for n in since if losses[n] > limit) >= record["step"] - 30
+    assert outcome.last_error < 0.1 * without.last_error
+    assert outcome.last_error < 1.2 * train(make_source(48), tiny(max_steps=300), tmp_path / "calm").last_error
+
+
+def test_a_loss_that_is_not_finite_costs_a_run_a_few_dozen_steps(make_source, tiny, run, monkeypatch) -> None:
+    """Batches of 3 are read after 6 held-out samples at most, and 2 ahead: 3 × 75 reads are some 70 steps."""
+    monkeypatch.setattr(loop, "LOG_EVERY", LOOK_EVERY)
+    settings = tiny(validate_every=1000, checkpoint_every=1000, max_steps=120)
+    assert train(spoilt(make_source(24), lambda reads: reads == 225), settings, run).reason == "steps"
+    (found,) = records(run, "recovered")
+    wanted = {"kind": "recovered", "cause": "loss", "errors": None, "losses": {"now": None, "usual": None}}
+    assert found == {**wanted, "recoveries": 1, "rate_factor": 0.5, "step": 80, "back_to": 50}
     rates = {record["step"]: record["rate"] for record in records(run, "train")}
-    assert rates == {n: 5e-4 if n <= step else 2.5e-4 for n in range(1, 13) if n != step + 1}, "no loss to tell of that"
-    assert checkpoint.load(run / CHECKPOINT)["following"]["drawn"] == 12, "the order of samples goes on"
+    assert rates == {n: 5e-4 if n < 80 else 2.5e-4 for n in range(10, 121, 10) if n != 80}, "no loss to tell of that"
+    assert checkpoint.load(run / CHECKPOINT)["following"]["drawn"] == 120, "the order of samples goes on"
+
+
+def test_without_recovery_a_loss_that_is_not_finite_ends_the_run_before_it_is_in_a_checkpoint(
+    make_source, tiny, run
+) -> None:
+    source = spoilt(make_source(24), lambda reads: reads > 36)
+    with pytest.raises(DivergedError, match=r"step 12: the loss is not finite"):
+        train(source, tiny(max_steps=40, validate_every=100, checkpoint_every=4, recover=False), run)
+    assert checkpoint.load(run / CHECKPOINT)["step"] == 8
+    weights = checkpoint.load(run / CHECKPOINT)["network"]
+    assert all(torch.isfinite(weight).all() for weight in weights.values())
 
 
 def test_without_recovery_a_held_out_error_that_is_not_finite_ends_the_run(make_source, tiny, run, monkeypatch) -> None:
@@ -217,7 +257,7 @@ def test_without_recovery_a_held_out_error_that_is_not_finite_ends_the_run(make_
 def test_it_gives_up_after_eight_times(make_source, tiny, run) -> None:
     source = spoilt(make_source(24), lambda reads: reads > 20)
     with pytest.raises(DivergedError) as diverged:
-        train(source, tiny(max_steps=40, validate_every=100), run)
+        train(source, tiny(max_steps=100, validate_every=100, checkpoint_every=100), run)
     assert diverged.value.exit_code == 8
     assert [record["recoveries"] for record in records(run, "recovered")] == [*range(1, 9)]
 

@@ -24,8 +24,8 @@ from photonfarm.trainer.data.batch_stream import RoundSampler
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings
+from photonfarm.trainer.training.good_state import NEXT
 from photonfarm.trainer.training.loop import Hooks, train
-from photonfarm.trainer.training.validation import NEXT
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 
@@ -96,6 +96,24 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
     assert logs[0] == logs[1]
     assert ("recovered" in [kind for kind, _ in logs[0]]) == ("learning_rate" in recipe)
     assert not (killed / NEXT).exists()
+
+
+def test_a_run_killed_on_either_side_of_a_return_to_a_snapshot_does_too(make_source, tiny, run, tmp_path) -> None:
+    """The snapshot is older than most checkpoints, which hold it then; the rate rises until the run diverges."""
+    rising = {"learning_rate": 0.05, "seed": 1, "schedule": "cosine", "warm_up": 0.99}
+    settings, killed = tiny(max_steps=130, validate_every=1000, checkpoint_every=15, **rising), tmp_path / "killed"
+    train(make_source(48), settings, run)
+    logs = [run_folder.read_log(run / METRICS)]
+    back = [(record["step"], record["back_to"]) for record in logs[0] if record["kind"] == "recovered"]
+    assert any(step - to > 15 and to > 0 for step, to in back)
+    for step in sorted({17, *(step + by for step, _ in back for by in (-2, 2))}):
+        how = {"on_draws": die_after(3 * step)}
+        assert ended_by(lambda how=how: train(make_source(48), settings, killed, Hooks(**how))) == -signal.SIGKILL
+    train(make_source(48), settings, killed)
+    assert_same(run, killed)
+    logs.append(run_folder.read_log(killed / METRICS))
+    told = [[(r["kind"], r["step"], r.get("back_to"), r.get("losses")) for r in log] for log in logs]
+    assert told[0] == told[1]
 
 
 @pytest.mark.parametrize(

@@ -50,14 +50,13 @@ def print_dry_run(estimate: DryRun, as_json: bool) -> None:
 
 def _format_recovery(log_record: dict[str, Any]) -> str:
     """Why a run went back, and to which step."""
-    errors, back_to = log_record["errors"], f"the weights of step {log_record['back_to']}"
-    if errors is None:
-        reason = "the loss is not finite"
-    elif errors["now"] is None:
-        reason = "the held-out error is not finite"
+    back_to = f"the weights of step {log_record['back_to']}"
+    values, what = log_record["errors"] or log_record["losses"], "held-out error" if log_record["errors"] else "loss"
+    now, before = (None if value is None else format_estimate(value, None) for value in values.values())
+    if now is None:
+        reason = f"the {what} is not finite"
     else:
-        now, best = (format_estimate(errors[when], None) for when in ("now", "best"))
-        reason = f"held-out error {now} (best so far {best})"
+        reason = f"{what} {now} ({'best so far' if log_record['errors'] else 'usually up to'} {before})"
     if log_record["cause"] == "end":
         return f"{reason}; ends with {back_to}"
     return f"{reason}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"

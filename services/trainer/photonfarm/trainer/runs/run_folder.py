@@ -75,8 +75,9 @@ class MetricsLog:
         """Drop the records after the checkpoint of `step`, which a resumed run writes again.
 
         Returns the records that stay. They are renamed into place, so that a concurrent reader always finds a whole
-        file. A training record of `step` itself was written before the checkpoint, and so was everything up to an end
-        there; a validation or a change of settings without an end after it was written after the checkpoint.
+        file. A record of training up to `step`, or of a return by the losses there, was written before the checkpoint,
+        and so was everything up to an end there; a validation or a change of settings without an end after it was
+        written after the checkpoint.
         """
         with store_errors("cut the log", self._path):
             lines = _read_lines(self._path)
@@ -101,7 +102,8 @@ class MetricsLog:
 
 
 def _is_after(record: dict[str, Any], step: int) -> bool:
-    return record["step"] > step or (record["step"] == step and record["kind"] != "train")
+    of_a_step = record["kind"] == "train" or record.get("cause") == "loss"
+    return record["step"] > step or (record["step"] == step and not of_a_step)
 
 
 def _read_lines(path: Path) -> list[bytes]:

@@ -30,21 +30,14 @@ from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, lock_run
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.user_code import name_in_errors
+from photonfarm.trainer.training.good_state import GoodState, Setback, settle_files
 from photonfarm.trainer.training.learner import DivergedError, Learner, name_compile_errors
 from photonfarm.trainer.training.other_ranks import Presence
-from photonfarm.trainer.training.validation import (
-    Comparison,
-    GoodState,
-    Show,
-    Validation,
-    compare,
-    settle_files,
-    validate,
-)
+from photonfarm.trainer.training.validation import Comparison, Show, Validation, compare, validate
 
 T = TypeVar("T")
 
-LOG_EVERY = 50  # steps
+LOG_EVERY = 50  # steps, a multiple of `LOOK_EVERY`, by which losses are read
 NAP_SECONDS = 0.05  # between looks at the feed while there is nothing to train on
 
 
@@ -93,9 +86,9 @@ def train(source: SceneReader, settings: TrainSettings, run: Path, hooks: Hooks 
     `max_seconds`, or when `hooks.stop` is set; each leaves a checkpoint.
 
     Raises SpecError for a run of another network, scene or store, a device that is not there or a hold-out that leaves
-    nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the loss or
-    the held-out error is not finite, or the latter much worse than before, and there is no good state, or the run has
-    gone back too often; the last checkpoint stays.
+    nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the losses or
+    the held-out error are not finite, or much worse than before, and there is no good state, or the run has gone back
+    too often; the last checkpoint stays.
     """
     hooks = hooks or Hooks()
     torch.set_num_threads(settings.threads)
@@ -130,7 +123,7 @@ class Session:
         self._log = MetricsLog(run / METRICS, hooks.on_record)
         frame = SceneFrame.of(feed.spec, *feed.base, settings.network)
         self._learner = Learner(frame, settings, hooks.ranks)
-        self._good = GoodState(self._learner)
+        self._good = GoodState(self._learner, settings)
         self._best: dict[str, Any] | None = None  # the state of the run's best validation
         self._stream = BatchStream(feed, settings, hooks.ranks)
         self._step = 0
@@ -184,7 +177,7 @@ class Session:
         checkpoint.check_same_store(path, state, self._feed.plan_requests())
         recovery = state["recovery"]
         settle_files(self._run, recovery["good"])
-        self._good.restore(state, self._run, recover=self._settings.recover)
+        self._good.restore(state, self._run)
         if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
             self._best = recovery["best"]
         self._step, self._last_error = state["step"], state["last_error"]
@@ -211,7 +204,8 @@ class Session:
     def _save(self) -> None:
         with self._watch.on("save"):
             recovery = {**self._good.state(), "best": self._best}
-            state = {**self._learner.state(), **self._state(), "recovery": recovery}
+            recent = self._good.recent(self._step)
+            state = {**self._learner.state(), **self._state(), "recovery": recovery, "recent": recent}
             with self._good.save_with(self._run):
                 checkpoint.save(self._run / CHECKPOINT, state)
 
@@ -357,18 +351,15 @@ class Session:
             self._log_recovered("end", comparison)
             self._validate()
 
-    def _log_recovered(self, cause: str, comparison: Comparison | None = None) -> None:
+    def _log_recovered(self, cause: str, found: Comparison | Setback) -> None:
         self._compared = None  # the learner has changed
-        errors = None
-        if comparison is not None:  # JSON has no number for values that are not finite
-            found = {"now": comparison.error, "best": comparison.best}
-            errors = {name: error if math.isfinite(error) else None for name, error in found.items()}
         self._log.write(
             "recovered",
             step=self._step,
             cause=cause,
-            back_to=self._good.step,
-            errors=errors,
+            back_to=found.back_to if isinstance(found, Setback) else self._good.step,
+            errors=_describe(now=found.error, best=found.best) if isinstance(found, Comparison) else None,
+            losses=_describe(now=found.now, usual=found.usual) if isinstance(found, Setback) else None,
             recoveries=self._good.recoveries,
             rate_factor=self._learner.rate_factor,
         )
@@ -385,11 +376,16 @@ class Session:
 
     def _train_step(self, batch: TrainingBatch) -> None:
         with self._watch.on("train"):
-            value = self._good.step_or_go_back(self._step, batch)
-        if value is None:
-            self._log_recovered("loss")
+            setback = self._good.take_step(self._step, batch)
         self._step += 1
         self._report_draws()
-        if value is not None and self._step % LOG_EVERY == 0:
-            rate = self._learner.rate(self._step - 1)
-            self._log.write("train", step=self._step, loss=value, rate=rate, **self._counts())
+        if setback is not None:
+            self._log_recovered("loss", setback)
+        elif self._step % LOG_EVERY == 0:
+            rate, loss = self._learner.rate(self._step - 1), self._good.read_loss()
+            self._log.write("train", step=self._step, loss=loss, rate=rate, **self._counts())
+
+
+def _describe(**values: float) -> dict[str, float | None]:
+    """The values, with None for those that are not finite, for which JSON has no number."""
+    return {name: value if math.isfinite(value) else None for name, value in values.items()}

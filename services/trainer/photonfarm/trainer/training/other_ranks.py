@@ -25,8 +25,8 @@ from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.training.good_state import GoodState
 from photonfarm.trainer.training.learner import Learner, name_compile_errors
-from photonfarm.trainer.training.validation import GoodState
 
 
 def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
@@ -42,16 +42,16 @@ def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings,
     resident = ResidentSamples(ranks.device(settings.device), settings.resident_gb)
     with Feed(source(value["scene_id"], value["exposure"]), own, resident=resident) as feed:
         frame = SceneFrame.of(feed.spec, *feed.base, settings.network)
-        good, step = GoodState(Learner(frame, settings, ranks)), value["step"]
+        good, step = GoodState(Learner(frame, settings, ranks), settings), value["step"]
         if value["continues"]:
-            good.restore(checkpoint.load(run / CHECKPOINT), run, recover=settings.recover)
+            good.restore(checkpoint.load(run / CHECKPOINT), run)
         with name_compile_errors(settings.compile):
             while (received := ranks.receive())[0] != "end":
                 command, value = received
                 if command == "rows":
                     feed.ask(ranks.part(value))
                 elif command == "take":
-                    good.step_or_go_back(step, feed.take())
+                    good.take_step(step, feed.take())
                     step += 1
                 elif command == "keep":
                     good.keep(value)

@@ -3,17 +3,22 @@
 import os
 import subprocess
 import sys
+from itertools import combinations
+from typing import get_args
 
 import numpy as np
 import pytest
+import torch
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predictors.denoisers import Oidn, fill_in
 from photonfarm.trainer.predictors.evaluation import measure, read_batches
+from photonfarm.trainer.predictors.trained import OIDN, ReadyPredictor
+from photonfarm.trainer.runs.settings import OidnQuality
 
-pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
+pytest.importorskip("mitsuba_oidn", reason="the extra `oidn` is not installed")
 
 
 @pytest.fixture(scope="module")
@@ -46,19 +51,33 @@ def test_it_is_measured_on_a_store_like_any_predictor_and_better_than_what_it_is
     assert abs(difference.mean()) < 3 * difference.std(ddof=1) / np.sqrt(count)
 
 
-def test_bright_light_stays_as_bright_as_it_is(oidn: Oidn) -> None:
+@pytest.mark.parametrize("quality", get_args(OidnQuality))
+def test_bright_light_stays_as_bright_as_it_is(quality: OidnQuality) -> None:
     """The package clips at 1 without its flag for HDR."""
     rng = np.random.default_rng(0)
     albedo = np.full((64, 64, 3), 0.5, np.float32)
-    normal = np.broadcast_to(np.array([0, 0, 1], np.float32), albedo.shape)
+    normal = np.tile(np.array([0, 0, 1], np.float32), (64, 64, 1))
     colour = (20 * rng.gamma(4, 1 / 4, albedo.shape)).astype(np.float32)
-    denoised = oidn.denoise(colour, albedo, normal)
+    denoised = Oidn(quality=quality).denoise(*map(torch.from_numpy, (colour, albedo, normal))).numpy()
     assert denoised.mean() == pytest.approx(20, rel=0.05)
     assert np.mean((denoised - 20) ** 2) < 0.05 * np.mean((colour - 20) ** 2)
 
 
+def test_each_quality_has_a_name_and_makes_images_of_its_own(make_source, tiny) -> None:
+    made = {}
+    with Feed(make_source(1, size=32, noise=1.0), tiny(), needs=Needs(points=False, kept=1)) as feed:
+        (batch,) = read_batches(feed, [0], 1)
+        for denoiser in OIDN:
+            ready = ReadyPredictor(denoiser, 1, tiny())
+            made[ready.name] = ready.predictor(feed.spec, feed.base, "cpu")(batch)
+    assert list(made) == ["oidn 1/1", "oidn-balanced 1/1", "oidn-fast 1/1"]
+    for one, other in combinations(made.values(), 2):
+        difference = np.abs(one - other).max()
+        assert 1e-4 < difference < 0.5
+
+
 def test_without_its_package_it_says_what_to_install(monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "pyoidn", None)
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
     with pytest.raises(SpecError, match=r"photonfarm\[oidn\]"):
         Oidn()
 

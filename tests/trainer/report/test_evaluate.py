@@ -76,7 +76,7 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(measured, 
 
 
 def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured, trained, tmp_path: Path) -> None:
-    pytest.importorskip("pyoidn", reason="the extra `oidn` is not installed")
+    pytest.importorskip("mitsuba_oidn", reason="the extra `oidn` is not installed")
     runs = [TrainedRun.load(measured.runs[1]), trained(seed=1)]
     named = ["--store", measured.store, "--references", measured.references]
     named += [argument for run in runs for argument in ("--run", run.folder)]

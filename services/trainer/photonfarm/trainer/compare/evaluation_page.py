@@ -65,7 +65,7 @@ def make_table(evaluation: Evaluation, metrics: Mapping[str, tuple[str, int]] = 
     if all(row.metrics is None for row in evaluation.rows):
         metrics = {}
     head = ["predictor", "network, ms", "linear MSE (95 %)", "more than the first (95 %)"]
-    rendering = ", nor is rendering the 1/k of the pixels that denoisers are given; ready ones run on the cpu"
+    rendering = ", nor is rendering the 1/k of the pixels that denoisers are given"
     of_time = (
         f"network: one image, the median of {TIMED_ROUNDS} calls, taken by turns with the other predictors', on "
         f"{describe_device(evaluation)}; reading, or rendering buffers and photons, is not in it"

@@ -11,8 +11,8 @@ c = d · E, is reproduced exactly wherever E is constant, and so is a constant i
 albedo is 0, does not bleed into the wall beside it. It is a ratio of sums instead of a mean of ratios: dark surfaces,
 whose ratios are noisiest, count the least. Kept pixels do not change.
 
-Open Image Denoise takes colour, albedo and normals of one filled-in image. Its weights are part of the package `pyoidn`
-(the extra `oidn`), whose binding has the flag for HDR.
+Open Image Denoise takes colour, albedo and normals of one filled-in image. Its weights are part of the package
+`mitsuba-oidn` (the extra `oidn`), which uses Dr.Jit's threads, and neither Dr.Jit nor Mitsuba otherwise.
 
 Shape letters: B batch, H W image.
 """
@@ -22,16 +22,14 @@ from __future__ import annotations
 import math
 from importlib import import_module
 from types import ModuleType
-from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional
 
 from photonfarm.core.errors import SpecError
-from photonfarm.core.records import F32
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, require
+from photonfarm.trainer.runs.settings import OidnQuality
 
 LEAST_ALBEDO = 0.01
 """The albedo below which a channel counts as having none: lamps, mirrors, glass, and the sky."""
@@ -84,51 +82,56 @@ def _blur(image: Tensor, sigma: float) -> Tensor:
     return planes.reshape(len(image), 3, *image.shape[1:3]).movedim(1, -1)
 
 
-PACKAGE = "pyoidn"
+PACKAGE = "mitsuba_oidn"
 
 
 class Oidn:
     """Whole images from the kept pixels of half A, for a `DevicePredictor` that has `Needs(points=False, kept=k)`.
 
-    It runs on the CPU, so that images do not depend on the machine's GPU. It is not thread-safe.
+    It runs where its inputs are: on the CPU, or on a card, without a copy. It is not thread-safe.
     """
 
-    def __init__(self, threads: int = 1) -> None:
-        """Load the library. Raises SpecError if the package is not installed or does not work here."""
-        self._oidn = _import_package()
-        self._device = self._oidn.Device(self._oidn.OIDN_DEVICE_TYPE_CPU)
-        self._device.set_int("numThreads", threads)
-        self._device.set_bool("setAffinity", False)  # renderers share the machine
-        self._device.commit()
-        self._check()
+    def __init__(self, threads: int = 1, device: str | torch.device = "cpu", quality: OidnQuality = "high") -> None:
+        """Load the library; `threads` are the CPU's.
+
+        Raises SpecError if the package is not installed or does not work on this device.
+        """
+        place, self._oidn = torch.device(device), _import_package()
+        self._quality = self._oidn.Quality[quality.capitalize()]
+        try:
+            if place.type == "cuda":
+                stream = torch.cuda.current_stream(place)
+                self._device = self._oidn.Device.cuda(stream.device_index, stream.cuda_stream)
+            else:
+                self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
+                self._device.num_threads = threads
+                self._device.set_bool("setAffinity", False)  # renderers share the machine
+            self._device.commit()
+        except self._oidn.Error as error:
+            raise SpecError(
+                f"the denoiser oidn: {PACKAGE} does not work on {place}: {error}; leave the denoiser out"
+                + (", or give --device cpu" if place.type == "cuda" else "")
+            ) from error
 
     def __call__(self, inputs: Inputs) -> Tensor:
         """A batch's images, (B, H, W, 3), linear radiance × exposure."""
         whole = fill_in(require(inputs.noisy), inputs.albedo)
-        images = zip(whole.numpy(), inputs.albedo.numpy(), inputs.normal.numpy(), strict=True)
-        return torch.from_numpy(np.stack([self.denoise(*image) for image in images]))
+        images = zip(whole, inputs.albedo, inputs.normal, strict=True)
+        return torch.stack([self.denoise(*image) for image in images])
 
-    def denoise(self, colour: F32, albedo: F32, normal: F32) -> F32:
-        """One denoised image, (H, W, 3) each. Albedo and normals are taken as free of noise, which ours are."""
-        result = np.empty_like(colour, order="C")
-        named = {"color": colour, "albedo": np.clip(albedo, 0, 1), "normal": normal, "output": result}
-        images = {name: np.ascontiguousarray(image) for name, image in named.items()}  # must live until it has run
-        denoiser: Any = self._oidn.Filter(self._device, self._oidn.OIDN_FILTER_TYPE_RT)
-        try:  # its own context manager would swallow exceptions
-            for name, image in images.items():
-                denoiser.set_image(name, image, self._oidn.OIDN_FORMAT_FLOAT3)
-            denoiser.set_bool("hdr", True)
-            denoiser.set_bool("cleanAux", True)
-            denoiser.commit()
-            denoiser.execute()
-            self._check()
-        finally:
-            denoiser.release()
+    def denoise(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """One denoised image; (H, W, 3) float32 on the device each. Albedo and normals are taken as free of noise."""
+        guides = (image.contiguous() for image in (albedo.clamp(0, 1), normal))
+        result: Tensor = self._oidn.denoise(
+            colour.contiguous(),
+            *guides,
+            hdr=True,
+            clean_aux=True,
+            quality=self._quality,
+            device=self._device,
+            output=torch.empty_like(colour, memory_format=torch.contiguous_format),
+        )
         return result
-
-    def _check(self) -> None:
-        if (error := self._device.get_error()) is not None:
-            raise SpecError(f"the denoiser oidn: {PACKAGE} does not work here: {error}")
 
 
 def _import_package() -> ModuleType:

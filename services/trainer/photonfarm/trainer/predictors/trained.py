@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -23,7 +23,7 @@ from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
-from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
+from photonfarm.trainer.runs.settings import OidnQuality, ReadyDenoiser, TrainSettings
 from photonfarm.trainer.runs.user_code import name_in_errors
 
 
@@ -88,6 +88,9 @@ class TrainedRun:
         return replace(predict, images=named(predict.images))
 
 
+OIDN: Mapping[ReadyDenoiser, OidnQuality] = {"oidn": "high", "oidn-balanced": "balanced", "oidn-fast": "fast"}
+
+
 @dataclass(frozen=True, slots=True)
 class ReadyPredictor:
     """A denoiser that is given one of `kept` pixels of half A."""
@@ -98,7 +101,7 @@ class ReadyPredictor:
 
     @property
     def name(self) -> str:
-        """A name such as "oidn 1/4"."""
+        """A name such as "oidn 1/4", or "oidn-fast 1/4"."""
         return f"{self.denoiser} 1/{self.kept}"
 
     @property
@@ -106,16 +109,17 @@ class ReadyPredictor:
         """The noisy colour, beside the buffers."""
         return Needs(points=False, kept=self.kept)
 
-    def predictor(self, *_: object) -> DevicePredictor:
-        """The predictor, on the CPU, whatever the scene and the device. Raises SpecError if a package is missing."""
-        return DevicePredictor(self._images(), torch.device("cpu"))
+    def predictor(self, _spec: object, _base: object, device: str) -> DevicePredictor:
+        """The predictor on a device, whatever the scene. Raises SpecError if a package is missing, or cannot use it."""
+        place = usable_device(device)
+        return DevicePredictor(self._images(place), place)
 
-    def _images(self) -> Callable[[Inputs], Tensor]:
+    def _images(self, device: torch.device) -> Callable[[Inputs], Tensor]:
         if self.denoiser == "none":
             return lambda inputs: require(inputs.noisy).colour
         if self.denoiser == "fill-in":
             return lambda inputs: fill_in(require(inputs.noisy), inputs.albedo)
-        return Oidn(self.settings.threads)
+        return Oidn(self.settings.threads, device, OIDN[self.denoiser])
 
 
 def list_predictors(

@@ -83,8 +83,8 @@ def _describe_time(contents: ReportContents) -> str:
     frames, edit = contents.costs.render_s.shape[1], contents.costs.parts()["edit_s"]
     return (
         f"time per frame: medians of {frames} frames for rendering, buffers, points and photons, on one core by LLVM's "
-        f"code; of {TIMED_ROUNDS} calls, taken by turns, for networks, on {describe_device(contents.evaluation)} "
-        f"(ready denoisers on the CPU); editing the scene, {_format_times(edit)} ms, which all need, is not in it"
+        f"code; of {TIMED_ROUNDS} calls, taken by turns, for networks, on {describe_device(contents.evaluation)}; "
+        f"editing the scene, {_format_times(edit)} ms, which all need, is not in it"
     )
 
 

@@ -91,7 +91,11 @@ Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 Compilation = Literal["off", "on", "graphs"]
 Schedule = Literal["epochs", "cosine"]
-ReadyDenoiser = Literal["none", "fill-in", "oidn"]  # kept pixels as they are; the rest filled in; then denoised
+ReadyDenoiser = Literal["none", "fill-in", "oidn", "oidn-balanced", "oidn-fast"]
+"""Kept pixels as they are; the rest filled in; then denoised by Open Image Denoise: in its best quality, a quicker one,
+or its quickest."""
+
+OidnQuality = Literal["high", "balanced", "fast"]  # as the package names them
 
 
 def _check_choice(kind: Any) -> BeforeValidator:

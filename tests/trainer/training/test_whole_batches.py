@@ -43,10 +43,11 @@ def learner_of(source: Any, architecture: str, **changes: Any) -> Learner:
 
 
 def batch_with_metal(source: Any, architecture: str, size: int) -> TrainingBatch:
-    """Samples with a metal in a part of the first image."""
+    """Samples with a metal in two of the images, as many pixels as fill a tile in none."""
     batch = batch_of(source, range(size), ARCHITECTURES[architecture].needs)
     if (guides := batch.inputs.guides) is not None:
-        guides.specular[0, 2:7, 1:10], guides.roughness[0, 2:7, 1:10] = 0.9, 0.3
+        for place in ((0, slice(2, 7), slice(1, 10)), (1, slice(5, 6), slice(3, 12))):
+            guides.specular[place], guides.roughness[place] = 0.9, 0.3
     return batch
 
 

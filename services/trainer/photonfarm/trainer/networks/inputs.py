@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional
 
 from photonfarm.core.records import F32, BasePointCloud, Geometry
 from photonfarm.data.torch_dataset import GUIDES, IMAGES, PHOTONS, POINTS
@@ -127,10 +126,6 @@ class NoisyColour:
     kept: Tensor  # (B, H, W) bool
 
 
-SQUARE = 4
-"""The side, in pixels, of the squares for which lit points are summed: diffuse light changes little between neighbours.
-"""
-
 GLOSSY = 0.2
 """The directional albedo above which a pixel's glossy lobe is summed over lit points.
 
@@ -155,23 +150,16 @@ class GuideInputs:
     beyond_normal: Tensor  # (B, H, W, 3)
     beyond_depth: Tensor  # (B, H, W) scene units, along the path
     point_light: Tensor  # (B, L, 3) irradiance × exposure of the first points
-    glossy_count: Tensor | None = None  # (B,) int64 on the host: glossy squares of each sample that is on a card
+    glossy_count: Tensor | None = None  # (B,) int64 on the host: glossy pixels of each sample that is on a card
 
     def find_glossy(self) -> Tensor:
         """The pixels whose glossy lobe is summed, (B, H, W) bool; the same on all devices."""
         red, green, blue = (self.specular - self.throughput).unbind(-1)
         return red + green + blue > 3 * GLOSSY
 
-    def find_glossy_squares(self) -> Tensor:
-        """The squares with such pixels, (B, H/4, W/4) bool."""
-        return functional.max_pool2d(self.find_glossy().float(), SQUARE) > 0
-
-    def list_glossy_squares(self) -> Tensor:
-        """The places of those squares in the batch, (Q,) int64; a card that knows their number is not waited for."""
-        squares = self.find_glossy_squares().flatten()
-        if self.glossy_count is None:
-            return squares.nonzero().flatten()
-        return torch.nonzero_static(squares, size=int(self.glossy_count.sum())).flatten()
+    def count_glossy(self) -> Tensor:
+        """Their number in each sample, (B,) int64."""
+        return self.find_glossy().flatten(1).sum(dim=1)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -213,7 +201,7 @@ class Inputs:
             return moved
         count = self.guides.glossy_count
         if count is None:
-            count = self.guides.find_glossy_squares().flatten(1).sum(dim=1).cpu()
+            count = self.guides.count_glossy().cpu()
         return replace(moved, guides=replace(moved.guides, glossy_count=count))
 
 

@@ -15,7 +15,7 @@ V = sigmoid(r(receiver) · s(sender) + b)
 For metals the light is summed over the directions that their lobe reflects; nothing is learned there. Light that points
 send to each other was tried, and brings nothing at equal time (docs/results/networks.md).
 
-Shape letters: B batch, L lit points, H W image, N receivers, Q glossy squares of pixels, C numbers of a surface.
+Shape letters: B batch, L lit points, H W image, N receivers, Q tiles of glossy pixels, C numbers of a surface.
 """
 
 from __future__ import annotations
@@ -27,14 +27,20 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from photonfarm.core.records import LIT_POINTS
-from photonfarm.trainer.networks.inputs import SQUARE, Inputs, SceneFrame, require
+from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, SceneFrame, require
 from photonfarm.trainer.networks.network import add_octaves
+
+COARSE = 4
+"""The side, in pixels, of the squares for which diffuse light is summed: it changes little between neighbours."""
 
 SHARPEST = 0.075
 """The least roughness of a glossy lobe: a narrower lobe would fall between points."""
 
 LEAST_LOGARITHM = -60.0
 """The least logarithm of a lobe's values, as processors multiply denormal numbers about four times more slowly."""
+
+TOGETHER = 32
+"""The pixels of one tile: those glossy ones of one sample whose lobes are summed by one product of matrices."""
 
 CHANNELS = 9
 """The channels of the three results of `LitPoints` together."""
@@ -136,9 +142,9 @@ class LitPoints(nn.Module):
         """The points' light without and with learned visibility, (B, H, W, 3) each."""
         at, facing = (_pool(image).flatten(1, 2) for image in (surface, normal))
         arriving = torch.cat(self.arriving(at, functional.normalize(facing, dim=-1), source, sent), dim=-1)
-        height, width = surface.shape[1] // SQUARE, surface.shape[2] // SQUARE
+        height, width = surface.shape[1] // COARSE, surface.shape[2] // COARSE
         coarse = arriving.view(-1, height, width, 6).permute(0, 3, 1, 2)
-        fine = functional.interpolate(coarse, scale_factor=SQUARE, mode="bilinear").permute(0, 2, 3, 1)
+        fine = functional.interpolate(coarse, scale_factor=COARSE, mode="bilinear").permute(0, 2, 3, 1)
         return fine[..., :3], fine[..., 3:]
 
     def arriving(self, at: Tensor, facing: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
@@ -155,25 +161,21 @@ class LitPoints(nn.Module):
     def form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
         """cos θ cos θ′ A / (π r²) between surfaces (B, N, 3) with normals `facing` and each point, (B, N, L)."""
         leaves, squared = self._between(at, source)
-        cosines = _height(facing, at, source).clamp_(min=0).mul_(leaves)
+        cosines = _measure_along(facing, at, source).clamp_(min=0).mul_(leaves)
         return cosines.div_(squared.square_()).mul_(self._area / math.pi)
 
     @torch.no_grad()
     def _gloss(self, inputs: Inputs, surfaces: tuple[Tensor, Tensor, Tensor], source: Tensor, sent: Tensor) -> Tensor:
-        """Light by other lobes, (B, H, W, 3), summed for the pixels of glossy squares alone, as these are few."""
+        """Light by other lobes, (B, H, W, 3), summed for glossy pixels alone, as these are few."""
         guides = require(inputs.guides)
-        glossy, square = guides.find_glossy(), guides.list_glossy_squares()
-        height, width = glossy.shape[1] // SQUARE, glossy.shape[2] // SQUARE
-        side = torch.arange(SQUARE, device=square.device)
-        corner = square // width * (width * SQUARE**2) + square % width * SQUARE
-        pixel = (corner[:, None, None] + side[:, None] * glossy.shape[2] + side).flatten()
-        images = (image.flatten(0, 2).index_select(0, pixel) for image in (*surfaces, guides.roughness[..., None]))
-        rays, at, normal, roughness = (image.view(-1, SQUARE**2, image.shape[-1]) for image in images)
-        sample = square // (height * width)
+        pixel, slot, sample = _list_glossy(guides)
+        places = pixel.new_zeros(len(sample) * TOGETHER).index_copy_(0, slot, pixel)  # what is left over is not used
+        images = (image.flatten(0, 2).index_select(0, places) for image in (*surfaces, guides.roughness[..., None]))
+        rays, at, normal, roughness = (image.view(-1, TOGETHER, image.shape[-1]) for image in images)
         light = self._lobes(at, normal, rays, roughness, source.index_select(0, sample), sent.index_select(0, sample))
         gloss = torch.zeros_like(guides.specular)
-        gloss.flatten(0, 2).index_copy_(0, pixel, light.flatten(0, 1))
-        return gloss.masked_fill_(~glossy[..., None], 0)
+        gloss.flatten(0, 2).index_copy_(0, pixel, light.flatten(0, 1).index_select(0, slot))
+        return gloss
 
     def _lobes(
         self, at: Tensor, normal: Tensor, rays: Tensor, roughness: Tensor, source: Tensor, sent: Tensor
@@ -184,31 +186,54 @@ class LitPoints(nn.Module):
         Beckmann's normals of roughness α have 2 / α² about the surface's normal, and mirroring doubles their angles.
         """
         mirrored = rays - 2 * (rays * normal).sum(-1, keepdim=True) * normal
-        leaves, squared = self._between(at, source)
-        distance = squared.sqrt()
         sharpness = 0.5 / roughness.clamp(min=SHARPEST) ** 2
-        weight = _height(mirrored, at, source).div_(distance).sub_(1).mul_(sharpness).clamp_(min=LEAST_LOGARITHM)
-        weight.exp_().mul_(leaves).div_(squared.mul_(distance))
-        return (weight @ sent) / weight.sum(-1, keepdim=True).clamp(min=1e-12)
+        leaves, squared = self._between(at, source)
+        nearness = squared.rsqrt_()  # 1 / r
+        weight = _measure_along(sharpness * mirrored, at, source).mul_(nearness).sub_(sharpness)
+        weight.clamp_(min=LEAST_LOGARITHM).exp_().mul_(leaves).mul_(nearness.pow_(3))
+        light, total = torch.split(weight @ functional.pad(sent, (0, 1), value=1.0), [3, 1], dim=-1)
+        return light / total.clamp(min=1e-12)
 
     def _between(self, at: Tensor, source: Tensor) -> tuple[Tensor, Tensor]:
         """Distance × cosine at each point's front, at least 0, and the squared distance, (B, N, L) each.
 
         The square is at least a point's area over π, so that no near point outweighs all others.
         """
-        back = torch.cat([self.normal.expand_as(source), -(source * self.normal).sum(-1, keepdim=True)], dim=-1)
-        one = torch.ones_like(at[..., :1])
+        with_one = functional.pad(at, (0, 1), value=1.0)
+        behind = -(source * self.normal).sum(-1, keepdim=True)
+        leaves = with_one @ torch.cat([self.normal.expand_as(source), behind], dim=-1).mT
         squares = torch.cat([-2 * source, (source * source).sum(-1, keepdim=True)], dim=-1)
-        leaves = torch.cat([at, one], dim=-1) @ back.mT
-        squared = torch.baddbmm((at * at).sum(-1, keepdim=True), torch.cat([at, one], dim=-1), squares.mT)
+        squared = torch.baddbmm((at * at).sum(-1, keepdim=True), with_one, squares.mT)
         return leaves.clamp_(min=0), squared.clamp_(min=self._area / math.pi)
 
 
-def _height(direction: Tensor, at: Tensor, source: Tensor) -> Tensor:
+def _measure_along(direction: Tensor, at: Tensor, source: Tensor) -> Tensor:
     """direction · (source − at) of surfaces (B, N, 3) and points (B, L, 3), (B, N, L)."""
     return torch.baddbmm(-(direction * at).sum(-1, keepdim=True), direction, source.mT)
 
 
+def _list_glossy(guides: GuideInputs) -> tuple[Tensor, Tensor, Tensor]:
+    """The glossy pixels of a batch, and tiles for them, each for pixels of one sample.
+
+    The pixels (K,) of B·H·W, their places (K,) in Q · `TOGETHER`, and the sample of each tile, (Q,). Where they are
+    counted already, nothing is waited for.
+    """
+    glossy = guides.find_glossy().flatten(1)
+    count = glossy.sum(dim=1)
+    known = count if guides.glossy_count is None else guides.glossy_count
+    pixels, all_tiles = int(known.sum()), int(_count_tiles(known).sum())
+    pixel = torch.nonzero_static(glossy.flatten(), size=pixels).flatten()
+    tiles = _count_tiles(count)
+    shift = (tiles.cumsum(0) - tiles) * TOGETHER - (count.cumsum(0) - count)
+    place = torch.arange(pixels, device=pixel.device) + shift.index_select(0, pixel // glossy.shape[1])
+    samples = torch.arange(len(count), device=count.device)
+    return pixel, place, samples.repeat_interleave(tiles, output_size=all_tiles)
+
+
+def _count_tiles(pixels: Tensor) -> Tensor:
+    return (pixels + (TOGETHER - 1)) // TOGETHER
+
+
 def _pool(image: Tensor) -> Tensor:
     """Means over squares of pixels, (B, H, W, 3) → (B, H/4, W/4, 3)."""
-    return functional.avg_pool2d(image.permute(0, 3, 1, 2), SQUARE).permute(0, 2, 3, 1)
+    return functional.avg_pool2d(image.permute(0, 3, 1, 2), COARSE).permute(0, 2, 3, 1)

@@ -82,11 +82,15 @@ def test_a_step_has_as_many_operators_whatever_its_batch(make_source, architectu
     assert found[0].total() > 100
 
 
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 @pytest.mark.parametrize("architecture", EVERY)
-def test_a_step_on_a_card_reads_nothing_and_is_handed_nothing(make_source, architecture: str, monkeypatch) -> None:
+def test_a_step_on_a_card_reads_nothing_and_is_handed_nothing(
+    make_source, architecture: str, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(optimizer, "_get_fused_kernels_supported_devices", lambda: ["cpu", "meta"])
     source = make_source(3, photons=64)
-    learner, batch = learner_of(source, architecture), batch_with_metal(source, architecture, 3).to(META)
+    learner = learner_of(source, architecture, precision=precision)
+    batch = batch_with_metal(source, architecture, 3).to(META)
     assert learner.average is not None
     for each in (learner.network, learner.average.network):
         each.to(META)

@@ -296,7 +296,7 @@ def time_steps(
 
 
 def _time_step(learner: Learner, batch: TrainingBatch, device: torch.device) -> float:
-    """The seconds of a step; on a card until it is done, as its loss is read."""
+    """The seconds of a step; on a card until it is done."""
     began = time.perf_counter()
     learner.step(1, batch)
     if device.type == "cuda":

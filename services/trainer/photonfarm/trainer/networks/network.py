@@ -9,7 +9,6 @@ Shape letters: B batch, P points, H W image, C channels.
 from __future__ import annotations
 
 import math
-from contextlib import nullcontext
 from itertools import pairwise
 
 import torch
@@ -57,8 +56,7 @@ class ImageSynthesisLayer(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, channels_in, H, W) → (B, 3, H, W), exposed linear radiance."""
-        with torch.autocast(x.device.type, torch.bfloat16) if self.precision == "bfloat16" else nullcontext():
-            x = self._features(x)
+        x = self._features(x.bfloat16() if self.precision == "bfloat16" else x)
         return self.out(x.float())
 
     def _features(self, x: Tensor) -> Tensor:
@@ -79,20 +77,25 @@ CARD_CHANNELS = 8
 
 
 class Convolution(nn.Conv2d):
-    """A 3×3 convolution that keeps the size; on a card with further channels of zeros, which change nothing."""
+    """A 3×3 convolution that keeps the size, in the precision of its input.
+
+    On a card it has further channels of zeros, which change nothing.
+    """
+
+    bias: Tensor
 
     def __init__(self, channels_in: int, channels_out: int) -> None:
         super().__init__(channels_in, channels_out, kernel_size=3, padding=1)
 
     def forward(self, x: Tensor) -> Tensor:
         """(B, C, H, W) → (B, C′, H, W)."""
+        weight, bias = self.weight.to(x.dtype), self.bias.to(x.dtype)
         more_in, more_out = (-count % CARD_CHANNELS for count in (self.in_channels, self.out_channels))
         if not is_asynchronous(x.device) or not (more_in or more_out):
-            return super().forward(x)
-        weight = functional.pad(self.weight, (0, 0, 0, 0, 0, more_in, 0, more_out))
-        bias = None if self.bias is None else functional.pad(self.bias, (0, more_out))
+            return functional.conv2d(x, weight, bias, padding=1)
+        weight = functional.pad(weight, (0, 0, 0, 0, 0, more_in, 0, more_out))
         padded = functional.pad(x, (0, 0, 0, 0, 0, more_in))
-        return functional.conv2d(padded, weight, bias, padding=1)[:, : self.out_channels]
+        return functional.conv2d(padded, weight, functional.pad(bias, (0, more_out)), padding=1)[:, : self.out_channels]
 
 
 IMAGE_CHANNELS = 10

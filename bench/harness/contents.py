@@ -51,7 +51,7 @@ class Contents:
 
     def buffers(self, modification: Modification, view: View) -> ViewBuffers:
         """The image-space buffers."""
-        return self._get("buffers", modification, view, lambda: self._scene.buffers(view))
+        return self._inputs(modification, view)[0]
 
     def visibility(self, modification: Modification, view: View) -> Visibility:
         """What the view sees."""
@@ -59,7 +59,8 @@ class Contents:
 
         photons = self.photons(modification) if self.spec.photons.paths else None
         points = rebuild(self.base[1], modification)
-        return self._get("visibility", modification, view, partial(visibility_of, self._scene, view, points, photons))
+        make = partial(visibility_of, self._scene, [view], points, photons)
+        return self._get("visibility", modification, view, make)[0]
 
     def photons(self, modification: Modification) -> Photons:
         """The photons."""
@@ -67,11 +68,14 @@ class Contents:
 
     def guides(self, modification: Modification, view: View) -> Guides:
         """The guides of a view."""
+        return self._inputs(modification, view)[1]
+
+    def _inputs(self, modification: Modification, view: View) -> tuple[ViewBuffers, Guides]:
         from photonfarm.renderer.jobs.render import lit_points
 
         key, lit = modification.key(self.spec.radiance_id), lit_points(self.base[1], modification)
-        make = partial(self._scene.guides, view, view_key(key, view.vector), self.spec.guides, lit)
-        return self._get("guides", modification, view, make)
+        make = partial(self._scene.inputs, [view], [view_key(key, view.vector)], self.spec.guides, lit)
+        return self._get("inputs", modification, view, make)[0]
 
     def _get(self, what: str, modification: Modification, view: View | None, make: Any) -> Any:
         key = modification.key(self.spec.radiance_id)

@@ -86,6 +86,13 @@ class AnalyticScene:
         depth = np.full(size, self._level(view), np.float32)
         return ViewBuffers(depth, np.full((*size, 3), 0.5, np.float32), np.full((*size, 3), 0.6, np.float32))
 
+    def inputs(
+        self, views: Sequence[View], keys: Sequence[bytes], wanted: GuideSpec, lit: tuple[F32, F32]
+    ) -> list[tuple[ViewBuffers, Guides]]:
+        return [
+            (self.buffers(view), self.guides(view, key, wanted, lit)) for view, key in zip(views, keys, strict=True)
+        ]
+
     def guides(self, view: View, key: bytes, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
         """All that `schema` has, of the view's level; what is noisy follows from the key."""
         arrays = output_arrays(self.spec)
@@ -97,8 +104,9 @@ class AnalyticScene:
             found[name] *= noise.astype(np.float32) if wanted.light_samples else 0
         return Guides(**found)
 
-    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
-        return np.asarray(np.floor(position @ np.array([7.1, 13.7, 29.3]) + self._level(view)) % 2 == 0)
+    def sees(self, views: Sequence[View], position: F32) -> NDArray[np.bool_]:
+        levels = np.array([[self._level(view)] for view in views])
+        return np.asarray(np.floor(position @ np.array([7.1, 13.7, 29.3]) + levels) % 2 == 0)
 
     def photons(self, seed: int) -> Photons | None:
         count = self.spec.photons.slots

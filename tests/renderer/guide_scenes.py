@@ -9,16 +9,15 @@ from numpy.typing import NDArray
 from photonfarm.core.keys import make_key
 from photonfarm.core.records import Guides
 from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.gbuffer import GRID
+from photonfarm.renderer.scene.view_rays import GRID
 from photonfarm.scene.spec import GuideSpec, SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
 from photonfarm.scene.view import Camera, View
 
 mi = backend.load(threads=1)
 
-from photonfarm.renderer.bdpt.recording import Recorder  # noqa: E402
-from photonfarm.renderer.scene import guides  # noqa: E402 - after the variant is set
-from photonfarm.renderer.scene.guides import view_guides  # noqa: E402
+from photonfarm.renderer.bdpt.recording import Recorders  # noqa: E402
+from photonfarm.renderer.scene.guides import view_guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.scene.materials import Materials  # noqa: E402
 
 Images = NDArray[np.float64]
@@ -27,7 +26,7 @@ Shape = dict[str, Any]
 WIDTH, HEIGHT = 24, 16
 AHEAD = View(np.array([0, 0, 3], np.float32), np.array([0, 0, 0], np.float32))
 KEY = make_key("view", "of a test")
-NOWHERE = np.zeros((1, 3), np.float32)
+NOWHERE = np.zeros((1, 3), np.float32), np.array([[0, 0, 1]], np.float32)
 RADIANCE = np.array([5.0, 3.0, 1.0])
 GREY = np.array([0.5, 0.4, 0.3])
 
@@ -54,9 +53,11 @@ def known(scene: Any, view: View = AHEAD, *, light_samples: int = 3, **of_spec: 
 
 def of_keys(scene: Any, view: View, keys: list[bytes], light_samples: int, **of_spec: Any) -> Iterator[Guides]:
     """The guides of a view by several keys, one after the other."""
-    recorder, wanted = Recorder(guides.trace) if len(keys) > 1 else None, GuideSpec(light_samples=light_samples)
+    recorders, wanted = Recorders() if len(keys) > 1 else None, GuideSpec(light_samples=light_samples)
     for key in keys:
-        yield view_guides(scene, view, spec(**of_spec), wanted, key, Materials.of(scene), NOWHERE, recorder)
+        materials = Materials.of(scene)
+        ((_, found),) = view_guides(scene, [view], spec(**of_spec), wanted, [key], materials, NOWHERE, recorders)
+        yield found
 
 
 def some_keys(count: int, of: str = "key") -> list[bytes]:

@@ -90,8 +90,8 @@ class FrameCosts:
     rows: NDArray[np.int64]  # (N,) of the store
     surface: NDArray[np.uint8]  # (N, H, W) a `Surface` at each pixel's centre
     edit_s: NDArray[np.float64]  # (T,) bringing the scene into the frame's configuration, from another one
-    buffers_s: NDArray[np.float64]  # (T,) depth, albedo, normal
-    guides_s: NDArray[np.float64]  # (T,) the view's guides, mainly direct light
+    buffers_s: NDArray[np.float64]  # (T,) depth, albedo, normal, where no guides are wanted
+    guides_s: NDArray[np.float64]  # (T,) the view's guides and its buffers, which share their rays
     points_s: NDArray[np.float64]  # (T,) which points of the base cloud, or of its first ones, the view sees
     photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without photons
     photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees; 0 likewise

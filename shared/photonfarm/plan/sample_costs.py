@@ -61,7 +61,7 @@ class SampleCosts:
     pass_s: Cost  # a pass of a view, both halves, whatever its number of samples per pixel
     spp_s: Cost  # each sample per pixel of the whole image, of both halves together
     relative_variance: Cost  # as `relative_variance` estimates it; 0 if every view was black
-    guides_s: Cost = 0.0  # the guides' part of `view_s`
+    guides_s: Cost = 0.0  # of guides and buffers, part of `view_s`
 
     def seconds(self, spp: float, *, configurations: float, views: float, samples: float) -> float:
         """Core-seconds of samples of `spp` samples per pixel, both halves together; each is a pass of a view.
@@ -79,7 +79,7 @@ class SampleCosts:
         """All fields in words."""
         times = " + ".join(f"{name.removesuffix('_s')} {getattr(self, name):.4f} s" for name in SECONDS)
         noise = f"relative variance of one sample per pixel {self.relative_variance:.3g}"
-        return f"{times} × samples per pixel; guides {self.guides_s:.4f} s of a view; {noise}"
+        return f"{times} × samples per pixel; guides and buffers {self.guides_s:.4f} s of a view; {noise}"
 
     @classmethod
     def read(cls, text: str | bytes) -> Self:

@@ -210,7 +210,7 @@ class Credits(Frozen):
     source: Annotated[str, Field(max_length=500)] = ""  # where it was published
 
 
-INPUTS_GENERATOR = 1
+INPUTS_GENERATOR = 2
 """The version of the code that makes buffers, guides, photons and points: it grows when their values change."""
 
 RAYS_PER_PIXEL = 16

@@ -47,13 +47,10 @@ def recorded(analytic: ModuleType) -> type:
             self.calls.append(("apply", modification.vector.tobytes()))
             super().apply(modification)
 
-        def buffers(self, view: Any) -> Any:
-            self.calls.append(("buffers", view.vector.tobytes()))
-            return super().buffers(view)
-
-        def guides(self, view: Any, key: Any, *how: Any) -> Any:
-            self.calls.append(("guides", key))
-            return super().guides(view, key, *how)
+        def inputs(self, views: Any, keys: Any, *how: Any) -> Any:
+            self.calls += [("buffers", view.vector.tobytes()) for view in views]
+            self.calls += [("guides", key) for key in keys]
+            return super().inputs(views, keys, *how)
 
         def photons(self, seed: int) -> Any:
             self.calls.append(("photons", seed))
@@ -124,7 +121,7 @@ def test_points_of_a_removed_group_are_not_seen_even_if_the_scene_says_so(
     analytic: ModuleType, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """All points of the analytic scene are of its one object."""
-    monkeypatch.setattr(recorded, "sees", lambda _self, _view, position: np.ones(len(position), np.bool_))
+    monkeypatch.setattr(recorded, "sees", lambda _, views, position: np.ones((len(views), len(position)), np.bool_))
     (movable,) = analytic.small_spec().model_dump()["objects"]
     spec = analytic.small_spec(objects=[{**movable, "removal_probability": 0.5}])
     scene = store.scene(store.plan(spec, Request(modifications=16), shard_rows=16).scene_id)
@@ -205,18 +202,18 @@ def test_after_three_renders_that_are_not_finite_the_job_fails_and_nothing_is_st
     assert scene.missing_jobs() == [0, 1]
 
 
-@pytest.mark.parametrize(("what", "name"), [("buffers", "normal"), ("guides", "direct")])
+@pytest.mark.parametrize(("place", "name"), [(0, "normal"), (1, "direct")])
 def test_buffers_and_guides_that_are_not_finite_fail_the_job_and_name_view_and_sample(
-    scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch, what: str, name: str
+    scene: SceneStore, store: Store, recorded: type, monkeypatch: pytest.MonkeyPatch, place: int, name: str
 ) -> None:
-    plain = getattr(recorded, what)
+    plain = recorded.inputs
 
     def broken(*how: Any) -> Any:
         made = plain(*how)
-        getattr(made, name)[0, 0, 0] = np.nan
+        getattr(made[0][place], name)[0, 0, 0] = np.nan
         return made
 
-    monkeypatch.setattr(recorded, what, broken)
+    monkeypatch.setattr(recorded, "inputs", broken)
     with pytest.raises(IncompleteError, match=f"{name} of view 0 .sample "):
         render_all(scene, store, recorded)
     assert scene.missing_jobs() == [0, 1]

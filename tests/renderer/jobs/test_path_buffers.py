@@ -77,12 +77,21 @@ def test_the_verb_writes_a_path_and_leaves_the_store_as_it_is(tmp_path: Path, sp
 
 def test_buffers_that_are_not_finite_are_not_written(spec: SceneSpec, room: LoadedScene, somewhere) -> None:
     class Broken:
+        samples_at_once = 1
+        base = room.base
+
         def apply(self, _) -> None: ...
 
         def photons(self, _) -> None: ...
 
-        def buffers(self, view):
-            return replace(room.buffers(view), depth=np.full((16, 24), np.nan, np.float32))
+        def sees(self, views, position):
+            return room.sees(views, position)
+
+        def inputs(self, *arguments):
+            return [
+                (replace(buffers, depth=np.full((16, 24), np.nan, np.float32)), guides)
+                for buffers, guides in room.inputs(*arguments)
+            ]
 
     with pytest.raises(IncompleteError):
         frames_of(spec, rest(spec), [somewhere], load=lambda _: Broken())

@@ -177,10 +177,10 @@ def test_each_part_is_charged_with_its_own_seconds(
     )
     monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
-    monkeypatch.setattr(room, "guides", takes(lambda *_: 1000, lambda *_: None))
+    monkeypatch.setattr(room, "inputs", takes(lambda *_: 1000, lambda *_: None))
     monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
     monkeypatch.setattr(
-        room, "sees", takes(lambda _, points: len(points), lambda _, points: np.ones(len(points), bool))
+        room, "sees", takes(lambda _, points: len(points), lambda _, points: np.ones((1, len(points)), bool))
     )
     monkeypatch.setattr(PartialFilm, "render", takes(lambda film, *_: film.spec.film.width, lambda *_: None))
     costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[4, 1], timed=2)

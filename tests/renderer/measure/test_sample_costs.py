@@ -72,9 +72,9 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     monkeypatch.setattr(room, "apply", configured)
     monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
-    monkeypatch.setattr(room, "guides", takes(lambda *_: 5, lambda *_: None))
+    monkeypatch.setattr(room, "inputs", takes(lambda *_: 15, lambda *_: None))
     monkeypatch.setattr(
-        room, "sees", takes(lambda _, points: len(points), lambda _, points: np.ones(len(points), bool))
+        room, "sees", takes(lambda _, points: len(points), lambda _, points: np.ones((1, len(points)), bool))
     )
 
     def render(view: View, seeds: tuple[int, int], half_spp: int) -> np.ndarray:
@@ -85,8 +85,8 @@ def test_each_part_is_charged_with_its_own_seconds_and_the_medians_count(
     told: list[str] = []
     costs = sample_costs(room, 3, told.append)  # of which one takes a hundred times as long
     assert costs.configuration_s == pytest.approx(100)
-    assert costs.view_s == pytest.approx(10 + 4096 + 8192 + 5)
-    assert costs.guides_s == pytest.approx(5)
+    assert costs.view_s == pytest.approx(15 + 4096 + 8192)
+    assert costs.guides_s == pytest.approx(15)
     assert costs.pass_s == pytest.approx(7)
     assert costs.spp_s == pytest.approx(0.5)
     assert costs.relative_variance == pytest.approx(2 * 2 * (2**2 / 4) / (2**2 * 1.01))

@@ -29,8 +29,9 @@ from numpy.typing import NDArray
 from photonfarm.core.keys import make_key
 from photonfarm.core.records import arrays_of
 from photonfarm.core.statistics import block_z_test
-from photonfarm.renderer.scene.gbuffer import GRID
+from photonfarm.renderer.bdpt.lights.emission import read_lights
 from photonfarm.renderer.scene.guides import point_light
+from photonfarm.renderer.scene.view_rays import GRID
 from photonfarm.scene.spec import GuideSpec, SceneSpec
 from photonfarm.scene.view import View
 
@@ -139,12 +140,14 @@ def test_the_irradiance_of_points_is_that_of_the_formula_and_none_on_the_side_aw
     place = np.array([[x, 0, z] for x in np.linspace(-2, 2, 9) for z in (-0.5, 0.3)], np.float32)
     normal = np.zeros_like(place) + np.array(UP, np.float32)
     keys = [make_key("points", i) for i in range(64)]
-    found = np.stack([point_light(scene, place, normal, key, GuideSpec()) for key in keys]).astype(np.float64)
+    lights = read_lights(scene)
+    found = point_light(scene, lights, place, normal, keys, GuideSpec()).astype(np.float64)
     truth = RADIANCE * irradiance(place.astype(np.float64), 60)[:, None]
     error = found.std(axis=0, ddof=1) / np.sqrt(len(found))
     assert (np.abs(found.mean(axis=0) - truth) / np.maximum(error, 1e-3 * truth.max())).max() < 4.5
-    assert not point_light(scene, place, -normal, KEY, GuideSpec()).any()
-    assert not point_light(scene, place, normal, KEY, GuideSpec(light_samples=0)).any()
+    assert not point_light(scene, lights, place, -normal, [KEY], GuideSpec()).any()
+    assert not point_light(scene, lights, place, normal, [KEY], GuideSpec(light_samples=0)).any()
+    assert not point_light(scene, None, place, normal, [KEY], GuideSpec()).any()
 
 
 def test_under_an_even_sky_a_floor_reflects_its_albedo_and_points_receive_pi() -> None:
@@ -152,7 +155,9 @@ def test_under_an_even_sky_a_floor_reflects_its_albedo_and_points_receive_pi() -
     found = known(scene, View(np.array([0, 3, 0.1], np.float32), np.zeros(3, np.float32)), light_samples=16)
     assert found.direct.mean(axis=(0, 1)) == pytest.approx(2 * GREY, rel=0.01)
     points = np.zeros((200, 3), np.float32), np.tile(np.array([[0, 1, 0]], np.float32), (200, 1))
-    assert point_light(scene, *points, KEY, GuideSpec()).mean() == pytest.approx(2 * np.pi, rel=0.03)
+    assert point_light(scene, read_lights(scene), *points, [KEY], GuideSpec()).mean() == pytest.approx(
+        2 * np.pi, rel=0.03
+    )
 
 
 MATERIALS: dict[str, Shape] = {

@@ -11,18 +11,16 @@ from photonfarm.core.keys import make_key, seed_of, view_key
 from photonfarm.core.records import Guides, arrays_of
 from photonfarm.renderer.jobs.render import lit_points
 from photonfarm.renderer.scene import backend
-from photonfarm.renderer.scene.gbuffer import GRID
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.modification import rest
 from photonfarm.scene.spec import GuideSpec
-from photonfarm.scene.view import View
+from photonfarm.scene.view import View, sample_view
 from photonfarm.store.format.shards import NOISY_GUIDES
 
 backend.load(threads=1)
 
-from photonfarm.renderer.bdpt.recording import Recorder  # noqa: E402
-from photonfarm.renderer.scene import guides  # noqa: E402 - after the variant is set
-from photonfarm.renderer.scene.guides import point_light, view_guides  # noqa: E402
+from photonfarm.renderer.bdpt.recording import Recorders  # noqa: E402
+from photonfarm.renderer.scene.guides import view_guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.scene.materials import Materials  # noqa: E402
 
 Images = NDArray[np.float64]
@@ -44,7 +42,8 @@ def bytes_of(found: Guides) -> dict[str, bytes]:
 
 
 def test_another_key_gives_other_noise_and_the_same_of_all_else(room: LoadedScene, somewhere: View, lit: Lit) -> None:
-    one, other = (bytes_of(room.guides(somewhere, make_key("view", i), GuideSpec(), lit)) for i in (1, 2))
+    of_keys = room.inputs([somewhere, somewhere], [make_key("view", i) for i in (1, 2)], GuideSpec(), lit)
+    one, other = (bytes_of(guides) for _, guides in of_keys)
     assert {name for name in one if one[name] != other[name]} == set(NOISY_GUIDES)
     assert set(one) == {field.name for field in fields(Guides)}
 
@@ -52,23 +51,26 @@ def test_another_key_gives_other_noise_and_the_same_of_all_else(room: LoadedScen
 def test_a_key_gives_the_same_bytes_recorded_or_not_and_whatever_was_rendered_before(
     room: LoadedScene, somewhere: View, lit: Lit
 ) -> None:
-    again = room.guides(somewhere, KEY, GuideSpec(), lit)
-    arrives = [point_light(room.scene, *lit, KEY, GuideSpec(), how) for how in (None, Recorder(guides.irradiance))]
-    told = room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene)
-    plain = view_guides(*told, arrives[0])
-    fresh = view_guides(*told, arrives[1], Recorder(guides.trace))
+    ((_, again),) = room.inputs([somewhere], [KEY], GuideSpec(), lit)
+    told = room.scene, [somewhere], room.spec, GuideSpec(), [KEY], Materials.of(room.scene), lit
+    (_, plain), (_, fresh) = *view_guides(*told), *view_guides(*told, Recorders())
     assert bytes_of(again) == bytes_of(plain) == bytes_of(fresh)
 
 
-def test_images_that_are_traced_in_several_goes_are_those_of_one(
-    room: LoadedScene, somewhere: View, lit: Lit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = room.guides(somewhere, KEY, GuideSpec(), lit)
-    monkeypatch.setattr("photonfarm.renderer.scene.guides.images.RAYS", 100 * GRID * GRID)
-    arrives = point_light(room.scene, *lit, KEY, GuideSpec())
-    parts = view_guides(room.scene, somewhere, room.spec, GuideSpec(), KEY, Materials.of(room.scene), arrives)
-    for name, values in arrays_of(whole).items():
-        np.testing.assert_allclose(getattr(parts, name), values, rtol=1e-5, atol=1e-6, err_msg=name)
+def test_views_rendered_together_have_the_inputs_and_the_sight_of_each_alone(room: LoadedScene, lit: Lit) -> None:
+    room.apply(rest(room.spec))
+    views = [sample_view(room.spec, KEY, 0, i) for i in range(3)]
+    keys = [make_key("view", view.vector) for view in views]
+    together = room.inputs(views, keys, GuideSpec(), lit)
+    seen = room.sees(views, lit[0])
+    assert seen.any()
+    for view, key, of_view, sees in zip(views, keys, together, seen, strict=True):
+        (alone,) = room.inputs([view], [key], GuideSpec(), lit)
+        np.testing.assert_array_equal(room.sees([view], lit[0])[0], sees)
+        assert arrays_of(room.buffers(view)).keys() == arrays_of(alone[0]).keys()
+        for record, single in zip((*of_view, of_view[0]), (*alone, room.buffers(view)), strict=True):
+            for name, values in arrays_of(single).items():
+                np.testing.assert_allclose(getattr(record, name), values, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +88,8 @@ def of_many_views(room: LoadedScene, somewhere: View) -> Callable[[str], tuple[I
     halves = []
     for number in range(48):
         vector = somewhere.vector + np.float32(number)
-        found = room.guides(somewhere, view_key(of_modification, vector), GuideSpec(light_samples=1), lit)
+        key = view_key(of_modification, vector)
+        ((_, found),) = room.inputs([somewhere], [key], GuideSpec(light_samples=1), lit)
         for name, values in noisy.items():
             values.append(getattr(found, name).astype(np.float64))
         sample = make_key("sample", room.spec.radiance_id, modification.vector, vector, 0)

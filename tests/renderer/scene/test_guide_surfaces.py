@@ -161,7 +161,7 @@ def test_beyond_a_mirror_lies_the_wall_that_it_shows() -> None:
     assert not found.direct.any()
 
     virtual = View(np.array([0, 0, -3], np.float32), np.zeros(3, np.float32))  # the mirror image of the camera
-    behind = view_buffers(scene_of(wall=wall), virtual, spec()).albedo[:, ::-1]
+    behind = view_buffers(scene_of(wall=wall), [virtual], spec())[0].albedo[:, ::-1]
     np.testing.assert_allclose(found.beyond_albedo, behind, atol=1e-6)
     assert 0.2 < (found.beyond_albedo.mean() / GREY.mean()) < 0.8
     assert len(np.unique(found.beyond_albedo[..., 0].round(4))) > 2, "the mean over pixels at edges of the texture"

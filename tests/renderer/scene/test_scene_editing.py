@@ -71,7 +71,7 @@ def test_recorded_buffers_and_photons_are_those_that_python_traces_anew(room: Lo
         modification = sample_modification(room.spec, 11, i)
         room.apply(modification)
         view = sample_view(room.spec, modification.key(room.spec.radiance_id), 11, i)
-        recorded, anew = room.buffers(view), view_buffers(room.scene, view, room.spec)
+        recorded, anew = room.buffers(view), view_buffers(room.scene, [view], room.spec)[0]
         photons = room.photons(i)
         assert photons is not None
         hits = trace_photons(room.scene, seed=i, paths=wanted.paths, depth=wanted.depth)

@@ -123,7 +123,7 @@ def look(loaded: LoadedScene, geometry: Geometry, cloud: BasePointCloud) -> Iter
         view = sample_view(spec, modification.key(spec.radiance_id), 0, i)
         photons = loaded.photons(i // 2)
         assert photons is not None
-        found = visibility_of(loaded, view, rebuild(cloud, modification), photons)
+        (found,) = visibility_of(loaded, [view], rebuild(cloud, modification), photons)
         yield Looked(spec, view, cloud, modification, photons, found, triangles_of(geometry, modification))
 
 
@@ -172,7 +172,7 @@ def test_neither_another_view_nor_an_edit_compiles_a_kernel(loaded: LoadedScene,
         points = rebuild(one.cloud, one.modification)
         with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
             dr.kernel_history_clear()
-            visibility_of(loaded, one.view, points, one.photons)
+            visibility_of(loaded, [one.view], points, one.photons)
             used.append({kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel})
     assert all(used)
     assert set.union(*used) == used[0]
@@ -195,7 +195,7 @@ def sees(*position: tuple[float, float, float], bsdf: str = "diffuse", **limits:
     """The eye at (0, 0, 3) looks past a square at the origin, ±1 across and facing the eye."""
     mi = backend.load(1)
     scene = mi.load_dict({"type": "scene", "square": {"type": "rectangle", "bsdf": {"type": bsdf}}}, optimize=False)
-    return find_seen_points(scene, ALONG_Z, spec(**limits), np.array(position, np.float32)).tolist()
+    return find_seen_points(scene, [ALONG_Z], spec(**limits), np.array(position, np.float32))[0].tolist()
 
 
 @pytest.mark.parametrize("bsdf", ["diffuse", "dielectric", "null"])

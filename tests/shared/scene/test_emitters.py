@@ -97,16 +97,16 @@ CONTENT = {
 """Digests of the scene files that the ready specs were written for."""
 
 IDS = {
-    "bathroom": "0326b23bbc0af858b2bf55dbb03f2f57",
-    "dining-room": "ca9a1cef1644dde27acbf417340e2bd7",
-    "kitchen": "40ea8b073717f4e9552e5476c3539a38",
-    "living-room": "747cafd494555044a556d6cbb6c993f0",
-    "living-room-2": "3c02215b5c59b38d96351ac1d81a1451",
-    "veach-ajar": "339825d4947a28017b0d658970d54d69",
+    "bathroom": "72ed517684da36e07c11cd7c810dedb9",
+    "dining-room": "de9006e8e59cce8f4ad7c525169519cc",
+    "kitchen": "0aba70adc39be58b76362b7e5c3a20d6",
+    "living-room": "3e558b92d031298d3fc69ddeaaf08465",
+    "living-room-2": "15487555efc6e0dd8cc007dd3883ec99",
+    "veach-ajar": "f5cd1a43460653ffed147fee2e76250d",
 }
 """Their scene ids."""
 
-BUILT_IN = {"room": "a3479b18fa8162737f00026bd99ecc98", "cornell": "729d41a5db144aad9ef8628e19b4ff6c"}
+BUILT_IN = {"room": "587f7f830d03e55075903be44437dc37", "cornell": "b9bde84b7983cda0ba4f8a93cd0db9b7"}
 
 
 @pytest.mark.parametrize("name", IDS)

@@ -18,7 +18,7 @@ from photonfarm.core.pictures import display
 from photonfarm.core.records import LIT_POINTS, Guides, arrays_of
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
-from photonfarm.predict import infer
+from photonfarm.predict import infer, open_run, opened_run
 from photonfarm.scene.camera_path import Frames, orbit
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.view import View
@@ -181,9 +181,9 @@ def test_what_cannot_be_shown_is_refused(
     for named, network, buffers in refused:
         with pytest.raises(SpecError, match=named):
             infer.show_frames(store, network, buffers, tmp_path / "out")
-    monkeypatch.setattr(infer, "can_render", lambda: False)
+    monkeypatch.setattr(opened_run, "can_render", lambda: False)
     with pytest.raises(SpecError, match=r"photonfarm buffers --scene"):
-        infer.render_frames(store, run, None, 3)
+        open_run(run.folder, store)
     monkeypatch.undo()
     for show in (
         lambda: infer.show_sample(tmp_path, run, 7, tmp_path / "out"),

@@ -1,4 +1,30 @@
-"""Images of a trained network for samples of a store and for camera paths.
+"""Images of a trained network: of samples of a store, of camera paths, and of any configuration and view.
 
 This package alone stands above renderer and trainer: it may use both in one process, with both extras installed.
 """
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from photonfarm.predict.opened_run import OpenRun
+
+
+def open_run(run: str | Path, store: str | Path = "store", device: str = "auto") -> OpenRun:
+    """Load the network of a run folder, and from a store the scene that it was trained on.
+
+    The renderer uses the card if there is one, else the processor, as PHOTONFARM_DEVICE says, and the network the same
+    `device` unless another one is named.
+
+    Raises StoreError for a folder without a checkpoint, and for a store without the scene; SpecError without the
+    renderer, and for a scene or a network that cannot be loaded.
+    """
+    from photonfarm.predict.opened_run import OpenRun
+    from photonfarm.trainer.predictors.trained import TrainedRun
+
+    return OpenRun(TrainedRun.load(Path(run)), store, device)
+
+
+__all__ = ["open_run"]

@@ -1,12 +1,12 @@
 """`photonfarm infer`: a trained network's image of a sample, or of a camera path.
 
-The views of a path are in no store. The renderer makes their buffers where it is installed, or `photonfarm buffers` has
-written them to a file.
+The views of a path are in no store. Their inputs are rendered here where the renderer is installed, or `photonfarm
+buffers` has written them to a file.
 """
 
 from __future__ import annotations
 
-import os
+import statistics
 import subprocess
 import time
 from collections.abc import Iterator, Sequence
@@ -21,11 +21,14 @@ from PIL import Image
 
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError, store_errors
 from photonfarm.core.pictures import enlarge, write_png
-from photonfarm.core.processes import can_render
+from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.plan.hold_out import rows_held_out
-from photonfarm.scene.camera_path import CameraPath, Frames
+from photonfarm.predict.opened_run import OpenRun
+from photonfarm.scene.camera_path import Frames
+from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View
 from photonfarm.store import Sample, SceneReader, Store
 from photonfarm.store.read.find import Query, find_samples
 from photonfarm.trainer.data.batch import TrainingBatch
@@ -33,7 +36,6 @@ from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import require
 from photonfarm.trainer.predictors.evaluation import choose_error
 from photonfarm.trainer.predictors.trained import TrainedRun
-from photonfarm.trainer.runs.run_folder import make_environment
 
 NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
 FFMPEG = "imageio_ffmpeg"
@@ -108,23 +110,6 @@ def _explain_missing(source: SceneReader, row: int) -> StoreError | IncompleteEr
 # ------------------------------------------------------------------------------------------------------ a camera path
 
 
-def render_frames(store: str | Path, run: TrainedRun, modification: str | None, path: CameraPath | int) -> Frames:
-    """The buffers of a camera path, or of an orbit of so many frames, in the scene of the run.
-
-    Raises SpecError without the renderer, and as `path_buffers.render_path` does.
-    """
-    if not can_render():
-        raise SpecError(
-            "the buffers of a camera path come from the renderer, which is not installed here (pip install "
-            f"'photonfarm[render]'); where it is, run `photonfarm buffers --scene {run.scene_id}` with the same path, "
-            "and give its file as --buffers FILE"
-        )
-    os.environ.update(make_environment(run.folder))
-    from photonfarm.renderer.jobs.path_buffers import render_path
-
-    return render_path(store, run.scene_id, modification, path)
-
-
 def show_frames(
     store: str | Path, run: TrainedRun, frames: Frames, out: Path, *, fps: float = 12.0, device: str = "auto"
 ) -> InferResult:
@@ -136,17 +121,31 @@ def show_frames(
     source = _open_source(store, run)
     _check_frames(run, frames, source.spec)
     predict = run.predictor(source.spec, source.base(), device)
+    images = (predict(batch)[0] for batch in _read_frames(run, frames, source))
+    return _show_images(images, len(frames), out, fps, "for the network and what it reads")
+
+
+def show_path(
+    opened: OpenRun, modification: Modification, views: Sequence[View], out: Path, *, fps: float = 12.0
+) -> InferResult:
+    """Write the network's images of a configuration from some views, whose inputs are rendered: as `show_frames`."""
+    with torch.no_grad():
+        images = ((opened.predict(modification, view) * opened.spec.exposure).cpu().numpy() for view in views)
+        return _show_images(images, len(views), out, fps, "for what the network reads and the network")
+
+
+def _show_images(images: Iterator[F32], count: int, out: Path, fps: float, what: str) -> InferResult:
+    """Write exposed images as they come, and the animation of them; `what` says what their time was for."""
     with store_errors("make the folder of the pictures", out):
         out.mkdir(parents=True, exist_ok=True)
-    files = [out / f"frame-{i:04}.png" for i in range(len(frames))]
-    seconds = 0.0
-    frame_batches = _read_frames(run, frames, source)
+    files = [out / f"frame-{i:04}.png" for i in range(count)]
+    seconds = []
     for file in files:
         began = time.perf_counter()
-        image = predict(next(frame_batches))[0]
-        seconds += time.perf_counter() - began
+        image = next(images)
+        seconds.append(time.perf_counter() - began)
         write_png(enlarge(image), file)
-    sentence = f"{len(frames)} frames, {1e3 * seconds / len(frames):.1f} ms each for the network and what it reads"
+    sentence = f"{count} frames, {1e3 * statistics.median(seconds):.1f} ms each {what}"
     films = [out / "path.gif"]
     write_gif(files, films[0], fps)
     if find_spec(FFMPEG) is None:
@@ -157,17 +156,12 @@ def show_frames(
     return InferResult((*files, *films), sentence)
 
 
-def check_path(run: TrainedRun) -> None:
-    """Raise SpecError for a network that cannot show a camera path."""
+def _check_frames(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
     if run.needs.kept:
         raise SpecError(
-            f"{run.folder}: {run.settings.network.architecture} needs the noisy image of a view, which a camera path "
-            "does not have; show a stored sample with --row"
+            f"{run.folder}: {run.settings.network.architecture} needs the noisy image of a view, which a file of "
+            "buffers does not have; show a stored sample with --row, or the path where the renderer is installed"
         )
-
-
-def _check_frames(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
-    check_path(run)
     film = (len(frames), spec.film.height, spec.film.width)
     if (frames.scene_id, frames.depth.shape) != (run.scene_id, film):
         raise SpecError(

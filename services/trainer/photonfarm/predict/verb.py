@@ -55,9 +55,10 @@ def infer(
 ) -> None:
     """Show a trained network's image of one sample, or of a camera path: PNG, GIF and, with its extra, MP4.
 
-    The views of a path are in no store: the renderer makes their buffers, where it is installed, or a file has them.
+    The views of a path are in no store: their inputs are rendered, where the renderer is installed, or a file has them.
     """
     from photonfarm.predict import infer as shows
+    from photonfarm.predict.opened_run import OpenRun, require_renderer
     from photonfarm.scene.camera_path import CameraPath, Frames
     from photonfarm.trainer.predictors.trained import TrainedRun
 
@@ -73,10 +74,12 @@ def infer(
         along.sample()  # a faulty one is refused before anything is loaded
     trained = TrainedRun.load(run)
     if along is not None:
-        shows.check_path(trained)
-        with tell_waiting(partial(click.echo, err=True), f"rendering buffers of {trained.scene_id}"):
-            frames = shows.render_frames(store, trained, modification, along)
-        result = shows.show_frames(store, trained, frames, out, fps=fps, device=device)
+        require_renderer(trained)
+        from photonfarm.renderer.jobs.path_buffers import find_views
+
+        _, configuration, views = find_views(store, trained.scene_id, modification, along)
+        with tell_waiting(partial(click.echo, err=True), f"rendering {len(views)} frames of {trained.scene_id}"):
+            result = shows.show_path(OpenRun(trained, store, device), configuration, views, out, fps=fps)
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
     else:

@@ -22,7 +22,7 @@ from photonfarm.renderer.bdpt.launches import LAUNCH_PATHS, Lanes, Launch, launc
 from photonfarm.renderer.bdpt.light_paths import PathOptions, trace_light_paths
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.poses import Places, Poses
-from photonfarm.renderer.bdpt.recording import Recorder, call_recorded
+from photonfarm.renderer.bdpt.recording import Recorders, call_recorded
 from photonfarm.renderer.bdpt.scenes import bounding_box, check_scene
 
 UNBOUNDED = 0xFFFFFFFF
@@ -76,8 +76,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             raise ValueError(
                 "bdpt: hide_emitters is set; only false is allowed, because light paths cannot know what is hidden"
             )
-        self._recorder = Recorder(trace) if record else None
-        self._learning_recorder = Recorder(explore) if record else None
+        self._recorders = Recorders() if record else None
 
     def to_string(self) -> str:
         """The integrator and its parameters in Mitsuba's notation."""
@@ -171,7 +170,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
             lanes = self._lanes(SparseLanes, launch, (width, height), 1, seeds, places, options)
             lanes.thin(effort.eye_paths // views)
             grid = Grid.over(bounding_box(scene), SIDE)
-            images, totals = self._call(explore, self._learning_recorder, scene, sensor, lights, options, lanes, grid)
+            images, totals = self._call(explore, scene, sensor, lights, options, lanes, grid)
             return learn(layout, lights.emit_probability, images, totals, lanes)
 
     def _has_light_paths(self, scene: mi.Scene) -> bool:
@@ -219,7 +218,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
                 own = slice(launch.first_image, launch.first_image + launch.images)
                 own_places = None if places is None else places[own]
                 lanes = self._lanes(Lanes, launch, (width, height), spp, seeds[own], own_places, options)
-                part = self._call(trace, self._recorder, scene, sensor, lights, options, lanes)
+                part = self._call(trace, scene, sensor, lights, options, lanes)
                 images.add(part, launch.first_image * pixels)
             return images
 
@@ -240,7 +239,6 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
     def _call(
         self,
         function: Callable[..., Any],
-        recorder: Recorder | None,
         scene: mi.Scene,
         sensor: mi.Sensor,
         lights: Lights | None,
@@ -248,9 +246,9 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         lanes: Lanes,
         *more: Any,
     ) -> Any:
-        clipping = (sensor.near_clip(), sensor.far_clip()) if recorder else ()
+        clipping = sensor.near_clip(), sensor.far_clip()
         kind = (lanes.kind, options.kind, lights.kind_of_kernels if lights else None, clipping)
-        return call_recorded(recorder, function, kind, scene, sensor, lights, options, lanes, *more)
+        return call_recorded(self._recorders, function, kind, scene, sensor, lights, options, lanes, *more)
 
     def _options(self, launch: Launch, pixels: int, useful: Usefulness | None = None) -> PathOptions:
         connects = self.connections > 0 and launch.light_paths > 0

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.light_paths import LightState, PathOptions, first_state, scatter
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights, sample_emission
-from photonfarm.renderer.bdpt.recording import Recorder, call_recorded, loop_once
+from photonfarm.renderer.bdpt.recording import Recorders, call_recorded, loop_once
 from photonfarm.renderer.bdpt.scenes import check_scene
 
 Floats = npt.NDArray[np.float32]
@@ -34,7 +34,7 @@ class TracedPhotons:
 
 
 def trace_photons(
-    scene: mi.Scene, *, seed: int, paths: int, depth: int, recorder: Recorder | None = None
+    scene: mi.Scene, *, seed: int, paths: int, depth: int, recorders: Recorders | None = None
 ) -> TracedPhotons:
     """Trace ``paths`` light paths of up to ``depth`` surface hits each.
 
@@ -42,8 +42,8 @@ def trace_photons(
     bring none), so that sums over a region estimate the flux that arrives in it, whatever ``paths`` is. There is no
     Russian roulette, since the slots are fixed anyway. Lights that can only be hit (see ``lights.emission``) emit none.
 
-    Nothing is compiled again for another seed, or for a scene that was edited in place. With a ``recorder`` of
-    ``trace`` Python runs but once, which saves most of the time in scenes of many materials. Raises ValueError for
+    Nothing is compiled again for another seed, or for a scene that was edited in place. With
+    ``recorders`` Python runs but once, which saves most of the time in scenes of many materials. Raises ValueError for
     scenes with media, and for numbers below 1.
     """
     if paths < 1 or depth < 1:
@@ -56,7 +56,7 @@ def trace_photons(
         lights = read_lights(scene)
         keys = randomness.image_keys([seed & 0xFFFFFFFF])
         arguments = (lights, keys, dr.opaque(mi.UInt32, paths), dr.opaque(mi.Float, 0), paths, depth)
-        out, bounce = call_recorded(recorder, trace, (paths, depth, lights.kinds), scene, None, *arguments)
+        out, bounce = call_recorded(recorders, trace, (paths, depth, lights.kinds), scene, None, *arguments)
     position, direction, normal, power = (np.ascontiguousarray(np.array(column).T, dtype=np.float32) for column in out)
     return TracedPhotons(position, direction, normal, power / np.float32(paths), np.array(bounce))
 

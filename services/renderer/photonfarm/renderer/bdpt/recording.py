@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeVarTuple
 
 import drjit as dr
@@ -56,16 +57,26 @@ class Recorder:
         return self._function(scene, sensor, *arguments)
 
 
+class Recorders(dict[Callable[..., Any], Recorder]):
+    """The recorders of functions, each made when it is first needed."""
+
+    def __missing__(self, function: Callable[..., Any]) -> Recorder:
+        """Make the recorder of a function."""
+        self[function] = recorder = Recorder(function)
+        return recorder
+
+
 def call_recorded(
-    recorder: Recorder | None,
+    recorders: Recorders | None,
     function: Callable[..., Any],
     kind: Hashable,
     scene: mi.Scene,
     sensor: mi.Sensor | None,
     *arguments: Any,
 ) -> Any:
-    """The result of ``function`` by its ``recorder``, or called directly if there is none."""
-    return function(scene, sensor, *arguments) if recorder is None else recorder(kind, scene, sensor, *arguments)
+    """The result of ``function`` by its recorder, or called directly if there are none."""
+    call = function if recorders is None else partial(recorders[function], kind)
+    return call(scene, sensor, *arguments)
 
 
 @dataclass(slots=True)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.keys import view_key
-from photonfarm.core.records import BasePointCloud, Guides, arrays_of
+from photonfarm.core.records import BasePointCloud, Guides, ViewBuffers, Visibility, arrays_of
 from photonfarm.farm.configuration import find_configuration
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import (
@@ -24,28 +25,33 @@ from photonfarm.scene.camera_path import CameraPath, Frames, check_clear, orbit
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
-from photonfarm.store import Store
+from photonfarm.store import SceneStore, Store
 from photonfarm.store.read.find import scene_named
-
-if TYPE_CHECKING:
-    from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
 
 def render_path(store: str | Path, scene: str, modification: str | None, path: CameraPath | int) -> Frames:
     """The buffers of a camera path, or of an orbit of so many frames.
 
-    Raises StoreError for a scene that the store does not hold, SceneNotHereError if its files are not on this machine,
-    SpecError for an impossible configuration.
+    Raises as `find_views` does, and SceneNotHereError if the scene's files are not on this machine.
+    """
+    stored, configuration, views = find_views(store, scene, modification, path)
+    cloud = stored.base()[1] if stored.has_base() else None
+    return frames_of(locate(stored.spec), configuration, views, cloud)
+
+
+def find_views(
+    store: str | Path, scene: str, modification: str | None, path: CameraPath | int
+) -> tuple[SceneStore, Modification, list[View]]:
+    """The scene in the store, the configuration, by default that at rest, and the views of a path or of an orbit.
+
+    Raises StoreError for a scene that the store does not hold, SpecError for an impossible configuration or path.
     """
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
     configuration = find_configuration(opened, stored, modification)
-    spec = locate(stored.spec)
     if isinstance(path, int):
-        views = orbit(spec, path, configuration)
-    else:
-        views = check_clear(spec, path.sample(), configuration)
-    return frames_of(spec, configuration, views, stored.base()[1] if stored.has_base() else None)
+        return stored, configuration, orbit(stored.spec, path, configuration)
+    return stored, configuration, check_clear(stored.spec, path.sample(), configuration)
 
 
 def frames_of(
@@ -63,25 +69,28 @@ def frames_of(
     """
     scene = load(spec)
     scene.apply(modification)
-    buffers = [scene.buffers(view) for view in views]
-    depth, albedo, normal = (np.stack([getattr(b, name) for b in buffers]) for name in ("depth", "albedo", "normal"))
-    photons, _ = photons_of(scene, modification.key(spec.radiance_id))
-    arrays = {"depth": depth, "albedo": albedo, "normal": normal}
-    for name, values in arrays.items():
+    photons, _ = photons_of(scene, key := modification.key(spec.radiance_id))
+    cloud = cloud or scene.base()[1]
+    points, lit = rebuild(cloud, modification), lit_points(cloud, modification)
+    buffers, guides, seen = [], [], []
+    for first in range(0, len(views), scene.samples_at_once):
+        together = views[first : first + scene.samples_at_once]
+        keys = [view_key(key, view.vector) for view in together]
+        for of_view in scene.inputs(together, keys, spec.guides, lit):
+            buffers.append(of_view[0])
+            guides.append(of_view[1])
+        seen += visibility_of(scene, together, points, photons)
+    images = _stack(buffers)
+    for name, values in images.items():
         if not np.isfinite(values).all():
             raise IncompleteError(f"{name} of these views came out non-finite; move the camera a little")
-    cloud = cloud or scene.base()[1]
-    points = rebuild(cloud, modification)
-    guides = _guides(scene, modification, views, spec, cloud)
-    seen = [visibility_of(scene, view, points, photons) for view in views]
-    arrays |= {"point_seen": np.stack([s.points for s in seen]), "photon_seen": np.stack([s.photons for s in seen])}
-    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=guides, **arrays)
+    visible = _stack(seen)
+    images |= {"point_seen": visible["points"], "photon_seen": visible["photons"]}
+    stacked = Guides(**_stack(guides))
+    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=stacked, **images)
 
 
-def _guides(
-    scene: LoadedScene, modification: Modification, views: Sequence[View], spec: SceneSpec, cloud: BasePointCloud
-) -> Guides:
-    """The guides of all views, stacked."""
-    key, lit = modification.key(spec.radiance_id), lit_points(cloud, modification)
-    guides = [arrays_of(scene.guides(view, view_key(key, view.vector), spec.guides, lit)) for view in views]
-    return Guides(**{name: np.stack([each[name] for each in guides]).astype(np.float32) for name in guides[0]})
+def _stack(records: Sequence[ViewBuffers] | Sequence[Guides] | Sequence[Visibility]) -> dict[str, NDArray[Any]]:
+    """The arrays of all views by name, stacked."""
+    arrays = [arrays_of(record) for record in records]
+    return {name: np.stack([each[name] for each in arrays]) for name in arrays[0]}

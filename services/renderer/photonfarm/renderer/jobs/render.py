@@ -25,9 +25,7 @@ from photonfarm.core.records import (
     F32,
     LIT_POINTS,
     BasePointCloud,
-    Guides,
     Photons,
-    ViewBuffers,
     Visibility,
     arrays_of,
 )
@@ -210,14 +208,14 @@ def lit_points(cloud: BasePointCloud, modification: Modification) -> tuple[F32, 
 
 
 def visibility_of(
-    scene: LoadedScene, view: View, points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
-) -> Visibility:
-    """Which points a view sees in the current configuration: of its cloud, as `rebuild` returns it, and its photons."""
+    scene: LoadedScene, views: Sequence[View], points: tuple[F32, NDArray[np.bool_]], photons: Photons | None
+) -> list[Visibility]:
+    """Which points views see in the current configuration: of its cloud, as `rebuild` returns it, and its photons."""
     position, present = points
-    if photons is None:
-        return Visibility(scene.sees(view, position) & present, np.zeros(0, np.bool_))
-    seen = scene.sees(view, np.concatenate([position, photons.position]))
-    return Visibility(seen[: len(position)] & present, seen[len(position) :] & (photons.bounce >= 0))
+    if photons is not None:
+        position, present = np.concatenate([position, photons.position]), np.append(present, photons.bounce >= 0)
+    of_cloud, of_photons = np.split(scene.sees(views, position) & present, [len(points[0])], axis=1)
+    return [Visibility(*seen) for seen in zip(of_cloud, of_photons, strict=True)]
 
 
 class _Rendering:
@@ -260,19 +258,15 @@ class _Rendering:
                 self.redrawn += discarded
                 if photons is not None:
                     self._out.photons(modification_row, photons)
-            points = rebuild(self._cloud, modification)
             for first in range(0, len(samples), self._scene.samples_at_once):
                 together = samples[first : first + self._scene.samples_at_once]
                 phase = RENDERS_SAMPLES if self._compiled or done else COMPILES
                 self._on_progress(phase, done, len(rows.samples))
                 done += len(together)
-                for sample in together:
-                    if sample.view_row in new_views:
-                        view = rows.views[sample.view_row]
-                        visibility = visibility_of(self._scene, view, points, photons)
-                        buffers, guides = self._buffers(sample, view), self._guides(sample, view, modification)
-                        self._out.view(sample.view_row, buffers, guides, visibility)
-                        new_views.remove(sample.view_row)
+                of_new = {sample.view_row: sample for sample in together if sample.view_row in new_views}
+                if of_new:
+                    self._render_inputs(list(of_new.values()), rows, modification, photons)
+                    new_views -= of_new.keys()
                 self._render_halves(together, rows)
 
     def _render_halves(self, samples: Sequence[SampleRow], rows: JobRows) -> None:
@@ -290,18 +284,17 @@ class _Rendering:
             self.redrawn += discarded
             self._out.radiance(sample.row, halves)
 
-    def _buffers(self, sample: SampleRow, view: View) -> ViewBuffers:
-        """Render the buffers of a view, without a second attempt: they depend on no seed."""
-        buffers = self._scene.buffers(view)
-        _check_finite(arrays_of(buffers), sample)
-        return buffers
-
-    def _guides(self, sample: SampleRow, view: View, modification: Modification) -> Guides:
-        """Render the guides of a view, without a second attempt."""
-        key = view_key(modification.key(self._spec.radiance_id), view.vector)
-        guides = self._scene.guides(view, key, self._spec.guides, lit_points(self._cloud, modification))
-        _check_finite(arrays_of(guides), sample)
-        return guides
+    def _render_inputs(
+        self, samples: Sequence[SampleRow], rows: JobRows, modification: Modification, photons: Photons | None
+    ) -> None:
+        """Render the inputs of the samples' views together, without a second attempt: buffers depend on no seed."""
+        views, key = [rows.views[sample.view_row] for sample in samples], modification.key(self._spec.radiance_id)
+        keys = [view_key(key, view.vector) for view in views]
+        visible = visibility_of(self._scene, views, rebuild(self._cloud, modification), photons)
+        inputs = self._scene.inputs(views, keys, self._spec.guides, lit_points(self._cloud, modification))
+        for sample, (buffers, guides), seen in zip(samples, inputs, visible, strict=True):
+            _check_finite(arrays_of(buffers) | arrays_of(guides), sample)
+            self._out.view(sample.view_row, buffers, guides, seen)
 
 
 def _check_finite(arrays: Mapping[str, NDArray[np.generic]], sample: SampleRow) -> None:

@@ -27,6 +27,7 @@ letter: N points.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
@@ -36,87 +37,75 @@ from numpy.typing import NDArray
 
 from photonfarm.core.records import F32, ViewBuffers
 from photonfarm.renderer.bdpt.recording import call_recorded
-from photonfarm.renderer.scene.arrays import floats, points, rows
-from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.view import Camera, View
+from photonfarm.renderer.scene.arrays import floats, points
+from photonfarm.renderer.scene.view_rays import (
+    Columns,
+    PixelRay,
+    Take,
+    ViewCameras,
+    interleave,
+    shape_images,
+    sum_over_grid,
+    take_numpy,
+)
+from photonfarm.scene.spec import RAYS_PER_PIXEL, SceneSpec
+from photonfarm.scene.view import View
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.bdpt.recording import Recorder
+    from photonfarm.renderer.bdpt.recording import Recorders
 
-GRID = 4
-"""The number of rays along each axis of a pixel, over which albedo is averaged."""
+CENTRE = {"normal": 3, "depth": 1}
+"""The images that are made of one ray through each pixel's centre, and their channels."""
 
-RAYS = 1 << 20
-"""The number of rays traced at a time, or one for each pixel if that is more."""
+ALBEDO = {"albedo": 3}
 
 
-def view_buffers(scene: Any, view: View, spec: SceneSpec, recorder: Recorder | None = None) -> ViewBuffers:
-    """Depth (H, W), albedo and normal (H, W, 3) between the near and the far plane; zeros where nothing is hit.
+def view_buffers(
+    scene: Any, views: Sequence[View], spec: SceneSpec, recorders: Recorders | None = None, take: Take = take_numpy
+) -> list[ViewBuffers]:
+    """Depth (H, W), albedo and normal (H, W, 3) of views between the near and the far plane; zeros on a miss.
 
-    With a `recorder` of `trace_first_surfaces`, Python runs only the first time; it takes half of the time in scenes of
-    many materials.
+    With `recorders` Python runs only the first time; it takes half of the time in scenes of many materials.
     """
-    camera = Camera.of(view, spec)
-    rays, along = camera_rays(camera, camera.rays(), spec)
-    shape = (camera.height, camera.width)
-    kind = ("centre", dr.width(rays[2]))
-    hit, normal, distance = call_recorded(recorder, trace_first_surfaces, kind, scene, None, *rays, "centre")
-    depth = np.where(np.array(hit), spec.view.near + np.array(distance) * along, 0)
-    albedo = _mean_albedo(scene, camera, spec, recorder)
-    return ViewBuffers(depth.astype(np.float32).reshape(shape), albedo, rows(normal, *shape))
+    cameras = ViewCameras.of(views, spec)
+    arrays = call_recorded(recorders, trace_albedo, cameras.kind, scene, None, cameras)
+    albedo = [images["albedo"] for images in shape_images(arrays, ALBEDO, cameras, take)]
+    return with_albedo(scene, views, spec, albedo, recorders, take)
 
 
-def _mean_albedo(scene: Any, camera: Camera, spec: SceneSpec, recorder: Recorder | None) -> F32:
-    """The mean albedo over the area of each pixel, (H, W, 3)."""
-    steps = (np.arange(GRID) + 0.5) / GRID
-    within = [(u, v) for v in steps for u in steps]
-    at_once = max(1, RAYS // (camera.height * camera.width))
-    total = np.zeros((camera.height, camera.width, 3))
-    for start in range(0, len(within), at_once):
-        directions = np.stack([camera.rays(u, v) for u, v in within[start : start + at_once]])
-        rays, _ = camera_rays(camera, directions, spec)
-        kind = ("albedo", dr.width(rays[2]))
-        (albedo,) = call_recorded(recorder, trace_first_surfaces, kind, scene, None, *rays, "albedo")
-        total += rows(albedo, *directions.shape[:-1]).sum(axis=0, dtype=np.float64)
-    return (total / len(within)).astype(np.float32)
+def with_albedo(
+    scene: Any,
+    views: Sequence[View],
+    spec: SceneSpec,
+    albedo: Sequence[F32],
+    recorders: Recorders | None = None,
+    take: Take = take_numpy,
+) -> list[ViewBuffers]:
+    """The buffers of views whose albedo (H, W, 3) is known: depth and normals are rendered."""
+    cameras = ViewCameras.of(views, spec)
+    arrays = call_recorded(recorders, trace_centres, cameras.kind, scene, None, cameras)
+    of_centres = shape_images(arrays, CENTRE, cameras, take)
+    return [ViewBuffers(**images, albedo=mean) for images, mean in zip(of_centres, albedo, strict=True)]
 
 
-def camera_rays(camera: Camera, directions: F32, spec: SceneSpec) -> tuple[tuple[Any, Any, Any], NDArray[np.float64]]:
-    """Rays from the near to the far plane, along unit directions (..., 3), and their cosines to the forward axis.
-
-    The origins (Point3f), directions (Vector3f) and lengths (Float) of rays.
-    """
-    origin, direction, reach, along = place_rays(camera, directions, spec)
-    return (points(origin), mi.Vector3f(points(direction)), floats(reach)), along
-
-
-def place_rays(
-    camera: Camera, directions: F32, spec: SceneSpec
-) -> tuple[NDArray[np.float64], F32, NDArray[np.float64], NDArray[np.float64]]:
-    """The same in numpy's memory: origins (N, 3), directions (N, 3), lengths and cosines (N,) of N rays."""
-    flat = directions.reshape(-1, 3)
-    along = flat.astype(np.float64) @ camera.forward
-    near, far = spec.view.near / along, spec.view.far / along
-    return camera.origin + flat * near[:, None], flat, far - near, along
-
-
-def trace_first_surfaces(scene: Any, _: Any, origin: Any, direction: Any, reach: Any, what: str) -> tuple[Any, ...]:
-    """(hits, normals, distances) of the first surfaces that rays meet ("centre"), or ("albedo",); zeros on a miss."""
-    si = scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
+def trace_centres(scene: Any, _: Any, cameras: ViewCameras) -> Any:
+    """The depth and the normal of what the rays through the pixels' centres meet first, arrays."""
+    ray = cameras.pixels().ray(0.5, 0.5)
+    si = scene.ray_intersect(ray.ray)
     hit = si.is_valid()
-    columns: tuple[Any, ...]
-    if what == "centre":
-        columns = hit, dr.select(hit, si.sh_frame.n, 0), dr.select(hit, si.t, 0)
-    else:
-        columns = (dr.select(hit, seen_reflectance(si, hit), 0),)
-    dr.eval(columns)
-    return columns
+    columns = {"normal": dr.select(hit, si.sh_frame.n, 0), "depth": dr.select(hit, ray.depth(si.t), 0)}
+    return interleave(columns, CENTRE, cameras.lanes)
 
 
-def first_surfaces(scene: Any, camera: Camera, directions: F32, spec: SceneSpec) -> Any:
-    """The first hits between the near and the far plane of rays from the camera along unit directions (..., 3)."""
-    (origin, direction, reach), _ = camera_rays(camera, directions, spec)
-    return scene.ray_intersect(mi.Ray3f(o=origin, d=direction, maxt=reach, time=0, wavelengths=[]))
+def trace_albedo(scene: Any, _: Any, cameras: ViewCameras) -> Any:
+    """The mean albedo over each pixel's grid, arrays."""
+
+    def albedo(ray: PixelRay, _: Any) -> Columns:
+        si = scene.ray_intersect(ray.ray)
+        return {"albedo": seen_reflectance(si, si.is_valid())}
+
+    sums = sum_over_grid(cameras, ALBEDO, albedo)
+    return interleave({"albedo": sums["albedo"] / RAYS_PER_PIXEL}, ALBEDO, cameras.lanes)
 
 
 def seen_reflectance(si: Any, active: Any) -> Any:
@@ -140,27 +129,40 @@ SELF_HIT = 1e-4
 """The share of its length by which a ray ends before its point, so that it does not meet the point's surface."""
 
 
-def find_seen_points(scene: Any, view: View, spec: SceneSpec, position: F32) -> NDArray[np.bool_]:
-    """Whether a view sees points (N, 3) of the present scene, (N,), by the definition of `records.Visibility`.
+def find_seen_points(
+    scene: Any, views: Sequence[View], spec: SceneSpec, position: F32, recorders: Recorders | None = None
+) -> NDArray[np.bool_]:
+    """Whether each view sees points (P, 3) of the present scene, (K, P), by the definition of `records.Visibility`."""
+    cameras = ViewCameras.of(views, spec)
+    kind = cameras.kind, len(position)
+    seen = call_recorded(recorders, trace_to_points, kind, scene, None, cameras, floats(position))
+    return np.array(seen).reshape(len(views), len(position))
+
+
+def trace_to_points(scene: Any, _: Any, cameras: ViewCameras, position: Any) -> Any:
+    """Whether the views see the points, whose coordinates are one Float array, view after view (Bool).
 
     There is a ray for every point, so that the number of rays depends on no view; those to points outside the image
     are switched off.
     """
-    camera = Camera.of(view, spec)
-    offset = position - camera.origin
-    z = offset @ camera.forward
-    ahead = (z > spec.view.near) & (z < spec.view.far)
-    z = np.where(ahead, z, 1.0)
-    u, v = (camera.focal_px * (offset @ axis) / z for axis in (camera.right, camera.down))
-    in_image = ahead & _is_in_a_pixel(u, camera.width) & _is_in_a_pixel(v, camera.height)
-
-    distance = np.where(ahead, np.linalg.norm(offset, axis=1), 1.0)
-    direction = offset / distance[:, None]
-    near = spec.view.near * distance / z  # at which the line to the point crosses the near plane
-    ray = mi.Ray3f(o=points(camera.origin + near[:, None] * direction), d=mi.Vector3f(points(direction)))
-    ray.maxt = floats(np.where(in_image, (1 - SELF_HIT) * distance - near, 0.0))
-    hidden = scene.ray_test(ray, active=ray.maxt > 0)
-    return in_image & ~np.array(hidden)
+    count = dr.width(position) // 3
+    lane = dr.arange(mi.UInt32, cameras.views * count)
+    view = lane // count
+    camera, point = cameras.of_views(view), dr.gather(mi.Point3f, position, lane - view * count)
+    offset = mi.Vector3f(point - camera.origin)
+    z = dr.dot(offset, camera.forward)
+    ahead = (z > camera.near) & (z < camera.far)
+    z = dr.select(ahead, z, 1)
+    u, v = (camera.focal_px * dr.dot(offset, axis) / z for axis in (camera.right, camera.down))
+    seen = ahead & _is_in_a_pixel(u, camera.width) & _is_in_a_pixel(v, camera.height)
+    distance = dr.norm(offset)
+    direction = offset / distance
+    before = camera.near * distance / z  # where the line to the point crosses the near plane
+    reach = (1 - SELF_HIT) * distance - before
+    seen_ray = mi.Ray3f(mi.Point3f(camera.origin + before * direction), direction, reach, 0, [])
+    seen &= ~scene.ray_test(seen_ray, seen & (reach > 0))
+    dr.eval(seen)
+    return seen
 
 
 def sight_shares(scene: Any, origins: F32, targets: F32) -> F32:
@@ -173,7 +175,6 @@ def sight_shares(scene: Any, origins: F32, targets: F32) -> F32:
     return 1 - blocked.mean(axis=1, dtype=np.float32)
 
 
-def _is_in_a_pixel(place: NDArray[np.float64], pixels: int) -> NDArray[np.bool_]:
+def _is_in_a_pixel(place: Any, pixels: int) -> Any:
     """Whether places along one axis, in pixels from the image's centre, are in one of its pixels."""
-    inside: NDArray[np.bool_] = (place >= -0.5 * pixels) & (place < 0.5 * pixels)
-    return inside
+    return (place >= -0.5 * pixels) & (place < 0.5 * pixels)

@@ -41,9 +41,7 @@ class LoadedScene:
 
     def __init__(self, spec: SceneSpec, scene: Any, paths_at_once: int | None = None) -> None:
         """Take over a Mitsuba scene; `paths_at_once` are the most paths in a launch, by default as the device likes."""
-        from photonfarm.renderer.bdpt import photons
-        from photonfarm.renderer.bdpt.recording import Recorder
-        from photonfarm.renderer.scene import gbuffer, guides
+        from photonfarm.renderer.bdpt.recording import Recorders
         from photonfarm.renderer.scene.editing import MovableGroup
         from photonfarm.renderer.scene.loading import AimedSensor
         from photonfarm.renderer.scene.materials import Materials
@@ -55,8 +53,7 @@ class LoadedScene:
         paths_at_once = paths_at_once or backend.paths_at_once()
         self._integrator = integrator_of(spec.transport, paths_at_once)
         self.samples_at_once = 1 if paths_at_once is None else _samples_at_once(spec, paths_at_once)
-        self._photon_recorder, self._buffer_recorder = Recorder(photons.trace), Recorder(gbuffer.trace_first_surfaces)
-        self._guide_recorder, self._point_recorder = Recorder(guides.trace), Recorder(guides.irradiance)
+        self._recorders = Recorders()
         self._materials = Materials.of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
@@ -174,27 +171,34 @@ class LoadedScene:
         """Learn the guides of light paths anew, as for another configuration."""
         self._light_guides.clear()
 
-    def buffers(self, view: View) -> ViewBuffers:
-        """The depth, albedo and normal buffers of a view in the present configuration."""
+    def buffers(self, view: View, **taken: Any) -> ViewBuffers:
+        """The depth, albedo and normal buffers of a view in the present configuration; `taken` as for `inputs`."""
         from photonfarm.renderer.scene.gbuffer import view_buffers
 
-        return view_buffers(self.scene, view, self.spec, self._buffer_recorder)
+        return view_buffers(self.scene, [view], self.spec, self._recorders, **taken)[0]
 
-    def guides(self, view: View, key: Key, wanted: GuideSpec, lit: tuple[F32, F32]) -> Guides:
-        """The guides of a view; `key` is the view's, from which the seed of direct light is derived.
+    def inputs(
+        self, views: Sequence[View], keys: Sequence[Key], wanted: GuideSpec, lit: tuple[F32, F32], **taken: Any
+    ) -> list[tuple[ViewBuffers, Guides]]:
+        """The buffers and the guides of views in the present configuration, whose seeds follow from the views' `keys`.
 
-        `lit` are positions and normals (L, 3) of the points whose irradiance is required.
+        `lit` are positions and normals (L, 3) of the points whose irradiance is required. With `take`, a function of
+        values of Dr.Jit, images are what it makes of them, otherwise arrays of numpy.
         """
-        from photonfarm.renderer.scene.guides import point_light, view_guides
+        from photonfarm.renderer.scene.gbuffer import with_albedo
+        from photonfarm.renderer.scene.guides import view_guides
 
-        arrives = point_light(self.scene, *lit, key, wanted, self._point_recorder)
-        return view_guides(self.scene, view, self.spec, wanted, key, self._materials, arrives, self._guide_recorder)
+        of_scene, recorders = (self.scene, views, self.spec), self._recorders
+        albedo, guides = zip(
+            *view_guides(*of_scene, wanted, keys, self._materials, lit, recorders, **taken), strict=True
+        )
+        return list(zip(with_albedo(*of_scene, albedo, recorders, **taken), guides, strict=True))
 
-    def sees(self, view: View, position: F32) -> NDArray[np.bool_]:
-        """Whether the view sees points (N, 3) of the present configuration, (N,)."""
+    def sees(self, views: Sequence[View], position: F32) -> NDArray[np.bool_]:
+        """Whether each view sees points (P, 3) of the present configuration, (K, P)."""
         from photonfarm.renderer.scene.gbuffer import find_seen_points
 
-        return find_seen_points(self.scene, view, self.spec, position)
+        return find_seen_points(self.scene, views, self.spec, position, self._recorders)
 
     @cached_property
     def hollow(self) -> NDArray[np.bool_]:
@@ -216,9 +220,7 @@ class LoadedScene:
         wanted = self.spec.photons
         if not wanted.paths:
             return None
-        hits = trace_photons(
-            self.scene, seed=seed, paths=wanted.paths, depth=wanted.depth, recorder=self._photon_recorder
-        )
+        hits = trace_photons(self.scene, seed=seed, paths=wanted.paths, depth=wanted.depth, recorders=self._recorders)
         return Photons(hits.position, hits.direction, hits.normal, hits.power, hits.bounce.astype(np.int8))
 
     def base(self) -> tuple[Geometry, BasePointCloud]:

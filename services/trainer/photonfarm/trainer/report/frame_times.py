@@ -58,8 +58,9 @@ TIMED = 15  # frames
 class FrameTime:
     """Wall seconds of one frame, by parts in the order in which they are made; None for parts that are not needed.
 
-    These are half A at 1/k of the pixels, depth with albedo and normal, the view's guides, which points of the cloud it
-    sees, photons traced and seen, and the network. Editing the scene is left out, as it costs all the same.
+    These are half A at 1/k of the pixels, depth with albedo and normal, the view's guides together with these, which
+    points of the cloud it sees, photons traced and seen, and the network. Editing the scene is left out, as it costs
+    all the same.
     """
 
     parts: dict[str, Seconds | None]  # render, buffers, guides, points, photons, network
@@ -111,7 +112,7 @@ def assemble_frame_time(predictor: TrainedRun | ReadyPredictor, network: Seconds
     return FrameTime(
         {
             "render": costs.renders()[needs.kept] if needs.kept else None,
-            "buffers": parts["buffers_s"],
+            "buffers": None if needs.guides else parts["buffers_s"],
             "guides": parts["guides_s"] if needs.guides else None,
             "points": parts["points_s"] if _sees_points(predictor) else None,
             "photons": Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,

@@ -5,6 +5,7 @@ Shape letters: L lit points, N rays.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -14,15 +15,15 @@ import numpy as np
 
 from photonfarm.core.keys import Key, Stream
 from photonfarm.core.records import F32
-from photonfarm.renderer.bdpt.lights.emission import Lights, hit_densities, read_lights, sample_direct
+from photonfarm.renderer.bdpt.lights.emission import Lights, hit_densities, sample_direct
 from photonfarm.renderer.bdpt.recording import call_recorded, loop_once
-from photonfarm.renderer.scene.arrays import floats, points, rows
-from photonfarm.renderer.scene.gbuffer import GRID, diffuse_reflectance, reflects_here
+from photonfarm.renderer.scene.arrays import floats, rows
+from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, reflects_here
 from photonfarm.renderer.scene.materials import has_other_lobes
-from photonfarm.scene.spec import GuideSpec
+from photonfarm.scene.spec import RAYS_PER_PIXEL, GuideSpec
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.bdpt.recording import Recorder
+    from photonfarm.renderer.bdpt.recording import Recorders
 
 FOLLOWED = 8
 """The most mirrors and panes of glass that are followed."""
@@ -38,11 +39,8 @@ class GuideSettings:
     light_samples: int  # of each ray
     followed: int  # the most mirrors and panes
     max_depth: int  # the most edges of a path
-    near: float  # distance of the near plane
     glossy: bool  # whether any surface has lobes that are neither diffuse nor followed
 
-
-SUB_PIXELS = GRID * GRID
 
 STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)
 """The steps of the additive recurrence R₃, n · steps modulo 1.
@@ -53,23 +51,26 @@ sequences, 2018].
 
 
 def pattern_of(light_samples: int) -> F32:
-    """The points of a pixel before the shift, (…, 3): first those of each light sample, then those of the BSDF."""
-    number = np.arange((light_samples + 1) * SUB_PIXELS)[:, None]
+    """The points of a pixel before the shift, (N, 3): first those of each light sample, then those of the BSDF."""
+    number = np.arange((light_samples + 1) * RAYS_PER_PIXEL)[:, None]
     return (number * np.array(STEPS) % 1).astype(np.float32)
 
 
-def shift_pattern(pattern: Any, shift: Any, sample: Any) -> list[Any]:
-    """The three random numbers of sample number `sample`, for each ray."""
-    within = dr.arange(mi.UInt32, dr.width(shift)) % SUB_PIXELS
-    place = sample * SUB_PIXELS + within
-    u = [dr.gather(mi.Float, column, place) + x for column, x in zip(pattern, shift, strict=True)]
-    return [x - dr.floor(x) for x in u]
+def shifts_of(keys: Sequence[Key], purpose: str, count: int) -> Any:
+    """A random shift of the pattern for each of `count` pixels or points, view after view, as Float."""
+    return floats(np.concatenate([Stream(key, purpose).uniform(count, 3) for key in keys]))
+
+
+def shift_pattern(pattern: Any, shift: Any, place: Any) -> Any:
+    """The three random numbers (Vector3f) at a place (UInt32) of the pattern, for each lane's shift."""
+    u = dr.gather(mi.Vector3f, pattern, place) + shift
+    return u - dr.floor(u)
 
 
 class PatternSampler:
     """A sampler that returns three given numbers: one to choose a light, and two to choose a point on it."""
 
-    def __init__(self, u: list[Any]) -> None:
+    def __init__(self, u: Any) -> None:
         self._u = u
 
     def next_1d(self) -> Any:
@@ -85,38 +86,59 @@ class PatternSampler:
 
 
 def point_light(
-    scene: Any, position: F32, normal: F32, key: Key, wanted: GuideSpec, recorder: Recorder | None = None
+    scene: Any,
+    lights: Lights | None,
+    position: F32,
+    normal: F32,
+    keys: Sequence[Key],
+    wanted: GuideSpec,
+    recorders: Recorders | None = None,
 ) -> F32:
-    """Direct irradiance (L, 3) of points, on the side of their normals; 0 without light samples.
+    """Direct irradiance (K, L, 3) of points, on the side of their normals, for the keys of K views.
 
-    It takes one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With a
-    `recorder` of `irradiance` Python runs only once.
+    It is 0 without `lights` or light samples.
+    It takes one shadow ray for each of 16 points of the pattern, shifted by a random vector of each point's own. With
+    `recorders` Python runs only once.
     """
-    if not wanted.light_samples or not scene.emitters():
-        return np.zeros_like(position)
-    lights, pattern = read_lights(scene), pattern_of(0)
-    u = (Stream(key, "point light").uniform(len(position), 1, 3) + pattern) % 1
-    at, facing = (np.repeat(each, SUB_PIXELS, axis=0) for each in (position, normal))
-    arguments = lights, points(at), points(facing), [floats(column) for column in u.reshape(-1, 3).T]
-    irradiances = call_recorded(recorder, irradiance, (len(at), lights.kinds), scene, None, *arguments)
-    mean: F32 = rows(irradiances, len(position), SUB_PIXELS).mean(axis=1, dtype=np.float64).astype(np.float32)
-    return mean
+    if lights is None or not wanted.light_samples:
+        return np.zeros((len(keys), *position.shape), np.float32)
+    shifts = shifts_of(keys, "point light", len(position))
+    count = dr.opaque(mi.UInt32, len(position))
+    arguments = lights, count, floats(position), floats(normal), shifts, floats(pattern_of(0))
+    kind = len(keys), len(position), lights.kinds
+    return rows(call_recorded(recorders, irradiance, kind, scene, None, *arguments), len(keys), len(position))
 
 
-def irradiance(scene: Any, _: Any, lights: Lights, position: Any, normal: Any, u: list[Any]) -> Any:
-    """The irradiance of each point by one sample of the lights, on the side of its normal (Color3f)."""
-    count = dr.width(position)
+def irradiance(
+    scene: Any, _: Any, lights: Lights, points: Any, position: Any, normal: Any, shifts: Any, pattern: Any
+) -> Any:
+    """The irradiance of so many `points` on the side of their normals, once for each shift (Color3f), view after view.
+
+    Positions, normals, shifts and pattern are Float arrays, in which the three numbers of each lie together.
+    """
+    count = dr.width(shifts) // 3
+    lane = dr.arange(mi.UInt32, count)
+    place, shift = lane % points, dr.gather(mi.Vector3f, shifts, lane)
     si = dr.zeros(mi.SurfaceInteraction3f, count)
-    si.p, si.n, si.t = position, mi.Normal3f(normal), dr.ones(mi.Float, count)
+    si.p, si.n = (dr.gather(kind, of, place) for kind, of in ((mi.Point3f, position), (mi.Normal3f, normal)))
+    si.t = dr.ones(mi.Float, count)
     si.sh_frame = mi.Frame3f(si.n)
-    light = sample_direct(lights, si, PatternSampler(u), dr.full(mi.Bool, True, count))
-    cosine = dr.dot(si.n, light.d)
-    shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
-    lit = light.valid & (cosine > 0)
-    lit &= ~scene.ray_test(shadow, lit)
-    arriving = dr.select(lit, light.radiance_over_density * cosine, 0)
-    dr.eval(arriving)
-    return arriving
+
+    def add(index: Any, total: Any) -> tuple[Any, Any]:
+        light = sample_direct(lights, si, PatternSampler(shift_pattern(pattern, shift, index)), mi.Bool(True))
+        cosine = dr.dot(si.n, light.d)
+        shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
+        lit = light.valid & (cosine > 0)
+        lit &= ~scene.ray_test(shadow, lit)
+        return index + 1, total + dr.select(lit, light.radiance_over_density * cosine, 0)
+
+    start = dr.zeros(mi.UInt32, count), dr.zeros(mi.Color3f, count)
+    _, total = loop_once(
+        state=start, cond=lambda index, _: index < RAYS_PER_PIXEL, body=add, labels=("index", "total"), label="points"
+    )
+    mean = total / RAYS_PER_PIXEL
+    dr.eval(mean)
+    return mean
 
 
 # -------------------------------------------------------------------------------------------------------- on surfaces
@@ -132,11 +154,19 @@ class _Sum:
 
 
 def direct_light(
-    scene: Any, lights: Lights | None, si: Any, d: Any, reached: Any, pattern: Any, shift: Any, settings: GuideSettings
+    scene: Any,
+    lights: Lights | None,
+    si: Any,
+    d: Any,
+    reached: Any,
+    random: Callable[[Any], Any],
+    settings: GuideSettings,
 ) -> tuple[Any, Any]:
     """Direct light reflected by surfaces that rays along `d` have `reached`: (as if white and diffuse, by all lobes).
 
-    The mean over shadow rays to points of lights; lobes that are not diffuse get the share of the balance heuristic.
+    `random` gives three numbers for the light sample of a number (UInt32), and after the last one for the BSDF. The
+    results are means over shadow rays to points of lights; lobes that are not diffuse get the share of the balance
+    heuristic.
     """
     if lights is None or not settings.light_samples:
         return mi.Color3f(0), mi.Color3f(0)
@@ -145,7 +175,7 @@ def direct_light(
     other = reached & has_other_lobes(bsdf.flags()) & settings.glossy
 
     def body(s: _Sum) -> tuple[_Sum]:
-        light = sample_direct(lights, si, PatternSampler(shift_pattern(pattern, shift, s.index)), is_diffuse | other)
+        light = sample_direct(lights, si, PatternSampler(random(s.index)), is_diffuse | other)
         shadow = dr.select(light.at_infinity, si.spawn_ray(light.d), si.spawn_ray_to(light.p))
         lit = light.valid & ~scene.ray_test(shadow, light.valid)
         cosine = dr.dot(normal, light.d)
@@ -164,12 +194,11 @@ def direct_light(
     diffuse = sums.diffuse / count
     whole = sums.whole / count + dr.select(other, 0, diffuse_reflectance(si, is_diffuse) * diffuse)
     if settings.glossy:
-        u = shift_pattern(pattern, shift, mi.UInt32(count))
-        whole += _sample_bsdf(scene, lights, si, other, u, count)
+        whole += _sample_bsdf(scene, lights, si, other, random(mi.UInt32(count)), count)
     return diffuse, whole
 
 
-def _sample_bsdf(scene: Any, lights: Lights, si: Any, active: Any, u: list[Any], count: int) -> Any:
+def _sample_bsdf(scene: Any, lights: Lights, si: Any, active: Any, u: Any, count: int) -> Any:
     """The light of one ray along a sample of the BSDF, with the share that `count` shadow rays leave."""
     bs, weight = si.bsdf().sample(mi.BSDFContext(), si, u[0], mi.Point2f(u[1], u[2]), active)
     ray = si.spawn_ray(si.to_world(bs.wo))

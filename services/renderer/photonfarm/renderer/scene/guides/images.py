@@ -9,122 +9,104 @@ Shape letters: H W image.
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
-from numpy.typing import NDArray
 
-from photonfarm.core.keys import Key, Stream
+from photonfarm.core.keys import Key
 from photonfarm.core.records import F32, Guides
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights
 from photonfarm.renderer.bdpt.recording import call_recorded, loop_once
-from photonfarm.renderer.scene.arrays import floats, points
-from photonfarm.renderer.scene.gbuffer import GRID, RAYS, camera_rays, diffuse_reflectance, seen_reflectance
+from photonfarm.renderer.scene.arrays import floats
+from photonfarm.renderer.scene.gbuffer import diffuse_reflectance, seen_reflectance
 from photonfarm.renderer.scene.guides.direct import (
     FOLLOWED,
     NO_LIMIT,
     STEPS,
-    SUB_PIXELS,
     GuideSettings,
     direct_light,
     pattern_of,
+    point_light,
+    shift_pattern,
+    shifts_of,
     turn_towards,
 )
 from photonfarm.renderer.scene.materials import Materials, is_pure_delta
-from photonfarm.scene.spec import GuideSpec, SceneSpec
-from photonfarm.scene.view import Camera, View
+from photonfarm.renderer.scene.view_rays import (
+    Columns,
+    PixelRay,
+    Take,
+    ViewCameras,
+    interleave,
+    shape_images,
+    sum_over_grid,
+    take_numpy,
+)
+from photonfarm.scene.spec import RAYS_PER_PIXEL, GuideSpec, SceneSpec
+from photonfarm.scene.view import View
 
 if TYPE_CHECKING:
-    from photonfarm.renderer.bdpt.recording import Recorder
+    from photonfarm.renderer.bdpt.recording import Recorders
+
+
+CHANNELS = {
+    "albedo": 3,
+    "emission": 3,
+    "direct": 3,
+    "gloss": 3,
+    "specular": 3,
+    "mean_normal": 3,
+    "throughput": 3,
+    "beyond_albedo": 3,
+    "beyond_normal": 3,
+    "roughness": 1,
+    "mean_depth": 1,
+    "beyond_depth": 1,
+}
+"""The images that are made of each pixel's rays, and their channels."""
+
+COUNTS = {"hits": 1, "beyond": 1}
+"""The rays of a pixel that meet a surface, and those that meet one beyond a mirror or glass."""
+
+DIVISORS = {"mean_depth": "hits"} | dict.fromkeys(("beyond_albedo", "beyond_normal", "beyond_depth"), "beyond")
+"""The images that are means over the rays of `COUNTS`; all others are means over all rays."""
 
 
 def view_guides(
     scene: Any,
-    view: View,
+    views: Sequence[View],
     spec: SceneSpec,
     wanted: GuideSpec,
-    key: Key,
+    keys: Sequence[Key],
     materials: Materials,
-    arrives: F32,
-    recorder: Recorder | None = None,
-) -> Guides:
-    """The guides of a view in the scene's present configuration; `key` is the view's.
+    lit: tuple[F32, F32],
+    recorders: Recorders | None = None,
+    take: Take = take_numpy,
+) -> list[tuple[F32, Guides]]:
+    """The mean albedo (H, W, 3), of the same rays, and the guides of each view in the scene's present configuration.
 
-    `arrives` is the result of `point_light`. With a `recorder` of `trace` Python runs only once for all views.
+    `keys` are the views'. `lit` are positions and normals (L, 3) of the points whose irradiance is required. With
+    `recorders` Python runs only once.
     """
-    camera, spec = Camera.of(view, spec), spec.model_copy(update={"guides": wanted})
-    pixels = camera.height * camera.width
-    steps = (np.arange(GRID) + 0.5) / GRID
-    directions = np.stack([camera.rays(u, v).reshape(-1, 3) for v in steps for u in steps], axis=1)  # (H·W, 16, 3)
-    shifts = Stream(key, "direct").uniform(pixels, 3).astype(np.float32)
-    at_once = max(1, RAYS // SUB_PIXELS)  # pixels
-    blocks = [slice(start, start + at_once) for start in range(0, pixels, at_once)]
-    parts = [_trace(scene, camera, spec, directions[block], shifts[block], materials, recorder) for block in blocks]
-    sums = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _guides(sums, camera, arrives)
-
-
-def _trace(
-    scene: Any,
-    camera: Camera,
-    spec: SceneSpec,
-    directions: F32,
-    shifts: F32,
-    materials: Materials,
-    recorder: Recorder | None,
-) -> dict[str, NDArray[np.float64]]:
-    """Sums over the grids of some pixels, (pixels, channels), by name; see `trace`."""
-    rays, along = camera_rays(camera, directions, spec)
+    cameras = ViewCameras.of(views, spec)
     lights = read_lights(scene) if scene.emitters() else None
     settings = GuideSettings(
-        spec.guides.light_samples if lights is not None else 0,
+        wanted.light_samples if lights is not None else 0,
         FOLLOWED if materials.has_pure_deltas else 0,
         spec.transport.max_depth if spec.transport.max_depth >= 0 else NO_LIMIT,
-        spec.view.near,
         materials.has_other_lobes,
     )
     of_bsdfs = floats(materials.roughness), floats(materials.diffuse_kept)
-    tables = *of_bsdfs, *(floats(column) for column in pattern_of(settings.light_samples).T)
-    shift = points(np.repeat(shifts, SUB_PIXELS, axis=0))
-    kind = (len(along), settings, lights.kinds if lights else None)
-    arguments = lights, tables, *rays, floats(along), shift, settings
-    columns = call_recorded(recorder, trace, kind, scene, None, *arguments)
-    return {name: _rows(column).reshape(len(shifts), SUB_PIXELS, -1).sum(1) for name, column in columns.items()}
-
-
-def _rows(column: Any) -> NDArray[np.float64]:
-    values = np.array(column, np.float64)
-    return values.T if values.ndim > 1 else values
-
-
-def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) -> Guides:
-    """The guides, given the sums over each pixel's rays."""
-
-    def image(values: NDArray[np.float64]) -> F32:
-        shaped = values.reshape(camera.height, camera.width, -1).astype(np.float32)
-        return shaped[..., 0] if shaped.shape[-1] == 1 else shaped
-
-    def divide(name: str, count: str) -> F32:
-        return image(sums[name] / np.maximum(sums[count], 1))
-
-    mean = {name: values / SUB_PIXELS for name, values in sums.items()}
-    return Guides(
-        emission=image(mean["emission"]),
-        direct=image(mean["direct"]),
-        gloss=image(mean["gloss"]),
-        specular=image(np.maximum(mean["specular"], 0)),
-        roughness=image(mean["roughness"]),
-        mean_depth=divide("depth", "hits"),
-        mean_normal=image(mean["normal"]),
-        throughput=image(mean["throughput"]),
-        beyond_albedo=divide("beyond_albedo", "beyond"),
-        beyond_normal=divide("beyond_normal", "beyond"),
-        beyond_depth=divide("beyond_depth", "beyond"),
-        point_light=arrives,
-    )
+    pattern = floats(pattern_of(settings.light_samples))
+    shifts = shifts_of(keys, "direct", cameras.height * cameras.width)
+    arrives = point_light(scene, lights, *lit, keys, wanted, recorders)
+    kind = cameras.kind, settings, lights.kinds if lights else None
+    arrays = call_recorded(recorders, trace, kind, scene, None, cameras, lights, of_bsdfs, pattern, shifts, settings)
+    images = shape_images(arrays, CHANNELS, cameras, take)
+    return [(image.pop("albedo"), Guides(**image, point_light=at)) for image, at in zip(images, arrives, strict=True)]
 
 
 # -------------------------------------------------------------------------------------------- through mirrors and glass
@@ -133,36 +115,59 @@ def _guides(sums: dict[str, NDArray[np.float64]], camera: Camera, arrives: F32) 
 def trace(
     scene: Any,
     _: Any,
+    cameras: ViewCameras,
     lights: Lights | None,
-    tables: Any,
-    o: Any,
-    d: Any,
-    reach: Any,
-    along: Any,
-    shift: Any,
+    of_bsdfs: tuple[Any, Any],
+    pattern: Any,
+    shifts: Any,
     settings: GuideSettings,
-) -> dict[str, Any]:
-    """The quantities that are averaged, by name, for each ray; zeros where there is nothing.
+) -> Columns:
+    """The images of `CHANNELS`, interleaved; zeros where there is nothing.
 
-    `tables` are the roughness of BSDFs, their `diffuse_kept`, and three columns of points; rays begin on the near
-    plane, whose distance from the eye is `settings.near` / `along`.
+    `of_bsdfs` are their roughness and their `diffuse_kept`; `pattern` and its `shifts` are those of direct light.
     """
-    roughness, diffuse_kept, *pattern = tables
-    ray = mi.Ray3f(o=o, d=d, maxt=reach, time=0, wavelengths=[])
-    first = scene.ray_intersect(ray)
-    hit, bsdf, before = first.is_valid(), first.bsdf(), settings.near / along
-    number = dr.reinterpret_array(mi.UInt32, bsdf)
-    path, last = _follow_to_end(scene, ray, first, before, settings)
+    shift = dr.gather(mi.Vector3f, shifts, dr.arange(mi.UInt32, cameras.lanes))
+
+    def columns_of(ray: PixelRay, number: Any) -> Columns:
+        def random(sample: Any) -> Any:
+            return shift_pattern(pattern, shift, sample * RAYS_PER_PIXEL + number)
+
+        return _trace_rays(scene, ray, number, lights, of_bsdfs, random, settings)
+
+    sums = sum_over_grid(cameras, CHANNELS | COUNTS, columns_of)
+    counts = {name: dr.maximum(sums[of], 1) for name, of in DIVISORS.items()}
+    means = {name: sums[name] / counts.get(name, mi.Float(RAYS_PER_PIXEL)) for name in CHANNELS}
+    means["specular"] = dr.maximum(means["specular"], 0)
+    return interleave(means, CHANNELS, cameras.lanes)
+
+
+def _trace_rays(
+    scene: Any,
+    ray: PixelRay,
+    number: Any,
+    lights: Lights | None,
+    of_bsdfs: Any,
+    random: Callable[[Any], Any],
+    settings: GuideSettings,
+) -> Columns:
+    """What is summed, by name, for one ray of each pixel, which has this `number` in the pixel."""
+    first = scene.ray_intersect(ray.ray)
+    hit, bsdf = first.is_valid(), first.bsdf()
+    roughness, diffuse_kept = (
+        dr.gather(mi.Float, column, dr.reinterpret_array(mi.UInt32, bsdf), hit) for column in of_bsdfs
+    )
+    path, last = _follow_to_end(scene, ray, first, settings)
     met, is_beyond = last.is_valid(), hit & (path.followed > 0)
     albedo = seen_reflectance(last, met)
     reached = met & (path.followed + 2 <= settings.max_depth)
-    diffuse, whole = direct_light(scene, lights, last, path.ray.d, reached, pattern, shift, settings)
-    columns = {
+    diffuse, whole = direct_light(scene, lights, last, path.ray.d, reached, random, settings)
+    return {
         "hits": dr.select(hit, mi.Float(1), 0),
-        "depth": dr.select(hit, settings.near + first.t * along, 0),
-        "normal": dr.select(hit, turn_towards(first.sh_frame.n, d), 0),
-        "specular": specular_of(bsdf, first, hit, dr.gather(mi.Float, diffuse_kept, number, hit)),
-        "roughness": dr.gather(mi.Float, roughness, number, hit),
+        "albedo": seen_reflectance(first, hit),
+        "mean_depth": dr.select(hit, ray.depth(first.t), 0),
+        "mean_normal": dr.select(hit, turn_towards(first.sh_frame.n, ray.ray.d), 0),
+        "specular": specular_of(bsdf, first, hit, diffuse_kept, number),
+        "roughness": roughness,
         "emission": path.emission,
         "direct": path.throughput * albedo * diffuse,
         "gloss": path.throughput * (whole - albedo * diffuse),
@@ -172,8 +177,6 @@ def trace(
         "beyond_normal": dr.select(is_beyond & met, turn_towards(last.sh_frame.n, path.ray.d), 0),
         "beyond_depth": dr.select(is_beyond & met, path.length + last.t, 0),
     }
-    dr.eval(columns)
-    return columns
 
 
 @dataclass(slots=True)
@@ -188,13 +191,12 @@ class _Path:
     followed: Any  # UInt32: surfaces passed on the way
 
 
-def _follow_to_end(scene: Any, ray: Any, first: Any, before: Any, settings: GuideSettings) -> tuple[_Path, Any]:
+def _follow_to_end(scene: Any, ray: PixelRay, first: Any, settings: GuideSettings) -> tuple[_Path, Any]:
     """Follow each ray from `first`, which it meets, to the first surface that is no pure mirror, glass or null.
 
     Returns the path, and that surface.
     """
-    active = dr.full(mi.Bool, True, dr.width(ray))
-    start = _Path(active, mi.Ray3f(ray), mi.Color3f(1), mi.Color3f(0), mi.Float(before), mi.UInt32(0))
+    start = _Path(mi.Bool(True), mi.Ray3f(ray.ray), mi.Color3f(1), mi.Color3f(0), mi.Float(ray.before), mi.UInt32(0))
     start = _follow(scene, start, first, settings)
     if not settings.followed:
         return start, first
@@ -232,20 +234,19 @@ BSDF_SAMPLES = 2
 """The samples of each ray, for the directional albedo."""
 
 
-def specular_of(bsdf: Any, si: Any, hit: Any, diffuse_kept: Any) -> Any:
+def specular_of(bsdf: Any, si: Any, hit: Any, diffuse_kept: Any, number: Any) -> Any:
     """The directional albedo of all lobes but the diffuse one, 0 if there are none; it may be below 0 for `principled`.
 
-    `diffuse_kept` is that of `Materials`. The albedo is a share of the light's power: radiance in glass is larger by
-    the square of the refractive index.
+    `diffuse_kept` is that of `Materials`, `number` is the ray's in its pixel. The albedo is a share of the light's
+    power: radiance in glass is larger by the square of the refractive index.
     """
     flags, context = bsdf.flags(), mi.BSDFContext(mi.TransportMode.Importance)
     context.type_mask = int(mi.BSDFFlags.All) & ~int(mi.BSDFFlags.Diffuse)
     other = mi.has_flag(flags, mi.BSDFFlags.Delta) | mi.has_flag(flags, mi.BSDFFlags.Glossy)
     sampled = hit & other
     total = mi.Color3f(0)
-    within = dr.arange(mi.UInt32, dr.width(hit)) % SUB_PIXELS
     for sample in range(BSDF_SAMPLES):
-        u = [dr.fma(mi.Float(within * BSDF_SAMPLES + sample), step, 0.5) for step in STEPS]
+        u = [dr.fma(mi.Float(number * BSDF_SAMPLES + sample), step, 0.5) for step in STEPS]
         u = [x - dr.floor(x) for x in u]
         _, weight = bsdf.sample(context, si, u[0], mi.Point2f(u[1], u[2]), sampled)
         total += dr.select(sampled, weight, 0)

@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from photonfarm.core.pictures import Picture, display
 from photonfarm.core.records import F32, BasePointCloud
 from photonfarm.core.waiting import Steps, WorkLog
-from photonfarm.renderer.scene.arrays import floats, points
-from photonfarm.renderer.scene.gbuffer import place_rays, reflects_here, sight_shares
+from photonfarm.renderer.scene.gbuffer import reflects_here, sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import LEAVING, NONE
+from photonfarm.renderer.scene.view_rays import ViewCameras
 from photonfarm.renderer.tools.measure import exposure
 from photonfarm.scene.modification import Modification, rebuild, sample_modification
 from photonfarm.scene.spec import Film, SceneSpec
-from photonfarm.scene.view import Camera, View, sample_view
+from photonfarm.scene.view import View, sample_view
 
 COUNT = 16
 """The rendered configurations."""
@@ -93,25 +93,19 @@ def examine_cameras(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Ca
     here = scene.surroundings(origin)
     sights = sight_shares(scene.scene, origin, target)
     hit, dark = _images(scene, views)
-    seen = [scene.sees(view, cloud).mean(dtype=np.float32) for view in views]
     return Cameras(
         inside=tuple(None if number == NONE else ids[number] for number in here.solid),
         behind=(here.leaving > LEAVING) & (sights < BEHIND),
         nothing=hit == 0,
         dark=dark,
-        seen=np.array(seen, np.float32),
+        seen=scene.sees(views, cloud).mean(axis=1, dtype=np.float32),
     )
 
 
 def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
     """The shares of images that show a surface between the near and the far plane, and a black back; (N,) each."""
     coarse = scene.spec.model_copy(update={"film": Film(width=RAYS_ALONG, height=RAYS_ALONG)})
-    cameras = [Camera.of(view, coarse) for view in views]
-    rays = [place_rays(camera, camera.rays(), coarse) for camera in cameras]
-    origin, direction, reach, _ = (np.concatenate(column) for column in zip(*rays, strict=True))
-    ray = mi.Ray3f(o=points(origin), d=mi.Vector3f(points(direction)))
-    ray.maxt = floats(reach)
-    si = scene.scene.ray_intersect(ray)
+    si = scene.scene.ray_intersect(ViewCameras.of(views, coarse).pixels().ray(0.5, 0.5).ray)
     hit = si.is_valid()
     lit = reflects_here(si) | (si.shape.is_emitter()) | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
     dark = hit & ~lit

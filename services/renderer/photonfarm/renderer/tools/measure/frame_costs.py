@@ -36,23 +36,22 @@ from photonfarm.core.keys import Key, view_key
 from photonfarm.core.records import F32, BasePointCloud, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, locate
-from photonfarm.renderer.scene.gbuffer import first_surfaces
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
+from photonfarm.renderer.scene.view_rays import ViewCameras
 from photonfarm.scene.modification import Modification, rebuild, rest
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.view import Camera, View
+from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.read.find import scene_named
 
 
 def surface_kinds(scene: Any, view: View, spec: SceneSpec) -> NDArray[np.uint8]:
     """The kind of surface at each pixel's centre, (H, W) of `Surface`, between the view's clipping planes."""
-    camera = Camera.of(view, spec)
-    si = first_surfaces(scene, camera, camera.rays(), spec)
+    si = scene.ray_intersect(ViewCameras.of([view], spec).pixels().ray(0.5, 0.5).ray)
     kind = dr.select(si.shape.is_emitter(), mi.UInt32(Surface.EMITTER), _kind_of_lobes(si.bsdf().flags()))
     kinds = np.array(dr.select(si.is_valid(), kind, int(Surface.NOTHING)))
-    return kinds.astype(np.uint8).reshape(camera.height, camera.width)
+    return kinds.astype(np.uint8).reshape(spec.film.height, spec.film.width)
 
 
 def _kind_of_lobes(flags: Any) -> Any:
@@ -207,12 +206,12 @@ def time_parts(
     timed("edit_s", partial(_edit, scene, modification))
     timed("buffers_s", partial(scene.buffers, view))
     guided = view_key(key, view.vector)
-    timed("guides_s", lambda: scene.guides(view, guided, scene.spec.guides, lit_points(cloud, modification)))
-    timed("points_s", lambda: scene.sees(view, rebuild(cloud, modification)[0]))
+    timed("guides_s", lambda: scene.inputs([view], [guided], scene.spec.guides, lit_points(cloud, modification)))
+    timed("points_s", lambda: scene.sees([view], rebuild(cloud, modification)[0]))
     photons = timed("photons_s", lambda: photons_of(scene, key)[0])
     if photons is None:
         return seconds | {"photons_s": 0.0, "photons_seen_s": 0.0}
-    timed("photons_seen_s", lambda: scene.sees(view, photons.position))
+    timed("photons_seen_s", lambda: scene.sees([view], photons.position))
     return seconds
 
 

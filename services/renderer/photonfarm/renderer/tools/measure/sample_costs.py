@@ -133,7 +133,7 @@ def _measure_frame(scene: LoadedScene, cloud: BasePointCloud, number: int) -> di
     noise = relative_variance(halves[0], halves[1], 2 * few) if np.isfinite(halves).all() else None
     return {
         "configuration_s": configuration_s,
-        "view_s": sum(parts.values()) - configuration_s,
+        "view_s": parts["guides_s"] + parts["points_s"] + parts["photons_seen_s"],
         "pass_s": pass_s,
         "spp_s": spp_s,
         "relative_variance": math.nan if noise is None else noise,

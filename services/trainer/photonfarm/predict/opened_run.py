@@ -1,0 +1,140 @@
+"""A trained network and its scene, both loaded: the image of any configuration and view, on one device.
+
+A network's inputs are rendered and handed on in the memory of the device that renders; on a processor nothing is
+copied. So a frame is rendered, predicted and shown without a store, and costs what it has to.
+
+Shape letters: H W image, P points, K photon slots.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from photonfarm.core.errors import SpecError
+from photonfarm.core.keys import make_key, seed_of, view_key
+from photonfarm.core.processes import can_render
+from photonfarm.core.records import arrays_of
+from photonfarm.data.torch_dataset import OF_LIGHT
+from photonfarm.farm.devices import AUTO, CPU, CUDA
+from photonfarm.scene.modification import Modification, rebuild, rest
+from photonfarm.scene.view import Camera, View
+from photonfarm.store import Store
+from photonfarm.trainer.data.batch import choose_kept_pixels
+from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, NoisyColour, PhotonInputs, PointInputs
+from photonfarm.trainer.predictors.trained import TrainedRun
+from photonfarm.trainer.runs.run_folder import make_environment
+
+if TYPE_CHECKING:
+    from photonfarm.core.records import Photons
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
+
+
+def require_renderer(run: TrainedRun) -> None:
+    """Raise SpecError if the renderer is not installed; otherwise let it find the run's scene."""
+    if not can_render():
+        raise SpecError(
+            "the buffers of a camera path come from the renderer, which is not installed here (pip install "
+            f"'photonfarm[render]'); where it is, run `photonfarm buffers --scene {run.scene_id}` with the same path, "
+            "and give its file as --buffers FILE"
+        )
+    os.environ.update(make_environment(run.folder))
+
+
+class OpenRun:
+    """A trained network and its scene. Not thread-safe: the scene is in one configuration at a time."""
+
+    def __init__(self, run: TrainedRun, store: str | Path, device: str = "auto") -> None:
+        """Load both, as `open_run` does; the network's device is by default the one that renders."""
+        require_renderer(run)
+        from photonfarm.renderer.jobs.render import load_scene, locate
+        from photonfarm.renderer.scene import backend
+
+        source = run.source(Store(store).root)
+        self.spec = source.spec
+        geometry, self._cloud = source.base()
+        self._scene: LoadedScene = load_scene(locate(source.spec))
+        torch.set_num_threads(run.settings.threads)
+        self._run, self._needs, self._exposure = run, run.needs, self.spec.exposure
+        if device == AUTO:
+            device = CUDA if backend.device().card else CPU
+        predictor = run.predictor(self.spec, (geometry, self._cloud), device)
+        self._images, self._device = predictor.images, predictor.device
+        self._apply(rest(self.spec))
+
+    def predict(self, modification: Modification, view: View) -> Tensor:
+        """The network's image of a configuration from a view, (H, W, 3), linear radiance, on the network's device.
+
+        It can be differentiated with respect to the network's weights. A denoiser gets a noisy image rendered for it.
+        """
+        if not np.array_equal(modification.vector, self._modification.vector):
+            self._apply(Modification.from_vector(modification.vector))  # the caller may change theirs
+        return self._images(self._inputs(view))[0] / self._exposure
+
+    def _apply(self, modification: Modification) -> None:
+        """Bring the scene into a configuration, and its points and photons."""
+        from photonfarm.renderer.jobs.estimates import photons_of
+        from photonfarm.renderer.jobs.render import lit_points
+
+        self._scene.apply(modification)
+        self._modification, self._key = modification, modification.key(self.spec.radiance_id)
+        self._lit = lit_points(self._cloud, modification)
+        self._photons = photons_of(self._scene, self._key)[0] if self._needs.photons else None
+        used = self._run.settings.network.points
+        position, present = rebuild(self._cloud, modification)
+        self._points = position[:used], present[:used]
+
+    def _inputs(self, view: View) -> Inputs:
+        """What the network reads of the present configuration from a view, a batch of one."""
+        key = view_key(self._key, view.vector)
+        if self._needs.guides:
+            ((buffers, guides),) = self._scene.inputs([view], [key], self.spec.guides, self._lit, take=take_torch)
+        else:
+            buffers, guides = self._scene.buffers(view, take=take_torch), None
+        return Inputs(
+            world_to_camera=self._tensor(Camera.of(view, self.spec).world_to_camera.astype(np.float32)),
+            **{name: self._tensor(image) for name, image in arrays_of(buffers).items()},
+            points=self._point_inputs(view) if self._needs.points else None,
+            photons=None if self._photons is None else self._photon_inputs(view, self._photons),
+            noisy=self._noisy(view, key) if self._needs.kept else None,
+            guides=None if guides is None else self._guide_inputs(arrays_of(guides)),
+        )
+
+    def _tensor(self, values: Any) -> Tensor:
+        tensor: Tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
+        return tensor[None].to(self._device)
+
+    def _guide_inputs(self, guides: dict[str, Any]) -> GuideInputs:
+        factors = {name: self._exposure if name in OF_LIGHT else 1.0 for name in guides}
+        return GuideInputs(**{name: self._tensor(image) * factors[name] for name, image in guides.items()})
+
+    def _point_inputs(self, view: View) -> PointInputs:
+        position, present = self._points
+        seen = present  # networks with guides sum over all points, seen or not
+        if not self._needs.guides:
+            seen = present & self._scene.sees([view], position)[0]
+        return PointInputs(self._tensor(position), self._tensor(present), self._tensor(seen))
+
+    def _photon_inputs(self, view: View, photons: Photons) -> PhotonInputs:
+        present = photons.bounce >= 0
+        arrays = arrays_of(photons) | {"bounce": photons.bounce.astype(np.float32), "present": present}
+        arrays["seen"] = self._scene.sees([view], photons.position)[0] & present
+        return PhotonInputs(**{name: self._tensor(values) for name, values in arrays.items()})
+
+    def _noisy(self, view: View, key: bytes) -> NoisyColour:
+        """A noisy image of the view, of which as many pixels are kept as the network was trained with."""
+        sample = make_key("frame", key)
+        half = self._scene.render_half(view, seed_of(sample, "half A")) * np.float32(self._exposure)
+        kept = choose_kept_pixels(sample, self.spec, self._needs.kept or 1)
+        return NoisyColour(self._tensor(half * kept[..., None]), self._tensor(kept))
+
+
+def take_torch(values: Any) -> Tensor:
+    """Values of Dr.Jit as a tensor in the same memory."""
+    tensor: Tensor = values.torch()
+    return tensor

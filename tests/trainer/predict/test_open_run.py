@@ -1,0 +1,116 @@
+"""The frame call: a network's image of a configuration and a view, inputs rendered in the same process."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from photonfarm.core.pictures import display
+from photonfarm.plan.request import Request
+from photonfarm.predict import infer, open_run
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.scene.modification import rest
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import View, sample_view
+from photonfarm.store import SceneReader, Store
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
+from photonfarm.trainer.training.loop import train
+
+PAGE = Path(__file__).resolve().parents[3] / "docs/training.md"
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four samples of the built-in room, each of another configuration."""
+    room = load_spec("room")
+    changes = {
+        "film": room.film.model_copy(update={"width": 24, "height": 16}),
+        "transport": room.transport.model_copy(update={"half_spp": 1}),
+        "photons": room.photons.model_copy(update={"paths": 512}),
+        "points": 2048,
+    }
+    store = Store(tmp_path_factory.mktemp("predict") / "store", create=True)
+    scene = store.scene(store.plan(room.model_copy(update=changes), Request(modifications=4), shard_rows=4).scene_id)
+    assert ShardRenderer(store, worker="test").render(scene.scene_id, 0)
+    return Path(store.root)
+
+
+def trained(store: Path, folder: Path, architecture: str) -> Path:
+    """A run of one step."""
+    (scene_id,) = Store(store).scene_ids()
+    network = NetworkSettings.model_validate({"architecture": architecture, "width": 4})
+    settings = TrainSettings(network=network, max_steps=1, batch=2, hold_out=0.5, poll_seconds=0.01, threads=1)
+    train(SceneReader(store, scene_id), settings, folder)
+    return folder
+
+
+def spec_of(store: Path) -> SceneSpec:
+    (scene_id,) = Store(store).scene_ids()
+    return SceneReader(store, scene_id).spec
+
+
+@pytest.mark.parametrize("architecture", ["cnn", "light_transport_photons", "guided_transport_photons"])
+def test_a_frame_is_the_image_of_the_stored_sample_of_its_configuration_and_view(
+    store: Path, tmp_path: Path, architecture: str
+) -> None:
+    """Up to the rounding of the store's types."""
+    run = trained(store, tmp_path / "run", architecture)
+    opened = open_run(run, store)
+    reader = SceneReader(store, opened.spec.scene_id)
+    reader.refresh()
+    sample = reader.read(2)
+    with torch.no_grad():
+        opened.predict(rest(opened.spec), sample.view)  # the scene comes from another configuration
+        image = opened.predict(sample.modification, sample.view)
+    assert image.shape == (16, 24, 3)
+    infer.show_sample(store, infer.TrainedRun.load(run), 2, tmp_path / "sample")
+    wanted = infer.Image.open(tmp_path / "sample/prediction.png").resize((24, 16), infer.Image.Resampling.NEAREST)
+    shown = display(image.numpy(), opened.spec.exposure).astype(int)
+    off = np.abs(shown - np.asarray(wanted))
+    assert np.quantile(off, 0.99) <= 2, "the rest are edges that rays of another rounding hit or miss"
+    assert off.mean() < 0.3
+
+
+def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_path: Path) -> None:
+    opened = open_run(trained(store, tmp_path / "run", "denoise_4"), store)
+    view = sample_view(opened.spec, b"view of a test..", 0, 0)
+    with torch.no_grad():
+        one, again = (opened.predict(rest(opened.spec), view) for _ in range(2))
+    torch.testing.assert_close(one, again, rtol=0, atol=0)
+    noisy = opened._inputs(view).noisy
+    assert noisy is not None
+    assert int(noisy.kept.sum()) == 24 * 16 // 4
+    assert float(noisy.colour.sum()) > 0
+
+
+def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_in_place(
+    store: Path, tmp_path: Path
+) -> None:
+    opened = open_run(trained(store, tmp_path / "run", "guided_transport"), store)
+    view = View(np.array([1.9, 1.6, 1.7], np.float32), np.array([-0.7, 0.6, -0.5], np.float32))
+    configuration = rest(opened.spec)
+    image = opened.predict(configuration, view)
+    image.mean().backward()
+    configuration.present[:] = False
+    with torch.no_grad():
+        empty = opened.predict(configuration, view)
+    assert float((empty - image.detach()).abs().mean()) > 0.01
+
+
+def test_the_lines_of_the_training_page_make_a_frame(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (lines,) = [
+        block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL) if "open_run" in block
+    ]
+    assert len(lines.splitlines()) <= 12
+    trained(store, tmp_path / "run", "guided")
+    (tmp_path / "store").symlink_to(store)
+    monkeypatch.chdir(tmp_path)
+    left: dict[str, torch.Tensor] = {}
+    exec(lines, left)
+    assert left["image"].shape == (16, 24, 3)
+    assert bool(torch.isfinite(left["image"]).all())

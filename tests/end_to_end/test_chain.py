@@ -16,6 +16,7 @@ from photonfarm.trainer.runs import checkpoint
 
 ROOT = Path(__file__).parents[2]
 UP = ("up", "small.toml", "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")
+UP = (*UP, "--preset", "small", "--architecture", "guided_transport", "--set", "batch=3")
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -42,6 +43,7 @@ def test_the_farm_renders_trains_and_reports(folder: Path) -> None:
     assert report["dataset"]["core_seconds_per_sample"] > 0
     (run,) = report["runs"]
     assert run["steps"] == 40
+    assert json.loads((folder / "run/settings.json").read_text())["batch"] == 3
     assert [run["curve"][end]["step"] for end in (0, -1)] == [0, 40]  # the first is of the few samples there were then
     assert run["curve"][-1]["error"] < 0.1 * report["mean_colour"]
     for page in ("out/preview.html", "out/report.html"):

@@ -156,6 +156,8 @@ DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
         (NOTHING, "evaluate --references none", 4, ["none: there is no such folder"]),
         (NOTHING, "evaluate --kept 4", 2, ["--denoiser"]),
         (NOTHING, "train cornell", 3, ["run: was trained on scene"]),
+        (NOTHING, "up den.toml --set width=no --run new", 3, ["network.width = 'no': a whole number"]),
+        (NOTHING, "up den.toml --architecture nope --run new", 2, ["'nope' is not one of", "guided_transport"]),
         (NOTHING, f"train den.toml --architecture guided {TRAIN}", 3, ["network.architecture = 'cnn'"]),
         (NOTHING, f"train den.toml --run new --architecture cnn {FEW}", 3, ["none is held out", "--hold-out 0."]),
         (NOTHING, "train den.toml --run new --set widht=3", 3, ["widht: unknown key; nearest: width"]),

@@ -239,6 +239,15 @@ def redis_server(port: int) -> None:
 @device_option
 @run_option
 @click.option("--train-steps", type=click.IntRange(0), default=3000, show_default=True, help="0: render only.")
+@click.option("--preset", metavar="NAME", help="Of the training, as `train` has it.")
+@click.option("--architecture", metavar="NAME", help="Kind of network, as `train` has it.  [default: the preset's]")
+@click.option(
+    "--set",
+    "pairs",
+    multiple=True,
+    metavar="KEY=VALUE",
+    help="Any setting of the training, as `train` has it; may be repeated.",
+)
 @click.option(
     "--hold-out",
     type=click.FloatRange(0, 1, min_open=True, max_open=True),
@@ -279,8 +288,11 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
 
     try:
         _check_arguments(["work", "--until-complete"], "mitsuba", "render")
+        named = {f"--{name}": options.pop(name) for name in ("preset", "architecture")}
+        given = [word for name, value in named.items() if value is not None for word in (name, value)]
+        options["train_options"] = [*given, *(word for pair in options.pop("pairs") for word in ("--set", pair))]
         if options["train_steps"]:
-            trainer = {name: options[name] for name in ("run", "train_steps")}
+            trainer = {name: options[name] for name in ("run", "train_steps", "train_options")}
             arguments = trainer_arguments(spec, hold_out=options["hold_out"] or HOLD_OUT, **trainer)
             _check_arguments(arguments, "torch", "train", "--train-steps 0 renders only")
         devices = worker_devices(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())

@@ -46,9 +46,12 @@ Display = AbstractContextManager[Callable[[FarmProgress, bool], None]]
 """A context manager that gives a function: it is called with each look at the farm, and with True for the last."""
 
 
-def trainer_arguments(spec: str, *, run: Path, train_steps: int, hold_out: float) -> list[str]:
-    """The trainer's verb with its arguments."""
-    return ["train", spec, "--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
+def trainer_arguments(
+    spec: str, *, run: Path, train_steps: int, hold_out: float, train_options: Sequence[str] = ()
+) -> list[str]:
+    """The trainer's verb with its arguments; `train_options` are further ones, as `photonfarm train` takes them."""
+    own = ["--run", str(run), "--steps", str(train_steps), "--hold-out", str(hold_out)]
+    return ["train", spec, *own, *train_options]
 
 
 def run_farm(
@@ -63,6 +66,7 @@ def run_farm(
     train_steps: int,
     hold_out: float | None,
     out: Path,
+    train_options: Sequence[str] = (),
     reference_views: int = 0,
     reference_spp: int = 256,
     shard_rows: int | None = None,
@@ -113,7 +117,9 @@ def run_farm(
             scene = ["--scene", planned.scene_id, "--name", name, "--device", device]
             verbs[name] = ["work", "--until-complete", *scene]
         if train_steps:
-            verbs["trainer"] = trainer_arguments(spec, run=run, train_steps=train_steps, hold_out=share)
+            verbs["trainer"] = trainer_arguments(
+                spec, run=run, train_steps=train_steps, hold_out=share, train_options=train_options
+            )
         address, trained = None, run if train_steps else None
         if web:
             port = free_port(WEB_PORT)

@@ -11,7 +11,7 @@ from typing import Any, get_args
 import click
 
 from photonfarm.cli.options import json_option, redis_option, store_option
-from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision
+from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision, make_settings
 from photonfarm.trainer.runs.user_code import is_own
 
 run_option = click.option(
@@ -56,7 +56,24 @@ def collect_settings(pairs: tuple[str, ...]) -> dict[str, Any]:
     return changes
 
 
-@click.command()
+class TrainCommand(click.Command):
+    """Refuses settings that are none when it parses its arguments, so that `up` can ask before it begins."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; raises SpecError for settings that are none."""
+        left = super().parse_args(ctx, args)
+        if not ctx.resilient_parsing:
+            make_settings(ctx.params["preset"], collect_changes(ctx.params))
+        return left
+
+
+def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that parameters of the verb change: those of `--set`, and before them those of their own options."""
+    own = {key: value for key, value in params.items() if key in KEYS and value is not None}
+    return {**collect_settings(params["pairs"]), **own}
+
+
+@click.command(cls=TrainCommand)
 @click.argument("spec", required=False)
 @store_option
 @run_option
@@ -171,7 +188,7 @@ def train(
     if (as_json or film is not None) and not dry_run:
         raise click.UsageError(f"{'--json' if as_json else '--film'} goes with --dry-run alone")
     log = partial(click.echo, err=True)
-    changes = {**collect_settings(pairs), **{key: value for key, value in options.items() if value is not None}}
+    changes = collect_changes({"pairs": pairs, **options})
     if check:
         service.check(run)
     elif summary:

@@ -74,7 +74,7 @@ class JobWriter:
         self._wanted: dict[schema.RowKind, set[int]] = rows.wanted(photons=bool(scene.spec.photons.paths))
         self._missing = {kind: set(wanted) for kind, wanted in self._wanted.items()}
         self._shards: dict[str, ShardWriter] = {}
-        self._waiting: queue.Queue[tuple[str, int, memoryview] | None] = queue.Queue(WAITING_ROWS)
+        self._waiting: queue.Queue[tuple[str, int, NDArray[Any]] | None] = queue.Queue(WAITING_ROWS)
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._write, daemon=True, name=f"writer of job {rows.job}")
         self._thread.start()
@@ -134,19 +134,20 @@ class JobWriter:
             raise IncompleteError(f"{name} of row {row} has shape {values.shape}; {array.shape} is required")
         if not stays_finite(values, array.dtype):
             raise IncompleteError(f"{name} of row {row} holds a value that is not finite in {array.dtype.name}")
-        self._waiting.put((name, row % self._plan.shard_rows, encode(array, values)))
+        self._waiting.put((name, row % self._plan.shard_rows, values))
         self._raise_error()
 
     def _write(self) -> None:
-        """The thread's loop: after an error it only empties the queue, so that callers do not block."""
+        """The thread's loop: it encodes and writes rows; after an error it only empties the queue for its callers."""
         while (taken := self._waiting.get()) is not None:
             if self._error is not None:
                 continue
-            name, row, content = taken
+            name, row, values = taken
+            array = self._arrays[name]
             try:
                 if name not in self._shards:
-                    self._shards[name] = ShardWriter(self._storage.part(), self._arrays[name], self._plan.shard_rows)
-                self._shards[name].append(row, content)
+                    self._shards[name] = ShardWriter(self._storage.part(), array, self._plan.shard_rows)
+                self._shards[name].append(row, encode(array, values))
             except Exception as error:
                 self._error = error
 

@@ -51,7 +51,7 @@ class Contents:
 
     def buffers(self, modification: Modification, view: View) -> ViewBuffers:
         """The image-space buffers."""
-        return self._inputs(modification, view)[0]
+        return self._get("buffers", modification, view, lambda: self._inputs(modification, view)[0])
 
     def visibility(self, modification: Modification, view: View) -> Visibility:
         """What the view sees."""
@@ -60,7 +60,7 @@ class Contents:
         photons = self.photons(modification) if self.spec.photons.paths else None
         points = rebuild(self.base[1], modification)
         make = partial(visibility_of, self._scene, [view], points, photons)
-        return self._get("visibility", modification, view, make)[0]
+        return self._get("visibility", modification, view, lambda: make()[0])
 
     def photons(self, modification: Modification) -> Photons:
         """The photons."""
@@ -68,7 +68,7 @@ class Contents:
 
     def guides(self, modification: Modification, view: View) -> Guides:
         """The guides of a view."""
-        return self._inputs(modification, view)[1]
+        return self._get("guides", modification, view, lambda: self._inputs(modification, view)[1])
 
     def _inputs(self, modification: Modification, view: View) -> tuple[ViewBuffers, Guides]:
         from photonfarm.renderer.jobs.render import lit_points

@@ -74,4 +74,5 @@ def measurement(*rows: MeasuredCandidate) -> Measurement:
         reach=LightReach(configurations=1, hit=1.0, near=1.0, beyond=(0.3, 0.005, 0.0)),
         asked_s=60.0,
         spent_s=5.0,
+        device="cpu",
     )

@@ -132,6 +132,16 @@ class Film(Frozen):
     height: Annotated[int, Field(ge=8, le=4096, multiple_of=8)] = 128
 
 
+class CardStrategy(Frozen):
+    """How cards sample light where they do it otherwise than processors; None: as these."""
+
+    rr_depth: Annotated[int, Field(ge=1)] | None = None
+    connections: Annotated[int, Field(ge=0, le=64)] | None = None
+    light_ratio: Annotated[float, Field(ge=0, le=64)] | None = None
+    guided_light: bool | None = None
+    light_samples: Annotated[int, Field(ge=1, le=64)] | None = None
+
+
 class Transport(Frozen):
     """Light transport: the settings of the `bdpt` integrator."""
 
@@ -142,9 +152,11 @@ class Transport(Frozen):
     half_spp: Annotated[int, Field(ge=1, le=65536)] = 4  # samples per pixel of each of the two half-estimates
     guided_light: bool = False  # light paths start where views see them, connections go to useful light vertices
     light_samples: Annotated[int, Field(ge=1, le=64)] = 1  # at the first eye vertex
+    card: CardStrategy | None = Field(default=None, exclude_if=lambda said: said is None)
 
     @model_validator(mode="after")
     def _has_light_paths_to_connect_to(self) -> Self:
+        _ = self.on_card
         for key, off in (("connections", "0"), ("guided_light", "false")):
             if (value := getattr(self, key)) and not self.light_ratio:
                 raise ValueError(
@@ -153,8 +165,14 @@ class Transport(Frozen):
                 )
         return self
 
+    @property
+    def on_card(self) -> Transport:
+        """The settings for cards."""
+        said = {} if self.card is None else self.card.model_dump(exclude_none=True)
+        return Transport.model_validate({**self.model_dump(exclude={"card"}), **said}) if said else self
 
-STRATEGY = frozenset({"rr_depth", "connections", "light_ratio", "guided_light", "light_samples"})
+
+STRATEGY = frozenset(CardStrategy.model_fields)
 """The settings of `Transport` that change the noise and the cost of an estimate, and not its mean: part of no id."""
 
 
@@ -277,7 +295,7 @@ class SceneSpec(Frozen):
 
     def radiance_settings(self) -> dict[str, Any]:
         """All that the mean of a sample and its size depend on."""
-        not_of_it: dict[str, Any] = {"scene": {"file"}, "transport": STRATEGY}
+        not_of_it: dict[str, Any] = {"scene": {"file"}, "transport": STRATEGY | {"card"}}
         not_of_it |= dict.fromkeys(("name", "credits", "exposure", "stored_exponent", *_INPUTS), True)
         return self.model_dump(mode="json", exclude=not_of_it)
 

@@ -6,11 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from photonfarm.core.errors import SpecError
+from photonfarm.farm.devices import Card
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.modification import sample_modification
-from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec import SceneSpec, Transport
 from photonfarm.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec
 from photonfarm.scene.view import sample_view
 
@@ -91,3 +94,24 @@ def test_a_real_room_is_loaded_edited_and_rendered(
     assert len(geometry.shape_group) == len(loaded.scene.shapes())
     assert np.all(np.isfinite(cloud.normal))
     assert set(np.unique(cloud.group)) <= {-1, *range(len(spec.groups))}
+
+
+def test_a_card_renders_by_the_strategy_that_the_spec_has_for_cards(
+    small: Callable[..., SceneSpec], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device is said to be a card; what renders is a processor."""
+    spec = small(load_spec("cornell"))
+    plain = {"connections": 0, "light_ratio": 0.0}
+    spec = spec.model_copy(
+        update={"transport": Transport.model_validate({**spec.transport.model_dump(), "card": plain})}
+    )
+    assert LoadedScene.load(spec).spec.strategy()["light_ratio"] == 1
+    card = Card(0, "a card", "9.0", 1 << 34)
+    monkeypatch.setattr(backend, "device", lambda: backend.Device(backend.DEFAULT_VARIANT, card, ""))
+    assert LoadedScene.load(spec).spec.strategy() == {**spec.strategy(), **plain}
+
+
+def test_a_strategy_for_cards_must_be_one() -> None:
+    for wrong in ({"connections": 1, "light_ratio": 0}, {"half_spp": 3}):
+        with pytest.raises(ValidationError):
+            Transport.model_validate({"card": wrong})

@@ -36,6 +36,19 @@ def test_a_half_keeps_its_cost() -> None:
     assert found.changes == found.settings
 
 
+def test_what_was_measured_on_a_card_is_planned_for_cards_alone() -> None:
+    on_card = measurement().model_copy(update={"device": "NVIDIA H200"})
+    found = plan_of(spec_with(half_spp=8), on_card, cached=False)
+    assert found.settings["transport"] == {"half_spp": 16, "card": {"connections": 0, "light_ratio": 1.0}}
+    assert "; it holds for cards (NVIDIA H200): 3 views" in lines(found)[-1]
+    written = spec_with(**found.settings["transport"])
+    assert written.scene_id == spec_with(half_spp=16).scene_id
+    assert (written.transport.connections, written.transport.on_card.connections) == (1, 0)
+    again = plan_of(written.model_copy(update={"transport": written.transport.on_card}), on_card, cached=True)
+    assert "transport" not in again.changes
+    assert "; it holds for processors: 3 views" in lines(plan_of(spec_with(), measurement(), cached=False))[-1]
+
+
 def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -> None:
     """The least error × time at 2 samples is that of (0, 1): 0.08·0.10 s, against 0.1·0.084 s of plain path tracing.
 

@@ -104,6 +104,7 @@ def test_a_scene_that_cannot_be_rendered_is_refused(scenes: Path, added: str, na
         ({"name": "other"}, set()),
         ({"exposure": 2.0}, set()),
         ({"transport": {"connections": 0, "light_ratio": 0.5, "guided_light": True, "light_samples": 2}}, set()),
+        ({"transport": {"card": {"connections": 0}}}, set()),
         ({"transport": {"rr_depth": 9}}, set()),
         ({"points": 7}, {"inputs_id"}),
         ({"guides": {"light_samples": 1}}, {"inputs_id"}),

@@ -14,7 +14,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from photonfarm.core.records import (
 from photonfarm.renderer.jobs.estimates import halves_of, photons_of
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import Modification, rebuild
-from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec import SceneSpec, Transport
 from photonfarm.scene.spec_loading import parse_spec
 from photonfarm.scene.view import View
 from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
@@ -74,7 +74,7 @@ class _Loaded:
 
     stored: SceneStore
     scene: LoadedScene
-    strategy: dict[str, Any]  # that it was loaded with
+    transport: Transport  # that it was loaded with
     compiled: bool = False  # its first image compiles the kernels
     _cloud: BasePointCloud | None = None
 
@@ -144,7 +144,7 @@ class ShardRenderer:
                 versions=versions(),
                 device=backend.device().name,
                 driver=backend.device().driver,
-                strategy=stored.spec.strategy(),
+                strategy=loaded.scene.spec.strategy(),
                 taken_over=rendering.taken_over,
             )
             committed = out.commit(figures)
@@ -157,7 +157,7 @@ class ShardRenderer:
         """The scene, loaded; anew if it is to be rendered by another strategy than before."""
         scene_id = stored.scene_id
         known = self._scenes.pop(scene_id, None)
-        if known is not None and known.strategy == stored.spec.strategy():
+        if known is not None and known.transport == stored.spec.transport:
             self._scenes[scene_id] = known
         else:
             known = None  # freed before the next one is loaded
@@ -166,7 +166,7 @@ class ShardRenderer:
                 self._scenes.pop(next(iter(self._scenes)))
             self._on_progress(LOADS, 0, 0)
             gc.collect()  # while an older scene is still partly alive, Dr.Jit finds no kernel in its cache
-            self._scenes[scene_id] = _Loaded(stored, self._load(spec), spec.strategy())
+            self._scenes[scene_id] = _Loaded(stored, self._load(spec), spec.transport)
         return self._scenes[scene_id]
 
 

@@ -178,7 +178,8 @@ def _spec_as_rendered(opened: Store, stored: SceneStore, key: Key) -> SceneSpec:
         if other is None or not figures.get("taken_over"):
             break
         holder = opened.scene(other)
-    return stored.spec.model_copy(update={"transport": stored.spec.transport.model_copy(update=strategy)})
+    transport = stored.spec.transport.model_copy(update={**strategy, "card": None})
+    return stored.spec.model_copy(update={"transport": transport})
 
 
 def _read_plan(stored: SceneStore, row: int) -> tuple[Modification, View, int]:

@@ -25,6 +25,7 @@ from typing import Any
 from photonfarm.core.errors import BackendError
 from photonfarm.farm import devices
 from photonfarm.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
+from photonfarm.scene.spec import SceneSpec
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "PHOTONFARM_VARIANT"
@@ -94,6 +95,11 @@ def paths_at_once() -> int | None:
     """
     card = device().card
     return None if card is None else max(1, min(card.memory_bytes // MEMORY_SHARE // PATH_BYTES, MOST_PATHS))
+
+
+def for_this_device(spec: SceneSpec) -> SceneSpec:
+    """The spec with the strategy that it has for what renders in this process."""
+    return spec.model_copy(update={"transport": spec.transport.on_card}) if device().card else spec
 
 
 def work_s() -> float:

@@ -47,7 +47,7 @@ class LoadedScene:
         from photonfarm.renderer.scene.materials import Materials
         from photonfarm.renderer.scene.surroundings import boxes_of
 
-        self.spec = spec
+        self.spec = spec = backend.for_this_device(spec)
         self.scene = scene
         self._sensor = AimedSensor(spec)
         paths_at_once = paths_at_once or backend.paths_at_once()
@@ -247,7 +247,7 @@ def integrator_of(transport: Transport, paths_at_once: int | None = None) -> Any
     """The integrator `bdpt` with the spec's parameters. Raises SpecError for those that it refuses."""
     import mitsuba as mi
 
-    parameters = transport.model_dump(exclude={"half_spp"})
+    parameters = transport.model_dump(exclude={"half_spp", "card"})
     if paths_at_once is not None:
         parameters["paths_at_once"] = paths_at_once
     try:

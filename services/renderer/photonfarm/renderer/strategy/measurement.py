@@ -19,6 +19,7 @@ from photonfarm.core.keys import make_key
 from photonfarm.core.models import Frozen
 from photonfarm.core.records import F32
 from photonfarm.core.waiting import Log, WorkLog
+from photonfarm.farm.devices import CPU
 from photonfarm.renderer.jobs.render import versions
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
@@ -77,6 +78,12 @@ class Measurement(Frozen):
     reach: LightReach
     asked_s: float  # CPU time that the pilot was given
     spent_s: float  # CPU time in all
+    device: str  # what rendered: the name of a card, or "cpu"
+
+    @property
+    def on_card(self) -> bool:
+        """Whether a card rendered."""
+        return self.device != CPU
 
     @property
     def costs(self) -> dict[Candidate, ImageCost]:
@@ -201,6 +208,7 @@ def measure(spec: SceneSpec, beside: Path | None, purpose: Purpose, seconds: flo
         reach=reach,
         asked_s=seconds,
         spent_s=budget.spent_s,
+        device=backend.device().name,
     )
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.core.waiting import Log
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.strategy.candidates import (
     CLEAR,
     PLAIN,
@@ -59,20 +60,30 @@ class TransportPlan:
 
     @property
     def settings(self) -> SpecTables:
-        """The planned tables of the spec; settings that it need not state are written only where they matter."""
+        """The planned tables of the spec. What was measured on a card is for cards alone, but for `half_spp`."""
+        transport = self._transport
+        if self.measurement.on_card:
+            transport = {"half_spp": transport.pop("half_spp"), "card": transport}
+        return {"transport": transport, "photons": {"paths": self.photons.paths, "depth": self.photons.depth}}
+
+    @property
+    def _transport(self) -> dict[str, Any]:
+        """The planned settings of this device; those that the spec need not state are there only where they matter."""
         planned, now = self.candidate, self.spec.transport
         transport = {"connections": planned.connections, "light_ratio": planned.light_ratio, "half_spp": self.half_spp}
         if planned.guided_light or now.guided_light:
             transport["guided_light"] = planned.guided_light
         if planned.light_samples > 1 or now.light_samples > 1:
             transport["light_samples"] = planned.light_samples
-        return {"transport": transport, "photons": {"paths": self.photons.paths, "depth": self.photons.depth}}
+        return transport
 
     @property
     def changes(self) -> SpecTables:
         """The planned tables that differ from the spec's present ones."""
-        now = {"transport": self.spec.transport.model_dump(), "photons": self.spec.photons.model_dump()}
-        return {table: keys for table, keys in self.settings.items() if now[table] != now[table] | keys}
+        settings, now = self.settings, {"transport": self.spec.transport, "photons": self.spec.photons}
+        planned = {**settings, "transport": self._transport}
+        kept = {table: given.model_dump() for table, given in now.items()}
+        return {table: settings[table] for table, keys in planned.items() if kept[table] != kept[table] | keys}
 
     @property
     def saving(self) -> Saving | None:
@@ -103,6 +114,7 @@ def make_plan(
 
     `beside` is the folder that the spec's files are relative to.
     """
+    spec = backend.for_this_device(spec)
     kept = None if again else find(spec, purpose)
     if kept is not None and kept.asked_s >= seconds and has_measured(kept, spec):
         return plan_of(spec, kept, cached=True)
@@ -180,7 +192,8 @@ def lines(plan: TransportPlan) -> list[str]:
         *(f"  {reason}" for reason in _why(plan, rows)),
         "",
         *([*table(plan, rows), "", *legend(plan), ""] if rows else []),
-        f"{origin}: {m.views} views of {m.film.width} × {m.film.height} pixels, {m.spp} spp; {m.spent_s:.0f} s of CPU",
+        f"{origin}; it holds for {f'cards ({m.device})' if m.on_card else 'processors'}: {m.views} views of "
+        f"{m.film.width} × {m.film.height} pixels, {m.spp} spp; {m.spent_s:.0f} s of CPU",
     ]
 
 

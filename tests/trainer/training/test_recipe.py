@@ -2,20 +2,24 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from held_out_errors import held_out_errors
+from read_batches import batch_of
 
 from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.networks.inputs import Needs, SceneFrame
 from photonfarm.trainer.predictors.evaluation import read_batches
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
+from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
-from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training import loop
-from photonfarm.trainer.training.learner import compute_rate
+from photonfarm.trainer.training.learner import Learner, compute_rate
 from photonfarm.trainer.training.loop import train
 
 Weights = dict[str, torch.Tensor]
@@ -50,6 +54,35 @@ def test_a_run_that_goes_on_with_more_steps_follows_the_schedule_of_these(make_s
     shares = [1, 1, 0.75, 0.25]  # of 4 steps, of which one is the rise
     shares += [(1 + np.cos(np.pi * part / 6)) / 2 for part in (2, 3, 4, 5)]  # of 8, of which two are
     assert rates == pytest.approx([1e-3 * share for share in shares])
+
+
+def take_a_step(source: Any, width: int, layer_rates: str) -> tuple[Learner, Weights, float]:
+    """A learner after its first step, its weights before, and by how much its image has changed (root mean square)."""
+    network = NetworkSettings(architecture="cnn", width=width)
+    settings = TrainSettings(network=network, layer_rates=layer_rates, learning_rate=1e-4)
+    learner = Learner(SceneFrame.of(source.spec, *source.base(), network), settings, Ranks())
+    before = {name: weight.detach().clone() for name, weight in learner.network.named_parameters()}
+    batch = batch_of(source, range(4), Needs(points=False))
+    images = [learner.network(batch.inputs).detach()]
+    learner.step(0, batch)
+    images.append(learner.network(batch.inputs).detach())
+    return learner, before, float((images[1] - images[0]).square().mean().sqrt())
+
+
+def test_a_scaled_layer_has_144_inputs_th_of_the_rate_and_one_of_fewer_inputs_all_of_it(make_source) -> None:
+    """Adam's first step moves every weight that has a gradient by the rate."""
+    learner, before, _ = take_a_step(make_source(4), 32, "scaled")
+    for name, weight in learner.network.named_parameters():
+        inputs = weight[0].numel() if name.endswith("weight") else 1
+        moved = float((weight.detach() - before[name]).abs().max())
+        assert moved == pytest.approx(1e-4 * min(1, 144 / inputs), rel=0.01), name
+
+
+def test_one_rate_changes_an_image_of_four_times_the_width_as_much_only_if_it_is_scaled(make_source) -> None:
+    source = make_source(4)
+    equal, scaled = ([take_a_step(source, width, how)[2] for width in (16, 64)] for how in ("equal", "scaled"))
+    assert equal[1] > 5 * equal[0]
+    assert scaled[1] < 2.5 * scaled[0]
 
 
 def test_the_average_is_the_running_mean_that_one_works_out_by_hand(make_source, tiny, run, tmp_path) -> None:

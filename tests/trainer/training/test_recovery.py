@@ -200,7 +200,7 @@ def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
 
 
 def test_a_run_whose_rate_rises_until_it_diverges_is_caught_within_thirty_steps_each_time_and_ends_well(
-    make_source, tiny, run, tmp_path, monkeypatch
+    make_source, tiny, run, tmp_path, monkeypatch, capsys
 ) -> None:
     """No validation on the way finds it."""
     losses, honest = [], Learner.step
@@ -212,9 +212,10 @@ def test_a_run_whose_rate_rises_until_it_diverges_is_caught_within_thirty_steps_
     settings = tiny(**RISING, max_steps=300, validate_every=300, checkpoint_every=100)
     without = train(make_source(48), settings.model_copy(update={"recover": False}), tmp_path / "without")
     monkeypatch.setattr(Learner, "step", step)
-    outcome = train(make_source(48), settings, run)
+    outcome = train(make_source(48), settings, run, Hooks(on_record=show.print_record))
     found = [record for record in records(run, "recovered") if record["cause"] == "loss"]
     assert len(found) >= 2
+    assert capsys.readouterr().err.count(" (usually up to 0.") == len(found)
     for before, record in pairwise([{"step": 0}, *found]):
         assert record["back_to"] >= record["step"] - SNAPSHOT_EVERY - 30
         since, limit = range(before["step"], record["step"]), FACTOR * record["losses"]["usual"]
@@ -223,11 +224,14 @@ def test_a_run_whose_rate_rises_until_it_diverges_is_caught_within_thirty_steps_
     assert outcome.last_error < 1.2 * train(make_source(48), tiny(max_steps=300), tmp_path / "calm").last_error
 
 
-def test_a_loss_that_is_not_finite_costs_a_run_a_few_dozen_steps(make_source, tiny, run, monkeypatch) -> None:
+def test_a_loss_that_is_not_finite_costs_a_run_a_few_dozen_steps(make_source, tiny, run, monkeypatch, capsys) -> None:
     """Batches of 3 are read after 6 held-out samples at most, and 2 ahead: 3 × 75 reads are some 70 steps."""
     monkeypatch.setattr(loop, "LOG_EVERY", LOOK_EVERY)
     settings = tiny(validate_every=1000, checkpoint_every=1000, max_steps=120)
-    assert train(spoilt(make_source(24), lambda reads: reads == 225), settings, run).reason == "steps"
+    source = spoilt(make_source(24), lambda reads: reads == 225)
+    assert train(source, settings, run, Hooks(on_record=show.print_record)).reason == "steps"
+    said = "step 80: the loss is not finite; goes on from the weights of step 50, at 0.5 of the rate"
+    assert said in capsys.readouterr().err.splitlines()
     (found,) = records(run, "recovered")
     wanted = {"kind": "recovered", "cause": "loss", "errors": None, "losses": {"now": None, "usual": None}}
     assert found == {**wanted, "recoveries": 1, "rate_factor": 0.5, "step": 80, "back_to": 50}

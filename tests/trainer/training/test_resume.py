@@ -77,7 +77,7 @@ def assert_same(one: Path, other: Path) -> None:
     [
         {"optimiser": "adam"},
         pytest.param({"optimiser": "rmsprop"}, marks=pytest.mark.slow),
-        {"schedule": "cosine", "average": 0.99, "learning_rate": 0.3},
+        {"schedule": "cosine", "average": 0.99, "learning_rate": 0.3, "layer_rates": "scaled"},
     ],
     ids=["adam", "rmsprop", "averaged, recovering"],
 )

@@ -17,7 +17,7 @@ from photonfarm.trainer.networks import ARCHITECTURES, inputs, network, predict_
 from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.settings import make_preset
-from photonfarm.trainer.training.learner import Learner, build_optimiser
+from photonfarm.trainer.training.learner import Learner, build_optimiser, group_weights
 
 EVERY = sorted(ARCHITECTURES)
 
@@ -94,7 +94,8 @@ def test_a_step_on_a_card_reads_nothing_and_is_handed_nothing(
     assert learner.average is not None
     for each in (learner.network, learner.average.network):
         each.to(META)
-    learner._device, learner.optimiser = META, build_optimiser(learner.network.parameters(), learner._settings)
+    groups = group_weights(learner.network, learner._settings)
+    learner._device, learner.optimiser = META, build_optimiser(groups, learner._settings)
     learner.step(0, batch)
     with Operators() as operators:
         loss = learner.step(1, batch)

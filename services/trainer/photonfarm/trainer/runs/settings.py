@@ -91,6 +91,7 @@ Loss = Literal["linear", "relative", "paired"]
 Optimiser = Literal["adam", "rmsprop"]
 Compilation = Literal["off", "on", "graphs"]
 Schedule = Literal["epochs", "cosine"]
+LayerRates = Literal["equal", "scaled"]
 ReadyDenoiser = Literal["none", "fill-in", "oidn", "oidn-balanced", "oidn-fast"]
 """Kept pixels as they are; the rest filled in; then denoised by Open Image Denoise: in its best quality, a quicker one,
 or its quickest."""
@@ -157,6 +158,8 @@ class TrainSettings(Frozen):
     # MODULE:NAME, a function of your own, which is refused if it is found to bias
     batch: Count = 32  # [S 3.1: 32 dynamic, 128 static]
     learning_rate: Positive = 5e-4  # [S 3.1]
+    layer_rates: LayerRates = "equal"  # "scaled" (ours): a layer of more than 144 inputs has 144 / inputs of the
+    # rate, as Adam changes what it puts out by the rate times its inputs; so one rate is good for all widths
     decay: Annotated[float, Field(gt=0, le=1)] = 0.99  # of the rate, per epoch [S 3.1]
     epoch_samples: Count = 50_000  # an epoch counts samples drawn, so the schedule ignores how much has arrived
     optimiser: Optimiser = "adam"  # [S 3.1]
@@ -226,7 +229,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         },
         "loss": "relative",
         "batch": 2,
-        "learning_rate": 1e-3,
+        "learning_rate": 3e-3,
+        "layer_rates": "scaled",
         "schedule": "cosine",  # rises and falls over the whole run, however short
         "average": 0.99,
         "epoch_samples": 256,

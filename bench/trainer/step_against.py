@@ -1,10 +1,12 @@
 """A training step of this checkout and of another one, in turns: its time, its operators, and how near its values are.
 
     git worktree add ../before COMMIT
-    python -m bench.trainer.step_against ../before [--size 64] [--batch 8] [--width 16] [--rounds 15] [--only NAME …]
+    python -m bench.trainer.step_against ../before [--scene room] [--size 64] [--batch 8] [--width 16] [--rounds 15]
+        [--only NAME …]
 
-Each checkout has a process of its own, and both read one store of `room`. Times are processor seconds, ratios are
-within a round. Operators are those that torch dispatches, without what they call themselves. Exit code 0.
+Each checkout has a process of its own, and both read one store of the scene, for which they must have the same id. Times
+are processor seconds, ratios are within a round. Operators are those that torch dispatches, without what they call
+themselves. Exit code 0.
 """
 
 from __future__ import annotations
@@ -160,18 +162,21 @@ def main() -> int:
         serve(Path(sys.argv[2]), sys.argv[3])
         return 0
     from bench.harness import results
-    from bench.trainer.train_step import filled, resized, shown
+    from bench.harness.scenes import ready_spec, square
+    from bench.trainer.train_step import filled, shown
     from photonfarm.trainer.runs.settings import make_preset
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("before", type=Path, help="the other checkout")
+    parser.add_argument("--scene", default="room", help="(room)")
     for name, value in (("size", 64), ("batch", 8), ("width", 16), ("rounds", 15)):
         parser.add_argument(f"--{name}", type=int, default=value, help=f"({value})")
     parser.add_argument("--only", nargs="*", default=list(shown()), help="architectures (all)")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        points = make_preset("small").network.points
-        scene_id = filled(resized(options.size, points), Path(folder))
+        spec = square(ready_spec(options.scene), options.size)
+        points = make_preset("small").network.points or spec.points
+        scene_id = filled(spec.model_copy(update={"points": points}), Path(folder))
         children = [Child(checkout, Path(folder), scene_id) for checkout in (options.before, results.ROOT)]
         sizes = options.batch, options.width, options.rounds
         rows = [compare(children, architecture, *sizes) for architecture in options.only]

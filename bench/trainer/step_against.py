@@ -4,8 +4,8 @@
     python -m bench.trainer.step_against ../before [--scene room] [--size 64] [--batch 8] [--width 16] [--rounds 15]
         [--only NAME …]
 
-Each checkout has a process of its own, and both read one store of the scene, for which they must have the same id. Times
-are processor seconds, ratios are within a round. Operators are those that torch dispatches, without what they call
+Each checkout has a process of its own, and both read one store of the scene, for which they must have one id. Times are
+processor seconds, ratios are within a round. Operators are those that torch dispatches, without what they call
 themselves. Exit code 0.
 """
 

@@ -75,6 +75,10 @@ $(VENV)/.bench-ready: $(DEV)
 
 bench-render: $(VENV)/.bench-ready
 
+# What this machine's card gives, most telling first: make bench-card ARGS="--minutes 8".
+bench-card: $(DEV)
+	$(BIN)/python -m bench.card $(ARGS)
+
 # bench-train-step is the module bench.trainer.train_step: whichever room of bench/ has it.
 bench-%: $(DEV)
 	$(BIN)/python -m $(or $(subst /,.,$(basename $(wildcard bench/*/$(subst -,_,$*).py))),$(error bench/ has no $*))

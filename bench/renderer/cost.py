@@ -1,11 +1,10 @@
-"""What a sample of `bdpt` costs against one of `path` and one of `ptracer`; whether views cost less in shared launches.
+"""What a sample of `bdpt` costs against one of `path` and one of `ptracer`.
 
     python -m bench.renderer.cost [--scene cornell] [--size 256] [--spp 16] [--repetitions 9] [--out DIR]
 
 Each repetition renders one image of every method, in turn; the cost is the median over repetitions of the ratio of CPU
 times within one. A render call counts whole, with the tracing in Python, the launch and the download, but for the first
-of each method, which compiles. For views that share launches the built-in room is rendered at several sizes: so many
-views one after the other, as a worker on a processor renders them, and the same together. Exit code 0.
+of each method, which compiles. Exit code 0.
 """
 
 from __future__ import annotations
@@ -13,11 +12,10 @@ from __future__ import annotations
 import statistics
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from bench.harness import results, scenes
+from bench.harness import results
 
 MAX_DEPTH, RR_DEPTH = 8, 5
 METHODS: dict[str, dict[str, Any]] = {
@@ -69,60 +67,8 @@ def measure(scene: Any, spp: int, repetitions: int) -> list[MethodCost]:
     return rows
 
 
-TOGETHER = ((16, 32), (32, 8), (32, 32), (64, 8), (128, 4))
-"""Sizes of images, and how many views of each are rendered together."""
-
-HALF_SPP = 8
-
-
-@dataclass(frozen=True, slots=True)
-class SharedLaunch:
-    """Views rendered together; times are CPU seconds of a view, with both halves."""
-
-    size: int
-    views: int
-    alone_s: float
-    together_s: float
-    cost: float  # of a view together over one alone, median of the ratios within a repetition
-    cost_from: float
-    cost_to: float
-
-
-def measure_together(size: int, count: int, repetitions: int) -> SharedLaunch:
-    """So many views of the built-in room, one after the other and together, in turn."""
-    import numpy as np
-
-    from photonfarm.renderer.scene.loaded_scene import LoadedScene
-    from photonfarm.scene.view import sample_view
-
-    spec = scenes.in_passes(scenes.square(scenes.ready_spec("room"), size), HALF_SPP)
-    scene = LoadedScene.load(spec, paths_at_once=2 * count * size * size * HALF_SPP)
-    views = [sample_view(spec, b"", 0, number) for number in range(count)]
-
-    def alone(seed: int) -> Any:
-        pairs = enumerate(range(seed, seed + 2 * count, 2))
-        return np.concatenate([scene.render_halves(views[i], (first, first + 1)) for i, first in pairs])
-
-    def together(seed: int) -> Any:
-        return scene.render_images([view for view in views for _ in "AB"], range(seed, seed + 2 * count))
-
-    for seed in (0, 1):  # the first compiles, the second may record once more
-        if not np.array_equal(alone(seed), together(seed)):
-            raise SystemExit(f"{size}²: views rendered together are others than those rendered alone")
-    turns = [[_seconds(render, seed) / count for render in (alone, together)] for seed in range(2, repetitions + 2)]
-    ratios = [shared / single for single, shared in turns]
-    single, shared = (statistics.median(column) for column in zip(*turns, strict=True))
-    return SharedLaunch(size, count, single, shared, statistics.median(ratios), min(ratios), max(ratios))
-
-
-def _seconds(render: Callable[[int], Any], seed: int) -> float:
-    start = time.process_time()
-    render(seed)
-    return time.process_time() - start
-
-
-def page(scene: str, size: int, spp: int, repetitions: int, rows: list[MethodCost], shared: list[SharedLaunch]) -> str:
-    """The tables as Markdown."""
+def page(scene: str, size: int, spp: int, repetitions: int, rows: list[MethodCost]) -> str:
+    """The table as Markdown."""
     header = ("method", "CPU ms an image", "cost of a sample over `path`", "least … greatest", "first call, CPU s")
     lines = [
         (
@@ -134,33 +80,13 @@ def page(scene: str, size: int, spp: int, repetitions: int, rows: list[MethodCos
         )
         for row in rows
     ]
-    together = [
-        (
-            f"{row.size}²",
-            row.views,
-            f"{row.alone_s * 1e3:.1f}",
-            f"{row.together_s * 1e3:.1f}",
-            f"×{row.cost:.2f}",
-            f"{row.cost_from:.2f} … {row.cost_to:.2f}",
-        )
-        for row in shared
-    ]
-    beside = ("image", "views together", "CPU ms a view alone", "CPU ms a view together", "cost", "least … greatest")
     return f"""# Cost of a sample
 
 `{scene}` at {size}², {spp} spp, max_depth {MAX_DEPTH}, one thread; medians of {repetitions} images of each method,
 rendered in turn. `bdpt` (connections, light paths per eye path), with recorded launches as the workers have them. What
 a sample buys for its cost is in [bdpt_against_peers.md](bdpt_against_peers.md).
 
-{results.table(header, lines)}
-
-## Views that share launches
-
-The built-in room at {HALF_SPP} samples per pixel a half, one thread; both halves of a view share a launch either way.
-All images together were equal to those alone to the bit. Workers on a processor render one view at a time; workers on
-a card render as many as its memory holds, for which this page has no figures.
-
-{results.table(beside, together)}"""
+{results.table(header, lines)}"""
 
 
 def main() -> int:
@@ -184,15 +110,13 @@ def main() -> int:
     rows = measure(
         mi.load_dict(HARD_SCENES[options.scene](options.size), optimize=False), options.spp, options.repetitions
     )
-    shared = [measure_together(size, count, options.repetitions) for size, count in TOGETHER]
     values = {
         "scene": options.scene,
         "size": options.size,
         "spp": options.spp,
         "rows": [asdict(row) for row in rows],
-        "together": [asdict(row) for row in shared],
     }
-    text = page(options.scene, options.size, options.spp, options.repetitions, rows, shared)
+    text = page(options.scene, options.size, options.spp, options.repetitions, rows)
     results.write("cost", text, values, options.out)
     return 0
 

@@ -112,12 +112,12 @@ class WorkTimer:
             torch.cuda.synchronize()
 
 
-def filled(spec: SceneSpec, root: Path) -> str:
-    """A store of the scene with `SAMPLES` samples; returns the scene's id."""
+def filled(spec: SceneSpec, root: Path, samples: int | None = None) -> str:
+    """A store of the scene with so many samples, `SAMPLES` if not given; returns the scene's id."""
     contents = Contents(spec)
     scene = Store(root, create=True).add(spec)
     scene.write_base(*contents.base)
-    scene.plan(Request(modifications=SAMPLES // 2, views_per_modification=2), shard_rows=2 * RENDERED)
+    scene.plan(Request(modifications=(samples or SAMPLES) // 2, views_per_modification=2), shard_rows=2 * RENDERED)
     commit(scene, 0, contents)
     pool = contents.pool()
     for job in range(1, scene.jobs()):
@@ -127,13 +127,7 @@ def filled(spec: SceneSpec, root: Path) -> str:
 
 def measure(where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer, steps: int) -> ArchitectureTimes:
     """One architecture on a complete store."""
-    with Feed(SceneReader(*where), settings) as feed:
-        rows = [row for row, _ in feed.arrivals()[0]]
-        learner = Learner(SceneFrame.of(feed.spec, *feed.base, settings.network), settings, Ranks())
-        feed.ask(rows[: settings.batch])
-        batch = feed.take()
-        step, image = (timed(learner, batch, usable_device(settings.device), clock, gradients=g) for g in (True, False))
-        parameters = sum(w.numel() for w in learner.network.parameters())
+    parameters, step, image = time_step(where, settings, clock)
     return ArchitectureTimes(
         settings.network.architecture,
         parameters,
@@ -144,6 +138,19 @@ def measure(where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer, 
         fed_ms(where, settings) * settings.batch,
         wait_share(where, settings, steps),
     )
+
+
+def time_step(
+    where: tuple[Path, str], settings: TrainSettings, clock: WorkTimer
+) -> tuple[int, dict[str, float], dict[str, float]]:
+    """The number of parameters of one architecture, and its `timed` step and image, of one batch."""
+    with Feed(SceneReader(*where), settings) as feed:
+        rows = [row for row, _ in feed.arrivals()[0]]
+        learner = Learner(SceneFrame.of(feed.spec, *feed.base, settings.network), settings, Ranks())
+        feed.ask(rows[: settings.batch])
+        batch = feed.take()
+        step, image = (timed(learner, batch, usable_device(settings.device), clock, gradients=g) for g in (True, False))
+        return sum(w.numel() for w in learner.network.parameters()), step, image
 
 
 def timed(

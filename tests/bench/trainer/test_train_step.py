@@ -1,15 +1,11 @@
 """Steps and images of every network are timed, those with guides too."""
 
-import pytest
-
-from bench.trainer import train_step
 from bench.trainer.train_step import WHOLE, WorkTimer, filled, for_architecture, measure, resized, shown
 from photonfarm.trainer.runs.settings import make_preset
 
 
-def test_every_network_takes_its_steps_and_its_parts_are_timed(tmp_path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train_step, "SAMPLES", 32)
-    where = tmp_path, filled(resized(16, 64), tmp_path)
+def test_every_network_takes_its_steps_and_its_parts_are_timed(tmp_path) -> None:
+    where = tmp_path, filled(resized(16, 64), tmp_path, 32)
     settings = make_preset("small", network={"width": 4, "points": 64})
     chosen = ("light_transport_photons", "guided_transport_photons", "denoise_4")
     assert set(chosen) <= set(shown())

@@ -101,7 +101,7 @@ class Oidn:
         try:
             if place.type == "cuda":
                 stream = torch.cuda.current_stream(place)
-                self._device = self._oidn.Device.cuda(stream.device_index, stream.cuda_stream)
+                self._device = self._oidn.Device.cuda(stream.device.index, stream.cuda_stream)
             else:
                 self._device = self._oidn.Device(self._oidn.DeviceType.CPU)
                 self._device.num_threads = threads

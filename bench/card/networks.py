@@ -1,0 +1,61 @@
+"""A training step and a frame of every architecture, on the room at the supplement's sizes."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from bench.card.rooms import on_card
+from bench.harness import results
+from bench.trainer.train_step import WHOLE, WorkTimer, filled, for_architecture, resized, time_step
+from photonfarm.trainer.runs.settings import make_preset
+
+TITLE = "A training step and a frame"
+BATCH, REPETITIONS, SAMPLES = 32, 7, 96
+
+
+def measure(architecture: str, size: int, out: Path) -> dict[str, Any]:
+    """Milliseconds of a step and of an image alone, whose inputs lie on the device."""
+    import torch
+
+    torch.set_num_threads(1)
+    device, batch, precision = ("cuda", BATCH, "bfloat16") if on_card() else ("cpu", 2, "float32")
+    preset = make_preset("paper-dynamic", device=device, batch=batch, network={"precision": precision})
+    settings, clock = for_architecture(preset, architecture), WorkTimer(device, REPETITIONS)
+    where = fill_once(out / f"store-{size}", size, settings.network.points)
+    parameters, step, _ = time_step(where, settings, clock)
+    _, _, frame = time_step(where, settings.model_copy(update={"batch": 1}), clock)
+    return {
+        "parameters": parameters,
+        "batch": settings.batch,
+        "precision": settings.network.precision,
+        "step_ms": step[WHOLE],
+        "frame_ms": frame[WHOLE],
+        "peak_gb": torch.cuda.max_memory_allocated() / 1e9 if torch.cuda.is_available() else 0.0,
+    }
+
+
+def fill_once(root: Path, size: int, points: int | None) -> tuple[Path, str]:
+    """The store that all architectures read, made by the first of them."""
+    spec = resized(size, points)
+    if not root.is_dir():
+        with tempfile.TemporaryDirectory(dir=root.parent) as folder:
+            filled(spec, Path(folder) / "store", SAMPLES)
+            (Path(folder) / "store").rename(root)
+    return root, spec.scene_id
+
+
+def describe(found: Mapping[str, Mapping[str, Any]]) -> str:
+    """The table."""
+    header = ("architecture", "parameters", "step, ms", "frame, ms", "most memory, GB")
+    rows = [
+        [f"`{name}`", of["parameters"], f"{of['step_ms']:.1f}", f"{of['frame_ms']:.1f}", f"{of['peak_gb']:.1f}"]
+        for name, of in found.items()
+    ]
+    first = next(iter(found.values()))
+    return f"""`paper-dynamic` in {first["precision"]}: a step of {first["batch"]} samples with its optimiser, and the
+network's part of a frame, in processor time or a card's; medians of {REPETITIONS}.
+
+{results.table(header, rows)}"""

@@ -17,7 +17,7 @@ from photonfarm.scene.spec_loading import parse_spec
 HERE = Path(__file__).parent
 SIZES = "sizes.toml"
 
-SizeName = Literal["small", "paper"]
+SizeName = Literal["small", "card", "paper"]
 Part = Literal["fixed", "movable", "daylight", "vanishing", "static", "ablation"]
 """Where an experiment stands in the tables."""
 

@@ -1,19 +1,23 @@
 #!/usr/bin/env python3
 """Runs experiments from nothing to their reports, and goes on where it was interrupted.
 
-    python experiments/run.py [NAME ...] [--size small] [--workers 2] [--work build/experiments] [--dry-run]
+    python experiments/run.py [NAME ...] [--size small] [--minutes N] [--workers 2] [--work build/experiments]
+                              [--dry-run]
 
 Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered
-and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. `--dry-run` says what that would take: what
-a sample costs is measured on this machine, training is counted in operations. Exit code 0, 2 for wrong usage, 3 for
-a name that no experiment has or a file that is wrong, 7 where an experiment did not come to its end: the others are run
-all the same.
+and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. With `--minutes` what is at work then is
+stopped, and the same command goes on later; in each room the most telling networks come first. `--dry-run` says what
+that would take: what a sample costs is measured on this machine, training is counted in operations. Exit code 0, 2 for
+wrong usage, 3 for a name that no experiment has or a file that is wrong, 7 where an experiment did not come to its end:
+the others are run all the same.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+import time
 from pathlib import Path
 from typing import get_args
 
@@ -31,6 +35,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help="experiments (all)")
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
+    parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long (never)")
     parser.add_argument("--workers", type=_parse_count, default=2, help="processes at a time, a core each (2)")
     parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
     parser.add_argument("--dry-run", action="store_true", help="say what it would take, and do none of it")
@@ -58,9 +63,9 @@ def main() -> int:
         for experiment in experiments:
             print(dry_run.measure_need(experiment).describe(), flush=True)
         return 0
-    failed = False
+    failed, until = False, time.monotonic() + 60 * arguments.minutes
     for experiment in experiments:
-        stages = Stages(experiment, arguments.work / arguments.size / experiment.name, arguments.workers)
+        stages = Stages(experiment, arguments.work / arguments.size / experiment.name, arguments.workers, until)
         try:
             tell(f"{experiment.name}: {stages.run()}")
         except PhotonfarmError as error:

@@ -6,6 +6,7 @@ Everything lies in one folder: spec.json, store/, references/, runs/NAME/ and re
 from __future__ import annotations
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -44,6 +45,7 @@ class Stages:
     experiment: Experiment
     folder: Path
     workers: int
+    until: float = math.inf  # by time.monotonic(): then what is at work is stopped, and nothing else begins
 
     def run(self) -> Path:
         """All stages; the folder of the report. Raises StageError, and StoreError where store or runs are damaged."""
@@ -136,7 +138,8 @@ class Stages:
                 f"{self.experiment.name}: {self._folder(run)} was trained with {'; '.join(differing)}: move that "
                 "folder away, and it is trained anew"
             )
-        return bool(state["step"] >= settings["max_steps"])
+        seconds = sum(state["seconds"].values())
+        return bool(state["step"] >= settings["max_steps"] or seconds >= (settings["max_seconds"] or math.inf))
 
     def _asked(self, run: Run) -> dict[str, Any]:
         """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""
@@ -228,9 +231,17 @@ class Stages:
             return
         log.parent.mkdir(exist_ok=True)
         began = time.monotonic()
-        verb = command(*map(str, arguments))
+        if began >= self.until:
+            raise StageError(f"{self.experiment.name}: the time is over before {stage}; the same command goes on")
         with log.open("ab") as output:
-            code = subprocess.run(tie(verb), stdout=output, stderr=subprocess.STDOUT, check=False).returncode
+            process = subprocess.Popen(tie(command(*map(str, arguments))), stdout=output, stderr=subprocess.STDOUT)
+        try:
+            code = process.wait(None if math.isinf(self.until) else self.until - began)
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            process.wait()
+            what = f"the time is over, and {stage} was stopped"
+            raise StageError(f"{self.experiment.name}: {what}; the same command goes on") from None
         if code:
             last = log.read_text(errors="replace").strip().splitlines()[-1:]
             raise StageError(f"{self.experiment.name}: {stage} ended with exit code {code}; {log} says: {last}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import time
 from itertools import product
 from pathlib import Path
 from typing import Any, get_args
@@ -103,6 +104,30 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
 
 def with_size(tiny: Experiment, **changes: Any) -> Experiment:
     return tiny.model_copy(update={"size": tiny.size.model_copy(update=changes)})
+
+
+def test_the_size_card_is_for_ten_minutes_a_network_and_has_the_most_telling_first() -> None:
+    found = Experiment.load("fixed-veach-ajar", "card")
+    assert [run.name for run in found.trained()[:2]] == ["guided_transport", "denoise_1"]
+    assert all(run.train["max_seconds"] == 600 for run in found.trained())
+
+
+@pytest.mark.slow
+def test_stages_stop_when_their_time_is_over_and_the_same_command_goes_on(tiny: Experiment, tmp_path: Path) -> None:
+    """Training ends by its seconds, which counts as its end."""
+    endless = with_size(tiny, train={**tiny.size.train, "max_steps": 100_000, "max_seconds": 4}, seeds=(0,))
+    begun = Stages(endless, tmp_path / "work", 1)
+    begun.write_spec()
+    begun.render()
+    with pytest.raises(StageError, match=r"train-light_transport was stopped; the same command goes on"):
+        Stages(endless, tmp_path / "work", 1, until=time.monotonic() + 3).train()
+    with pytest.raises(StageError, match="the time is over before train-light_transport"):
+        Stages(endless, tmp_path / "work", 1, until=0).train()
+    begun.train()
+    before = {run: run.stat().st_mtime_ns for run in (tmp_path / "work").glob("runs/*/checkpoint*")}
+    begun.train()
+    assert len(before) == 2
+    assert before == {run: run.stat().st_mtime_ns for run in before}
 
 
 def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> None:
@@ -222,6 +247,7 @@ def trained(experiment: Experiment, folder: Path, step: int) -> Stages:
     network = {"architecture": "light_transport", "width": 4, "points": 128}
     settings = make_preset("small", network=network, hold_out=experiment.size.hold_out, **told)
     state = {"scene_id": experiment.spec().scene_id, "settings": settings.model_dump(mode="json"), "step": step}
+    state["seconds"] = {"train": 1.0}
     (folder / "runs" / "light_transport").mkdir(parents=True)
     checkpoint.save(folder / "runs" / "light_transport" / "checkpoint.safetensors", state)
     return Stages(experiment, folder, workers=1)

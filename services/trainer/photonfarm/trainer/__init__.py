@@ -23,7 +23,7 @@ def train(
     scene: str,
     run: str | Path,
     *,
-    preset: str = "small",
+    preset: str | None = None,
     redis_url: str | None = None,
     log: Callable[[str], object] = print,
     **settings: Any,
@@ -31,9 +31,10 @@ def train(
     """Train on a scene's samples, or continue a run, as `photonfarm train` does; returns the run with its last weights.
 
     `store` is a folder or the URL of a bucket, and `scene` a scene's name, its id, or the beginning of its id. The
-    settings are a preset's with changes by key, such as `max_steps`, `architecture` or `width`; `photonfarm train
-    --help` lists them. The folder `run` is that of `photonfarm train --run`: either goes on with what the other began.
-    While it trains, `photonfarm train --check` finds the run alive, and TensorBoard, if it is installed, its curves.
+    settings are a preset's, by default `card` on a card and `small` elsewhere, with changes by key, such as
+    `max_steps`, `architecture` or `width`; `photonfarm train --help` lists them. The folder `run` is that of
+    `photonfarm train --run`: either goes on with what the other began. While it trains, `photonfarm train --check`
+    finds the run alive, and TensorBoard, if it is installed, its curves.
 
     Training waits for samples that workers are still to render, also for the first ones; `log` is told of that, and
     `max_seconds` limits it. With `redis_url`, the queue's Redis, workers learn how many samples are used; without it,
@@ -48,7 +49,9 @@ def train(
     from photonfarm.store.read.find import scene_named
     from photonfarm.trainer import service
     from photonfarm.trainer.predictors.trained import TrainedRun
+    from photonfarm.trainer.runs.devices import AUTO, choose_preset
 
+    preset = preset or choose_preset(settings.get("device", AUTO))
     scene_id = scene_named(Store(store), scene)
     service.run(None, store, Path(run), preset, settings, redis_url, scene_id=scene_id, log=log)
     return TrainedRun.load(Path(run))

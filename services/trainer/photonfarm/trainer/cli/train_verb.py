@@ -63,7 +63,7 @@ class TrainCommand(click.Command):
         """Parse the arguments; raises SpecError for settings that are none."""
         left = super().parse_args(ctx, args)
         if not ctx.resilient_parsing:
-            make_settings(ctx.params["preset"], collect_changes(ctx.params))
+            make_settings(ctx.params["preset"] or "small", collect_changes(ctx.params))
         return left
 
 
@@ -81,9 +81,7 @@ def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
 @click.option(
     "--preset",
     type=click.Choice(list(PRESETS)),
-    default="small",
-    show_default=True,
-    help="Sizes of network and batch.",
+    help="Sizes of network and batch.  [default: card on a card, small on a processor]",
 )
 @click.option(
     "--architecture",
@@ -162,7 +160,7 @@ def train(
     store: str | Path,
     run: Path,
     redis_url: str,
-    preset: str,
+    preset: str | None,
     pairs: tuple[str, ...],
     until_complete: bool,
     summary: bool,
@@ -180,6 +178,7 @@ def train(
     """
     from photonfarm.trainer import service
     from photonfarm.trainer.cli import show
+    from photonfarm.trainer.runs.devices import AUTO, choose_preset
 
     others = (("--summary", summary), ("--check", check), ("--dry-run", dry_run))
     instead = [name for name, asked in others if asked]
@@ -191,7 +190,9 @@ def train(
     changes = collect_changes({"pairs": pairs, **options})
     if check:
         service.check(run)
-    elif summary:
+        return
+    preset = preset or choose_preset(changes.get("device", AUTO))
+    if summary:
         click.echo(service.summarise(spec, store, preset, changes))
     elif dry_run:
         show.print_dry_run(service.rehearse(spec, store, preset, changes, film), as_json)

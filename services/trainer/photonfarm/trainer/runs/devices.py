@@ -51,6 +51,11 @@ def is_asynchronous(device: torch.device) -> bool:
     return device.type != "cpu"
 
 
+def choose_preset(device: str = AUTO) -> str:
+    """The preset of settings for a device of this name: "card" where that is a card, "small" on a processor."""
+    return "card" if usable_device(device).type == "cuda" else "small"
+
+
 def round_convolutions(device: torch.device, precision: Precision) -> None:
     """Let convolutions on CUDA round their factors to TF32 from now on, or not; their sums are float32 either way.
 

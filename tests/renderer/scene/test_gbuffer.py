@@ -77,6 +77,15 @@ def test_albedo_is_the_mean_over_the_pixel_and_depth_that_of_its_centre() -> Non
     assert not buffers.albedo[8, 4].any()
 
 
+def test_images_lie_in_memory_of_numpy_which_any_thread_may_free() -> None:
+    buffers = of(DIFFUSE)
+    for image in (buffers.depth, buffers.albedo, buffers.normal):
+        owner = image
+        while owner.base is not None:
+            assert isinstance(owner.base, np.ndarray), "memory of Dr.Jit"
+            owner = owner.base
+
+
 @pytest.mark.parametrize(
     ("bsdf", "front", "back"),
     [

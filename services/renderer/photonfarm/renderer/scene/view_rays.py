@@ -165,9 +165,12 @@ def interleave(columns: Columns, channels: Mapping[str, int], lanes: int) -> Col
 
 
 def take_numpy(values: Any) -> F32:
-    """Values of Dr.Jit as an array of numpy, of a processor in the same memory."""
-    array: F32 = values.numpy()
-    return array
+    """Values of Dr.Jit as an array of numpy, in memory of its own.
+
+    In Dr.Jit's memory it would have to be freed by the thread that renders: another one that frees it, such as the one
+    that writes samples, waits at full speed until all kernels under way have ended.
+    """
+    return np.array(values, np.float32)
 
 
 Take = Callable[[Any], Any]

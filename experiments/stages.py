@@ -158,6 +158,7 @@ class Stages:
             part for key, value in self._settings(run).items() for part in ("--set", f"{key}={_format_text(value)}")
         ]
         place = ["--store", self.folder / "store", "--run", self._folder(run), "--preset", run.train["preset"]]
+        self._check_time(f"train-{run.name}")
         self._keep_commit(run)
         self._verb(f"train-{run.name}", ["train", self.folder / "spec.json", *place, *pairs])
         if not self._is_trained(run):  # as one that is asked to stop exits with 0
@@ -230,13 +231,12 @@ class Stages:
         if made and _is_done(done, asked, made, of):
             return
         log.parent.mkdir(exist_ok=True)
+        self._check_time(stage)
         began = time.monotonic()
-        if began >= self.until:
-            raise StageError(f"{self.experiment.name}: the time is over before {stage}; the same command goes on")
         with log.open("ab") as output:
             process = subprocess.Popen(tie(command(*map(str, arguments))), stdout=output, stderr=subprocess.STDOUT)
         try:
-            code = process.wait(None if math.isinf(self.until) else self.until - began)
+            code = process.wait(None if math.isinf(self.until) else max(self.until - began, 0.0))
         except subprocess.TimeoutExpired:
             process.terminate()
             process.wait()
@@ -248,6 +248,11 @@ class Stages:
         if made:
             done.write_text(asked)
         tell(f"{self.experiment.name}: {stage} {time.monotonic() - began:.0f} s")
+
+    def _check_time(self, stage: str) -> None:
+        """Raise StageError if no further stage may begin."""
+        if time.monotonic() >= self.until:
+            raise StageError(f"{self.experiment.name}: the time is over before {stage}; the same command goes on")
 
 
 def _is_done(done: Path, asked: str, made: Iterable[Path], of: Iterable[Path]) -> bool:

@@ -39,9 +39,13 @@ PARTS: Mapping[Part, tuple[str, PublishedTable]] = {
 }
 """The page's parts: title, and the paper's figures."""
 
+_OF_PRESETS = (
+    "demodulation 0.2, relative maxima, the logarithm of emission, 2 octaves, exact occlusion, a cosine schedule"
+)
+
 RECIPES: Mapping[SizeName, str] = {
-    "small": "demodulation 0.2, relative maxima, the logarithm of emission, 2 octaves, exact occlusion, a cosine "
-    "schedule and averaged weights",
+    "small": f"{_OF_PRESETS} and averaged weights",
+    "card": f"{_OF_PRESETS}, averaged weights and bfloat16",
     "paper": "demodulation 0.2, 2 octaves and exact occlusion",
 }
 """What differs from the supplement in the training of its networks, beside the loss."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
@@ -136,6 +136,7 @@ def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named(
 
 
 def test_the_page_begins_with_what_was_found_and_says_whose_recipe_it_is() -> None:
+    assert all("demodulation 0.2" in tables.explain_reading(size, "relative") for size in get_args(SizeName))
     page = tables.format_page([room("night-living-room")], "small")
     heads = [line for line in page.splitlines() if line.startswith("## ")]
     assert heads[:2] == ["## What agrees with the paper, and what does not", "## How to read the tables"]

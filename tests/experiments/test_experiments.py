@@ -112,6 +112,12 @@ def test_the_size_card_is_for_ten_minutes_a_network_and_has_the_most_telling_fir
     assert all(run.train["max_seconds"] == 600 for run in found.trained())
 
 
+def test_what_does_not_begin_for_want_of_time_leaves_no_commit(tiny: Experiment, tmp_path: Path) -> None:
+    with pytest.raises(StageError):
+        Stages(tiny, tmp_path / "work", 1, until=0).train()
+    assert not (tmp_path / "work").exists()
+
+
 @pytest.mark.slow
 def test_stages_stop_when_their_time_is_over_and_the_same_command_goes_on(tiny: Experiment, tmp_path: Path) -> None:
     """Training ends by its seconds, which counts as its end."""

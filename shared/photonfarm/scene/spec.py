@@ -156,20 +156,19 @@ class Transport(Frozen):
 
     @model_validator(mode="after")
     def _has_light_paths_to_connect_to(self) -> Self:
-        _ = self.on_card
-        for key, off in (("connections", "0"), ("guided_light", "false")):
-            if (value := getattr(self, key)) and not self.light_ratio:
-                raise ValueError(
-                    f"has {key} = {str(value).lower()} and light_ratio = 0, which has no light paths for it; "
-                    f"{key} = {off} or a light_ratio above 0 is required"
-                )
+        for where, settings in (("", self), ("on cards ", self.on_card)):
+            for key, off in (("connections", "0"), ("guided_light", "false")):
+                if (value := getattr(settings, key)) and not settings.light_ratio:
+                    raise ValueError(
+                        f"{where}has {key} = {str(value).lower()} and light_ratio = 0, which has no light paths for "
+                        f"it; {key} = {off} or a light_ratio above 0 is required"
+                    )
         return self
 
     @property
     def on_card(self) -> Transport:
-        """The settings for cards."""
-        said = {} if self.card is None else self.card.model_dump(exclude_none=True)
-        return Transport.model_validate({**self.model_dump(exclude={"card"}), **said}) if said else self
+        """The settings for cards, with `card` as it is."""
+        return self if self.card is None else self.model_copy(update=self.card.model_dump(exclude_none=True))
 
 
 STRATEGY = frozenset(CardStrategy.model_fields)

@@ -15,7 +15,7 @@ from photonfarm.renderer.strategy import measurement as measuring  # noqa: E402 
 from photonfarm.renderer.strategy.candidates import GRID, PLAIN, Candidate  # noqa: E402
 from photonfarm.renderer.strategy.noise import Purpose  # noqa: E402
 from photonfarm.renderer.strategy.plan import TransportPlan, has_measured, lines, plan_of, plus_minus  # noqa: E402  # noqa: E402
-from photonfarm.scene.spec import SceneSpec  # noqa: E402
+from photonfarm.scene.spec import STRATEGY, SceneSpec  # noqa: E402
 from photonfarm.scene.spec_loading import parse_spec  # noqa: E402
 
 
@@ -39,7 +39,8 @@ def test_a_half_keeps_its_cost() -> None:
 def test_what_was_measured_on_a_card_is_planned_for_cards_alone() -> None:
     on_card = measurement().model_copy(update={"device": "NVIDIA H200"})
     found = plan_of(spec_with(half_spp=8), on_card, cached=False)
-    assert found.settings["transport"] == {"half_spp": 16, "card": {"connections": 0, "light_ratio": 1.0}}
+    light = {"connections": 0, "light_ratio": 1.0, "guided_light": False, "light_samples": 1}
+    assert found.settings["transport"] == {"half_spp": 16, "card": light}
     assert "; it holds for cards (NVIDIA H200): 3 views" in lines(found)[-1]
     written = spec_with(**found.settings["transport"])
     assert written.scene_id == spec_with(half_spp=16).scene_id
@@ -47,6 +48,23 @@ def test_what_was_measured_on_a_card_is_planned_for_cards_alone() -> None:
     again = plan_of(written.model_copy(update={"transport": written.transport.on_card}), on_card, cached=True)
     assert "transport" not in again.changes
     assert "; it holds for processors: 3 views" in lines(plan_of(spec_with(), measurement(), cached=False))[-1]
+
+
+def test_a_plan_for_one_kind_of_device_changes_nothing_for_the_other() -> None:
+    """What a spec says of cards in part is completed by what they had of the rest."""
+    spec, guided = spec_with(half_spp=8, card={"light_samples": 4, "rr_depth": 9}), Candidate(1, 1.0, True)
+    rows = row(PLAIN, 0.2, 0.01, 0.01), row(guided, 0.01, 0.02, 0.04), row(JOINED, 0.05, 0.02, 0.04)
+    written = plan_of(spec, measurement(*rows), cached=False).changes["transport"]
+    changed = spec_with(**written)
+    assert changed.transport.guided_light
+    assert changed.transport.on_card.model_dump(include=STRATEGY) == spec.transport.on_card.model_dump(include=STRATEGY)
+
+    on_card = measurement().model_copy(update={"device": "NVIDIA H200"})
+    spec = spec.model_copy(update={"transport": spec_with(half_spp=8, card={"rr_depth": 9}).transport.on_card})
+    written = plan_of(spec, on_card, cached=False).changes["transport"]
+    assert written["card"]["rr_depth"] == 9
+    both = spec_with(**written, guided_light=True, light_samples=2).transport.on_card
+    assert (both.connections, both.light_ratio, both.guided_light, both.light_samples) == (0, 1.0, False, 1)
 
 
 def test_candidates_are_compared_at_the_samples_that_the_same_time_buys_them() -> None:

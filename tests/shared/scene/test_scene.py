@@ -68,6 +68,7 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
         (changed(exposure=0), "exposure = 0"),
         (changed(film={"width": 100, "height": 64}), r"film\.width = 100"),
         (changed(transport={"light_ratio": 0}), "transport: has connections = 1 and light_ratio = 0,"),
+        (changed(transport={"card": {"light_ratio": 0}}), "transport: on cards has connections = 1 and light_ratio"),
         (
             changed(transport={"light_ratio": 0, "connections": 0, "guided_light": True}),
             "transport: has guided_light = true and light_ratio = 0",

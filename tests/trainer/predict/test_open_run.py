@@ -8,9 +8,11 @@ import pytest
 import torch
 
 from photonfarm.core.pictures import display
+from photonfarm.farm.devices import Card
 from photonfarm.plan.request import Request
 from photonfarm.predict import infer, open_run
 from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -72,6 +74,51 @@ def test_a_frame_is_the_image_of_the_stored_sample_of_its_configuration_and_view
     off = np.abs(shown - np.asarray(wanted))
     assert np.quantile(off, 0.99) <= 2, "the rest are edges that rays of another rounding hit or miss"
     assert off.mean() < 0.3
+
+
+OWN = """
+import torch
+from torch import nn
+from photonfarm.trainer.networks.inputs import Needs
+
+class Share(nn.Module):
+    needs = Needs(points=True, guides=True)
+
+    def __init__(self, settings, frame):
+        super().__init__()
+        self.bias = nn.Parameter(torch.zeros(1))
+
+    def forward(self, inputs):
+        share = inputs.points.seen.float().mean(dim=1)
+        return inputs.albedo * 0 + share[:, None, None, None] + self.bias
+"""
+
+
+def test_a_network_of_one_s_own_is_given_the_points_that_a_view_sees(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside guides, too, with which the built-in ones need no more than which points there are."""
+    (tmp_path / "own_share.py").write_text(OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    opened = open_run(trained(store, tmp_path / "run", "own_share:Share"), store)
+    reader = SceneReader(store, opened.spec.scene_id)
+    reader.refresh()
+    sample = reader.read(1)
+    opened.predict(sample.modification, sample.view)
+    seen = opened._inputs(sample.view).points.seen[0].numpy()
+    assert np.mean(seen != sample.point_cloud.seen) < 0.005, "up to rays of another rounding"
+    assert seen.mean() < 0.9
+
+
+def test_a_network_runs_where_torch_has_no_card_though_one_renders(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The device is said to be a card; what renders is a processor."""
+    run = trained(store, tmp_path / "run", "cnn")
+    card = backend.Device(backend.DEFAULT_VARIANT, Card(0, "a card", "9.0", 1 << 34), "")
+    monkeypatch.setattr(backend, "device", lambda: card)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    assert open_run(run, store)._device == torch.device("cpu")
 
 
 def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_path: Path) -> None:

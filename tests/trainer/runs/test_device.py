@@ -7,7 +7,7 @@ from held_out_errors import held_out_errors
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.devices import describe_device, round_convolutions, usable_device
+from photonfarm.trainer.runs.devices import choose_preset, describe_device, round_convolutions, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.loop import train
@@ -19,6 +19,13 @@ def test_without_a_name_it_is_cuda_where_there_is_one() -> None:
     assert TrainSettings().device == "auto"
     assert usable_device("auto").type == ("cuda" if HAS_CUDA else "cpu")
     assert describe_device(usable_device("cpu")) == "cpu"
+
+
+def test_the_preset_of_a_device_is_known_without_touching_a_card(monkeypatch: pytest.MonkeyPatch) -> None:
+    for there in (True, False):
+        monkeypatch.setattr(torch.cuda, "is_available", lambda there=there: there)
+        named = "auto", "cpu", "cuda", "cuda:99"
+        assert [choose_preset(device) for device in named] == ["card" if there else "small", "small", "card", "card"]
 
 
 def test_a_name_that_is_no_device_of_ours_is_refused_with_those_that_are() -> None:

@@ -15,11 +15,12 @@ if TYPE_CHECKING:
 def open_run(run: str | Path, store: str | Path = "store", device: str = "auto") -> OpenRun:
     """Load the network of a run folder, and from a store the scene that it was trained on.
 
-    The renderer uses the card if there is one, else the processor, as PHOTONFARM_DEVICE says, and the network the same
-    `device` unless another one is named.
+    The renderer uses the card if there is one, else the processor, as PHOTONFARM_DEVICE says. Unless a `device` is
+    named, the network uses the same, or the processor where torch cannot use that card.
 
     Raises StoreError for a folder without a checkpoint, and for a store without the scene; SpecError without the
-    renderer, and for a scene or a network that cannot be loaded.
+    renderer, for a scene or a network that cannot be loaded, and for a device that torch cannot use; BackendError where
+    Mitsuba does not work, or the scene's files are not on this machine.
     """
     from photonfarm.predict.opened_run import OpenRun
     from photonfarm.trainer.predictors.trained import TrainedRun

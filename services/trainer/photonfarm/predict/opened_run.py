@@ -21,7 +21,7 @@ from photonfarm.core.keys import make_key, seed_of, view_key
 from photonfarm.core.processes import can_render
 from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
-from photonfarm.farm.devices import AUTO, CPU, CUDA
+from photonfarm.farm.devices import AUTO, CPU
 from photonfarm.scene.modification import Modification, rebuild, rest
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import Store
@@ -61,8 +61,8 @@ class OpenRun:
         self._scene: LoadedScene = load_scene(locate(source.spec))
         torch.set_num_threads(run.settings.threads)
         self._run, self._needs, self._exposure = run, run.needs, self.spec.exposure
-        if device == AUTO:
-            device = CUDA if backend.device().card else CPU
+        if device == AUTO and backend.device().card is None:
+            device = CPU
         predictor = run.predictor(self.spec, (geometry, self._cloud), device)
         self._images, self._device = predictor.images, predictor.device
         self._apply(rest(self.spec))
@@ -115,9 +115,7 @@ class OpenRun:
 
     def _point_inputs(self, view: View) -> PointInputs:
         position, present = self._points
-        seen = present  # networks with guides sum over all points, seen or not
-        if not self._needs.guides:
-            seen = present & self._scene.sees([view], position)[0]
+        seen = present & self._scene.sees([view], position)[0] if self._run.sees_points else present
         return PointInputs(self._tensor(position), self._tensor(present), self._tensor(seen))
 
     def _photon_inputs(self, view: View, photons: Photons) -> PhotonInputs:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -60,11 +60,23 @@ class TransportPlan:
 
     @property
     def settings(self) -> SpecTables:
-        """The planned tables of the spec. What was measured on a card is for cards alone, but for `half_spp`."""
+        """The planned tables of the spec. What was measured on a card is for cards alone, but for `half_spp`.
+
+        What a spec does not say of cards they do as processors do. So where it says anything of cards all of it is
+        written: a plan for the one then changes nothing for the other.
+        """
         transport = self._transport
         if self.measurement.on_card:
-            transport = {"half_spp": transport.pop("half_spp"), "card": transport}
+            transport = {"half_spp": self.half_spp, "card": self._complete_card(self.candidate)}
+        elif self.spec.transport.card is not None:
+            on_card = self.spec.model_copy(update={"transport": self.spec.transport.on_card})
+            transport["card"] = self._complete_card(present_settings(on_card))
         return {"transport": transport, "photons": {"paths": self.photons.paths, "depth": self.photons.depth}}
+
+    def _complete_card(self, candidate: Candidate) -> dict[str, Any]:
+        """The spec's table for cards, with all settings of a candidate."""
+        card = self.spec.transport.card
+        return {**(card.model_dump(exclude_none=True) if card else {}), **asdict(candidate)}
 
     @property
     def _transport(self) -> dict[str, Any]:
@@ -193,7 +205,7 @@ def lines(plan: TransportPlan) -> list[str]:
         "",
         *([*table(plan, rows), "", *legend(plan), ""] if rows else []),
         f"{origin}; it holds for {f'cards ({m.device})' if m.on_card else 'processors'}: {m.views} views of "
-        f"{m.film.width} × {m.film.height} pixels, {m.spp} spp; {m.spent_s:.0f} s of CPU",
+        f"{m.film.width} × {m.film.height} pixels, {m.spp} spp; {m.spent_s:.0f} s{'' if m.on_card else ' of CPU'}",
     ]
 
 

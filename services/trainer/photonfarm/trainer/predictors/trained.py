@@ -24,7 +24,7 @@ from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import OidnQuality, ReadyDenoiser, TrainSettings
-from photonfarm.trainer.runs.user_code import name_in_errors
+from photonfarm.trainer.runs.user_code import is_own, name_in_errors
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -81,6 +81,15 @@ class TrainedRun:
         """The inputs of its network."""
         return find_kind(self.settings.network.architecture).needs
 
+    @property
+    def sees_points(self) -> bool:
+        """Whether its network reads which points a view sees; a class of the user's that has points may."""
+        needs, network = self.needs, self.settings.network
+        if is_own(network.architecture):
+            return needs.points
+        # those with guides sum over lit points, seen or not
+        return needs.points and not needs.guides and network.occlusion == "exact"
+
     def predictor(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud], device: str) -> DevicePredictor:
         """The network as a predictor on a device. SpecError if the device is not usable."""
         predict = make_network_predictor(self.network(spec, base).to(usable_device(device)).eval())
@@ -108,6 +117,11 @@ class ReadyPredictor:
     def needs(self) -> Needs:
         """The noisy colour, beside the buffers."""
         return Needs(points=False, kept=self.kept)
+
+    @property
+    def sees_points(self) -> bool:
+        """Whether it reads which points a view sees: it has none."""
+        return False
 
     def predictor(self, _spec: object, _base: object, device: str) -> DevicePredictor:
         """The predictor on a device, whatever the scene. Raises SpecError if a package is missing, or cannot use it."""

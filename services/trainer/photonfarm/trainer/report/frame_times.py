@@ -102,7 +102,7 @@ def measure_frame_costs(
 
 def count_points(runs: Sequence[TrainedRun]) -> int | None:
     """The most points whose visibility one of these networks needs; None for the whole cloud."""
-    used = [run.settings.network.points for run in runs if _sees_points(run)]
+    used = [run.settings.network.points for run in runs if run.sees_points]
     return None if None in used else max((points for points in used if points), default=None)
 
 
@@ -114,13 +114,8 @@ def assemble_frame_time(predictor: TrainedRun | ReadyPredictor, network: Seconds
             "render": costs.renders()[needs.kept] if needs.kept else None,
             "buffers": None if needs.guides else parts["buffers_s"],
             "guides": parts["guides_s"] if needs.guides else None,
-            "points": parts["points_s"] if _sees_points(predictor) else None,
+            "points": parts["points_s"] if predictor.sees_points else None,
             "photons": Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,
             "network": network,
         }
     )
-
-
-def _sees_points(predictor: TrainedRun | ReadyPredictor) -> bool:
-    projects = predictor.needs.points and not predictor.needs.guides  # lit points are summed over, seen or not
-    return projects and predictor.settings.network.occlusion == "exact"

@@ -53,7 +53,7 @@ def is_asynchronous(device: torch.device) -> bool:
 
 def choose_preset(device: str = AUTO) -> str:
     """The preset of settings for a device of this name: "card" where that is a card, "small" on a processor."""
-    return "card" if usable_device(device).type == "cuda" else "small"
+    return "card" if _is_card(device) else "small"
 
 
 def round_convolutions(device: torch.device, precision: Precision) -> None:
@@ -201,5 +201,9 @@ def _choose_own_device(device: str) -> str:
         raise SpecError(
             f"device = {device!r}: names one card, but {count_processes()} processes need one each; give cuda"
         )
-    on_cuda = device == "cuda" or (device == AUTO and torch.cuda.is_available())
-    return f"cuda:{os.environ['LOCAL_RANK']}" if on_cuda else device
+    return f"cuda:{os.environ['LOCAL_RANK']}" if _is_card(device) else device
+
+
+def _is_card(device: str) -> bool:
+    """Whether a device's name stands for a card here; none is touched, as that would take memory of it."""
+    return device.startswith("cuda") or (device == AUTO and torch.cuda.is_available())

@@ -86,7 +86,7 @@ def slurm(
     retry: bool,
     dry_run: bool,
     as_json: bool,
-    **options: Any,
+    **options: Any,  # the fields of `Asked`, by click's names
 ) -> None:
     """Plan samples of each SPEC, and render them by workers that SLURM runs as an array.
 
@@ -114,7 +114,7 @@ def slurm(
     from photonfarm.scene.plausibility import warnings
     from photonfarm.store import Store
 
-    planned = []
+    planned = []  # all scenes are planned first, without a queue, which is then filled once
     for spec in named:
         for warning in filter(None, (*warnings(spec), find_hold_out_warning(spec.spec, store, request))):
             click.echo(f"warning: {warning}", err=True)

@@ -31,7 +31,7 @@ class RefusedError(QueueError):
 
 @contextlib.contextmanager
 def redis_errors(what: str) -> Iterator[None]:
-    """Turn an error of Redis, which was `what`, into a QueueError; one that would come again into a RefusedError."""
+    """Turn an error of Redis while it was `what` ("asked") into a QueueError, or a RefusedError if it would recur."""
     try:
         yield
     except redis.RedisError as error:
@@ -60,6 +60,7 @@ def connect(url: str, *, only_s: float | None = None) -> Redis:
     shown = without_password(url)
     retry = RETRY if only_s is None else Retry(NoBackoff(), 0)
     try:
+        # redis://:a@b@host and redis://:a/b@host: a password that is not percent-encoded
         if url.count("@") > 1 or ("@" in url and "@" not in urlsplit(url).netloc):
             raise ValueError
         connection = Redis.from_url(
@@ -99,7 +100,7 @@ def without_password(url: str) -> str:
     """A URL for messages: without name, password and options, also where it is not a proper URL."""
     scheme, separator, rest = url.partition("://") if "://" in url else ("", "", url)
     before_options = rest.partition("?")[0]
-    if "@" in rest and "@" not in before_options:  # in a password with a ?, or in an option
+    if "@" in rest and "@" not in before_options:  # redis://:a?b@host, redis://host?password=a@b
         return f"{scheme}{separator}…"
     return f"{scheme}{separator}{before_options.rpartition('@')[2]}"
 

@@ -90,6 +90,7 @@ def sample_surface(geometry: Geometry, count: int, stream: Stream) -> tuple[NDAr
     first = np.concatenate([[0.0], np.cumsum(areas[order])])  # area before each triangle, in that order
     start = np.concatenate([[0], np.cumsum(np.bincount(geometry.face_shape, minlength=len(shape_area)))])
     u = first[start[shape]] + stream.uniform(count) * (first[start[shape + 1]] - first[start[shape]])
+    # u = 0 is found in the triangle before the shape's first, and rounding may pass its last
     place = np.clip(np.searchsorted(first[1:], u, side="left"), start[shape], start[shape + 1] - 1)
     return order[place].astype(np.uint32), _barycentric(stream.uniform(2, count))
 

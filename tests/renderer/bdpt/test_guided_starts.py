@@ -11,7 +11,7 @@ import pytest
 
 from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.guiding import grid, learning
-from photonfarm.renderer.bdpt.guiding.learning import DEFAULT_SHARE, LightGuide, estimate_gains
+from photonfarm.renderer.bdpt.guiding.learning import DEFAULT_SHARE, PathGuide, estimate_gains
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights, sample_emission
 from tests.stability.scenes import hard_scenes
@@ -96,7 +96,7 @@ def test_any_guide_leaves_the_mean(
     scene, spp, seeds = loaded(build), 64, range(12)
     counts = {"connections": connections, "light_ratio": light_ratio}
     plugin = mi.load_dict({**BDPT, **counts, "guided_light": True})
-    guide = LightGuide(at_random(Layout.of(len(scene.emitters()))), random_usefulness(seed=2))
+    guide = PathGuide(at_random(Layout.of(len(scene.emitters()))), random_usefulness(seed=2))
     images = [np.array(plugin.render(scene, seed=seed, spp=spp, guide=guide))[..., :3] for seed in seeds]
     assert_equal_means(np.stack(images), renders(scene, {**BDPT, **counts}, spp, range(100, 112)))
 
@@ -122,7 +122,7 @@ def test_equal_seeds_give_equal_images_and_guides() -> None:
 
 def test_a_guide_of_other_lights_is_refused() -> None:
     scene = loaded(hard_scenes.cornell)
-    guide = LightGuide(StartGuide.neutral(Layout.of(3)), None)
+    guide = PathGuide(StartGuide.neutral(Layout.of(3)), None)
     with pytest.raises(ValueError, match="learned with 3 lights, the scene has 1"):
         mi.load_dict({**BDPT, "guided_light": True}).render(scene, spp=1, guide=guide)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from photonfarm.renderer.bdpt.guiding.grid import Grid
-from photonfarm.renderer.bdpt.guiding.learning import LightGuide
+from photonfarm.renderer.bdpt.guiding.learning import PathGuide
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.usefulness import CELLS, LEAST, NORMALS, SIDE, cell_of, estimate_usefulness
 from tests.stability.scenes import hard_scenes
@@ -59,7 +59,7 @@ def test_no_cell_is_less_useful_than_the_least() -> None:
 @pytest.mark.parametrize("wrong", [np.full(CELLS, np.nan), np.zeros(CELLS), np.ones(2)], ids=["nan", "zero", "short"])
 def test_a_table_that_would_lose_light_is_refused(wrong: Any) -> None:
     with pytest.raises(ValueError, match=r"table of usefulness .* above 0"):
-        LightGuide.of(StartGuide.neutral(Layout.of(1)), wrong)
+        PathGuide.of(StartGuide.neutral(Layout.of(1)), wrong)
 
 
 # ------------------------------------------------ Images ------------------------------------------------
@@ -70,7 +70,7 @@ def test_useful_vertices_lower_the_error_behind_a_door() -> None:
     plugin = mi.load_dict(CONNECTED | {"record": True})
     learned = plugin.learn_guide(scene, scene.sensors()[0], 1)
     assert learned.usefulness_table is not None
-    without = LightGuide(learned.starts, None)
+    without = PathGuide(learned.starts, None)
     error = []
     for guide in (without, learned):
         images = np.array([np.array(plugin.render(scene, seed=seed, spp=16, guide=guide)) for seed in range(12)])
@@ -83,7 +83,7 @@ def test_useful_vertices_lower_the_error_behind_a_door() -> None:
 def test_an_image_hardly_depends_on_the_number_of_threads() -> None:
     scene = loaded(hard_scenes.cornell)
     plugin = mi.load_dict(CONNECTED)
-    guide = LightGuide.of(StartGuide.neutral(Layout.of(1)), np.random.default_rng(0).uniform(0.3, 3, CELLS))
+    guide = PathGuide.of(StartGuide.neutral(Layout.of(1)), np.random.default_rng(0).uniform(0.3, 3, CELLS))
     threads, images = dr.thread_count(), []
     try:
         for count in (1, 2):

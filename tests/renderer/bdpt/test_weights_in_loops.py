@@ -16,7 +16,7 @@ import pytest
 
 from photonfarm.renderer.bdpt import eye_paths, light_paths, weights
 from photonfarm.renderer.bdpt.camera import sample_sensor
-from photonfarm.renderer.bdpt.guiding.learning import LightGuide
+from photonfarm.renderer.bdpt.guiding.learning import PathGuide
 from photonfarm.renderer.bdpt.guiding.usefulness import Usefulness
 from photonfarm.renderer.bdpt.integrator import connection_count
 from photonfarm.renderer.bdpt.kept_vertices import KeptVertices
@@ -238,7 +238,7 @@ def test_weights_of_a_render_are_the_oracles(build: Any, guided: bool, recorder:
     lights, lens, guide, useful = read_lights(scene), Pinhole.of(scene), None, None
     bdpt = {"type": "bdpt", "max_depth": EDGES, "connections": CONNECTIONS, "light_ratio": LIGHT_RATIO, "rr_depth": 99}
     if guided:
-        guide = LightGuide(random_guide(lights.count, seed=4), random_usefulness(seed=5))
+        guide = PathGuide(random_guide(lights.count, seed=4), random_usefulness(seed=5))
         lights, useful = lights.guide_with(guide.starts, scene), Usefulness.over(scene, guide.usefulness_table)
     mi.load_dict(bdpt | {"guided_light": guided}).render(scene, seed=1, spp=SPP, guide=guide)
     counts = TechniqueCounts(connection_count(CONNECTIONS, EDGES, guided=guided), LIGHT_RATIO, useful)

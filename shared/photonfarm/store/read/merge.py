@@ -187,7 +187,7 @@ def merge_views(scene: SceneStore, query: Query, least: int = 1) -> Iterator[tup
     reader = SceneReader(scene.storage.where, scene.scene_id)
     complete = set(reader.refresh().tolist())
     rows = [row for row in SceneMatch(scene, query).rows.tolist() if row in complete]
-    views = {reader.view_row(row): row for row in reversed(rows)}
+    views = {reader.view_row(row): row for row in reversed(rows)}  # each view's first row stays
     for view_row, row in sorted(views.items()):
         if len(reader.rows_of_view(view_row)) < least:
             continue

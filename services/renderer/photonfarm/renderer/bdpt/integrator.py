@@ -14,7 +14,7 @@ from photonfarm.renderer.bdpt import randomness
 from photonfarm.renderer.bdpt.camera import ImageStack, Splat, Sums, check_sensor, primary_rays
 from photonfarm.renderer.bdpt.eye_paths import Connectable, trace_eye_paths
 from photonfarm.renderer.bdpt.guiding.grid import Grid, SparseLanes
-from photonfarm.renderer.bdpt.guiding.learning import Effort, LightGuide, learn
+from photonfarm.renderer.bdpt.guiding.learning import Effort, PathGuide, learn
 from photonfarm.renderer.bdpt.guiding.starts import Layout, StartGuide
 from photonfarm.renderer.bdpt.guiding.tally import Tally, Totals
 from photonfarm.renderer.bdpt.guiding.usefulness import SIDE, Usefulness
@@ -94,7 +94,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         spp: int = 0,
         develop: bool = True,
         evaluate: bool = True,
-        guide: LightGuide | None = None,
+        guide: PathGuide | None = None,
     ) -> mi.TensorXf:
         """The image [H, W, C] of linear radiance. Raises ValueError for scenes, sensors and films it cannot render.
 
@@ -121,7 +121,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         sensor: mi.Sensor,
         seeds: Sequence[int],
         spp: int,
-        guide: LightGuide | None = None,
+        guide: PathGuide | None = None,
         places: Places | None = None,
     ) -> mi.TensorXf:
         """Independent images, [K, H, W, 3], one for each seed; several small images share a launch.
@@ -146,7 +146,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         seed: int,
         places: Places | None = None,
         effort: Effort | None = None,
-    ) -> LightGuide | None:
+    ) -> PathGuide | None:
         """A guide to what a sensor sees, or sees from several ``places``, for light paths and for connections.
 
         It is learned from random numbers of its own, so images that are rendered with it stay independent of each
@@ -187,7 +187,7 @@ class BidirectionalPathTracer(mi.SamplingIntegrator):
         sensor: mi.Sensor,
         seeds: Sequence[int],
         spp: int,
-        guide: LightGuide | None,
+        guide: PathGuide | None,
         places: Places | None = None,
     ) -> ImageStack:
         self._check(scene, sensor)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from photonfarm.renderer.bdpt import randomness
-from photonfarm.renderer.bdpt.light_paths import LightState, PathOptions, first_state, scatter
+from photonfarm.renderer.bdpt.light_paths import LightState, first_state, scatter
 from photonfarm.renderer.bdpt.lights.emission import Lights, read_lights, sample_emission
 from photonfarm.renderer.bdpt.recording import Recorders, call_recorded, loop_once
 from photonfarm.renderer.bdpt.scenes import check_scene
@@ -55,21 +55,21 @@ def trace_photons(
     with dr.suspend_grad():
         lights = read_lights(scene)
         keys = randomness.image_keys([seed & 0xFFFFFFFF])
-        arguments = (lights, keys, dr.opaque(mi.UInt32, paths), dr.opaque(mi.Float, 0), paths, depth)
+        arguments = (lights, keys, dr.opaque(mi.UInt32, paths), paths, depth)
         out, bounce = call_recorded(recorders, trace, (paths, depth, lights.kinds), scene, None, *arguments)
     position, direction, normal, power = (np.ascontiguousarray(np.array(column).T, dtype=np.float32) for column in out)
     return TracedPhotons(position, direction, normal, power / np.float32(paths), np.array(bounce))
 
 
 def trace(
-    scene: mi.Scene, _: None, lights: Lights, keys: mi.UInt32, count: mi.UInt32, zero: mi.Float, paths: int, depth: int
+    scene: mi.Scene, _: None, lights: Lights, keys: mi.UInt32, path_count: mi.UInt32, paths: int, depth: int
 ) -> tuple[Columns, mi.Int32]:
-    """(columns, bounces) of all slots; ``count`` is ``paths`` and ``zero`` is 0, as data."""
+    """(columns, bounces) of all slots; ``path_count`` is ``paths`` as data, so that kernels do not depend on it."""
     slots = paths * depth
     sequence = randomness.stream(keys, randomness.PHOTONS)
     path = dr.arange(mi.UInt32, paths)
     rng = randomness.sampler(sequence + dr.zeros(mi.UInt32, paths), path)
-    start = sample_emission(lights, rng, path, count)
+    start = sample_emission(lights, rng, path, path_count)
     out = (
         dr.zeros(mi.Point3f, slots),
         dr.zeros(mi.Vector3f, slots),
@@ -77,19 +77,10 @@ def trace(
         dr.zeros(mi.Spectrum, slots),
     )
     bounce = dr.full(mi.Int32, -1, slots)
-    options = PathOptions(
-        max_depth=depth + 1,
-        rr_depth=depth + 1,
-        connections=0,
-        count=zero,
-        light_ratio=zero,
-        connects=False,
-        traces_light=False,
-    )
     loop_once(
         state=(first_state(scene, lights, start, rng),),
         cond=lambda s: s.active,
-        body=partial(_hit, scene=scene, options=options, out=out, bounce=bounce, paths=count),
+        body=partial(_hit, scene=scene, depth=depth, out=out, bounce=bounce, path_count=path_count),
         labels=("photon",),
         label="photons",
     )
@@ -98,17 +89,17 @@ def trace(
 
 
 def _hit(
-    s: LightState, *, scene: mi.Scene, options: PathOptions, out: Columns, bounce: mi.Int32, paths: mi.UInt32
+    s: LightState, *, scene: mi.Scene, depth: int, out: Columns, bounce: mi.Int32, path_count: mi.UInt32
 ) -> tuple[LightState]:
     """One vertex of a light path: write it into its slot, scatter."""
     si = s.hit.compute_surface_interaction(s.ray, mi.RayFlags.All, s.active)
     cos_in = dr.abs(dr.dot(si.n, s.ray.d))
     active = s.active & (cos_in > 0)
-    slot = (s.depth - 1) * paths + dr.arange(mi.UInt32, dr.width(s.active))
+    slot = (s.depth - 1) * path_count + dr.arange(mi.UInt32, dr.width(s.active))
     for column, value in zip(out, (si.p, s.ray.d, si.n, s.throughput), strict=True):
         dr.scatter(column, value, slot, active)
     dr.scatter(bounce, mi.Int32(s.depth) - 1, slot, active)
-    state = replace(s, active=active & (s.depth + 1 < options.max_depth), depth=s.depth + 1)
+    state = replace(s, active=active & (s.depth < depth), depth=s.depth + 1)
     scatter(state, si, si.bsdf(), cos_in)
     state.hit = scene.ray_intersect_preliminary(state.ray, active=state.active)
     state.active &= state.hit.is_valid()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from shlex import quote
@@ -43,6 +42,7 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
     What the file says and photonfarm cannot render is said. Where the picture would differ for it, nothing is written,
     unless --accept names it.
     """
+    from photonfarm.cli import show
     from photonfarm.renderer.scene import backend
 
     backend.load(threads=1)
@@ -50,7 +50,7 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
 
     made = import_scene(path, out, None if up is None else AXES[up], partial(click.echo, err=True), accept)
     if as_json:
-        click.echo(json.dumps(made.document(), indent=1))
+        show.print_json(made.document())
         return
     for line in (*map(str, made.changes), *made.found):
         click.echo(line)
@@ -81,16 +81,16 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
 
     named = NamedSpec.load(spec)
     backend.load()
-    from photonfarm.renderer.tools.check import scene_check as checking
+    from photonfarm.renderer.tools.check.scene_check import check, write
 
-    check, lines = checking.check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
-    checking.write(check, lines, out)
+    made, lines = check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
+    write(made, lines, out)
     if as_json:
-        show.print_json([finding.document(lines) for finding in check.findings])
+        show.print_json([finding.document(lines) for finding in made.findings])
         return
-    for finding in check.findings:
+    for finding in made.findings:
         click.echo(f"{'warning' if finding.serious else 'note'}: {finding.line(lines)}")
-    click.echo(f"{out}: {len(check.findings) or 'no'} finding{'' if len(check.findings) == 1 else 's'}")
+    click.echo(f"{out}: {len(made.findings) or 'no'} finding{'' if len(made.findings) == 1 else 's'}")
 
 
 @click.command()

@@ -20,13 +20,17 @@ from photonfarm.scene.view import View, sample_view
 
 if TYPE_CHECKING:
     from photonfarm.renderer.scene.surroundings import Surroundings
+    from photonfarm.renderer.scene.view_rays import Take
 
+
+Lit = tuple[F32, F32]
+"""Positions and normals (L, 3) of the points whose irradiance is required."""
 
 GUIDE_VIEWS = 4
-"""The views that a guide of light paths is learned from."""
+"""The views that a path guide is learned from."""
 
 GUIDED_SAMPLES = 16
-"""The samples that such a guide is learned for, where there is a single configuration; else 1."""
+"""The samples that share the cost of a path guide where nothing moves; else 1, as each configuration learns its own."""
 
 
 class LoadedScene:
@@ -47,7 +51,7 @@ class LoadedScene:
         from photonfarm.renderer.scene.materials import Materials
         from photonfarm.renderer.scene.surroundings import boxes_of
 
-        self.spec = spec = backend.for_this_device(spec)
+        self.spec = spec = backend.for_this_device(spec)  # a card may have its own strategy: `transport.card`
         self.scene = scene
         self._sensor = AimedSensor(spec)
         paths_at_once = paths_at_once or backend.paths_at_once()
@@ -61,8 +65,9 @@ class LoadedScene:
         self._groups = [MovableGroup(_find_shapes(by_id, shape_ids(group), group.name)) for group in spec.groups]
         self.boxes = boxes_of(shapes)
         self.still = np.array([shape.id() not in self._group_of for shape in shapes], np.bool_)
+        # The corner that removed groups are parked in: see `editing`
         self._parking = self.boxes[self.still if self.still.any() else slice(None), 0].min(axis=0)
-        self._light_guides: dict[Any, Any] = {}  # by integrator, of the present configuration
+        self._path_guides: dict[Any, Any] = {}  # by integrator, of the present configuration
         self._distant = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         self._state = rest(spec)
 
@@ -110,7 +115,7 @@ class LoadedScene:
 
         They have the spec's `half_spp` samples per pixel unless it is given.
         """
-        spp, guide = half_spp or self.spec.transport.half_spp, self._guide(self._integrator)
+        spp, guide = half_spp or self.spec.transport.half_spp, self._learn_path_guide(self._integrator)
         sensor = self._sensor.aim(view)
         return np.array(self._integrator.render_seeds(self.scene, sensor, seeds, spp, guide), np.float32)
 
@@ -121,7 +126,7 @@ class LoadedScene:
         """
         places = np.stack([self._sensor.place(view) for view in views])
         sensor, spp = self._sensor.at_origin, self.spec.transport.half_spp
-        guide = self._guide(self._integrator)
+        guide = self._learn_path_guide(self._integrator)
         return np.array(self._integrator.render_seeds(self.scene, sensor, seeds, spp, guide, places), np.float32)
 
     def render_half(self, view: View, seed: int) -> F32:
@@ -134,7 +139,7 @@ class LoadedScene:
         import mitsuba as mi
 
         integrator = integrator or self._integrator
-        guide = self._guide(integrator)
+        guide = self._learn_path_guide(integrator)
         image = integrator.render(
             self.scene,
             sensor=self._sensor.aim(view),
@@ -144,8 +149,8 @@ class LoadedScene:
         )
         return np.array(image, np.float32)
 
-    def _guide(self, integrator: Any) -> Any:
-        """The guide of light paths in the present configuration, learned once; None for an integrator without one.
+    def _learn_path_guide(self, integrator: Any) -> Any:
+        """The path guide of the present configuration, learned once; None for an integrator without one.
 
         It follows from the configuration's content key alone: it is learned from a few views that are drawn as those of
         samples are. So both halves of a sample, every view and every worker have the same guide, and none of them
@@ -155,7 +160,7 @@ class LoadedScene:
 
         if not getattr(integrator, "guided_light", False):
             return None
-        if integrator not in self._light_guides:
+        if integrator not in self._path_guides:
             spec, key = self.spec, self._state.key(self.spec.radiance_id)
             seed = seed_of(key, "guide of light paths")
             views = [sample_view(spec, key, seed, i, self._state) for i in range(GUIDE_VIEWS)]
@@ -164,35 +169,35 @@ class LoadedScene:
             eye_paths = 2 * spec.film.width * spec.film.height * spec.transport.half_spp * samples
             effort = Effort.for_image(eye_paths, integrator.light_ratio, integrator.connections)
             guide = integrator.learn_guide(self.scene, self._sensor.at_origin, seed, places, effort)
-            self._light_guides[integrator] = guide
-        return self._light_guides[integrator]
+            self._path_guides[integrator] = guide
+        return self._path_guides[integrator]
 
     def forget_path_guides(self) -> None:
-        """Learn the guides of light paths anew, as for another configuration."""
-        self._light_guides.clear()
+        """Learn path guides anew, as for another configuration."""
+        self._path_guides.clear()
 
-    def buffers(self, view: View, **taken: Any) -> ViewBuffers:
-        """The depth, albedo and normal buffers of a view in the present configuration; `taken` as for `inputs`."""
+    def buffers(self, view: View, take: Take | None = None) -> ViewBuffers:
+        """The depth, albedo and normal buffers of a view in the present configuration; `take` as for `inputs`."""
         from photonfarm.renderer.scene.gbuffer import view_buffers
+        from photonfarm.renderer.scene.view_rays import take_numpy
 
-        return view_buffers(self.scene, [view], self.spec, self._recorders, **taken)[0]
+        return view_buffers(self.scene, [view], self.spec, self._recorders, take or take_numpy)[0]
 
     def inputs(
-        self, views: Sequence[View], keys: Sequence[Key], wanted: GuideSpec, lit: tuple[F32, F32], **taken: Any
+        self, views: Sequence[View], keys: Sequence[Key], wanted: GuideSpec, lit: Lit, take: Take | None = None
     ) -> list[tuple[ViewBuffers, Guides]]:
         """The buffers and the guides of views in the present configuration, whose seeds follow from the views' `keys`.
 
-        `lit` are positions and normals (L, 3) of the points whose irradiance is required. With `take`, a function of
-        values of Dr.Jit, images are what it makes of them, otherwise arrays of numpy.
+        `take` makes images of values of Dr.Jit, by default arrays of numpy. Albedo comes from the guides' rays.
         """
         from photonfarm.renderer.scene.gbuffer import with_albedo
         from photonfarm.renderer.scene.guides import view_guides
+        from photonfarm.renderer.scene.view_rays import take_numpy
 
+        take = take or take_numpy
         of_scene, recorders = (self.scene, views, self.spec), self._recorders
-        albedo, guides = zip(
-            *view_guides(*of_scene, wanted, keys, self._materials, lit, recorders, **taken), strict=True
-        )
-        return list(zip(with_albedo(*of_scene, albedo, recorders, **taken), guides, strict=True))
+        albedo, guides = zip(*view_guides(*of_scene, wanted, keys, self._materials, lit, recorders, take), strict=True)
+        return list(zip(with_albedo(*of_scene, albedo, recorders, take), guides, strict=True))
 
     def sees(self, views: Sequence[View], position: F32) -> NDArray[np.bool_]:
         """Whether each view sees points (P, 3) of the present configuration, (K, P)."""

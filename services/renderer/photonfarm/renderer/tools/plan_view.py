@@ -41,12 +41,12 @@ class Standing:
         """Where a group stands, or where it was modelled."""
         group, place = spec.groups[i], None
         if modification is None or modification.present[i]:
-            place = said(np.array(group.at) + (0 if modification is None else modification.translation[i]))
+            place = format_point(np.array(group.at) + (0 if modification is None else modification.translation[i]))
         return cls(i + 1, group.name, i >= len(spec.objects), place)
 
 
-def said(point: NDArray[np.floating]) -> str:
-    """A point in words."""
+def format_point(point: NDArray[np.floating]) -> str:
+    """A point as text, such as (1, 0.5, 2)."""
     return f"({', '.join(f'{value:.3g}' for value in np.where(np.abs(point) < 1e-6, 0, point))})"
 
 

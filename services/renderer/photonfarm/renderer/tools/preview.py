@@ -12,7 +12,7 @@ from photonfarm.core import pictures
 from photonfarm.core.page import render_page, write_page
 from photonfarm.core.pictures import Picture
 from photonfarm.core.records import Geometry, Photons
-from photonfarm.renderer.tools.plan_view import PlanView, Standing, hue, said
+from photonfarm.renderer.tools.plan_view import PlanView, Standing, format_point, hue
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera
 from photonfarm.store.read.batch import Sample
@@ -34,7 +34,7 @@ class SheetRow:
 
     number: int  # its row in the store
     camera: str
-    plan: Markup
+    floor_plan: Markup
     standing: list[Standing]
     panels: list[tuple[str, Picture]]  # by COLUMNS
 
@@ -44,17 +44,17 @@ def contact_sheet(reader: SceneReader, count: int) -> str:
     reader.refresh()
     shown = reader.rows[np.unique(np.linspace(0, len(reader.rows) - 1, min(count, len(reader.rows))).astype(np.int64))]
     spec = reader.spec
-    plan = PlanView.of(spec, reader.base()[0] if reader.ready() else NO_GEOMETRY)
+    floor_plan = PlanView.of(spec, reader.base()[0] if reader.ready() else NO_GEOMETRY)
     return render_page(
         TEMPLATE,
         title=f"photonfarm: {spec.name}",
         spec=spec,
         complete=len(reader.rows),
         hues=[hue(i) for i in range(len(spec.groups))],
-        shell=plan.shell(),
-        places=plan.places("where objects and cameras may stand, from above"),
+        shell=floor_plan.shell(),
+        places=floor_plan.places("where objects and cameras may stand, from above"),
         groups=[(Standing.of(spec, i), group) for i, group in enumerate(spec.groups)],
-        rows=[_row(reader, plan, int(row)) for row in shown],
+        rows=[_row(reader, floor_plan, int(row)) for row in shown],
     )
 
 
@@ -63,7 +63,7 @@ def write_contact_sheet(reader: SceneReader, count: int, out: Path) -> None:
     write_page(out, contact_sheet(reader, count))
 
 
-def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:
+def _row(reader: SceneReader, floor_plan: PlanView, row: int) -> SheetRow:
     sample, spec = reader.read(row), reader.spec
     a, b = (pictures.display(half, spec.exposure) for half in sample.radiance)
     panels = (
@@ -76,8 +76,8 @@ def _row(reader: SceneReader, plan: PlanView, row: int) -> SheetRow:
     )
     return SheetRow(
         row,
-        f"camera at {said(sample.view.origin)}, looking at {said(sample.view.target)}",
-        plan.configuration(sample.modification, [sample.view]),
+        f"camera at {format_point(sample.view.origin)}, looking at {format_point(sample.view.target)}",
+        floor_plan.configuration(sample.modification, [sample.view]),
         [Standing.of(spec, i, sample.modification) for i in range(len(spec.groups))],
         list(zip(COLUMNS, panels, strict=True)),
     )
@@ -92,5 +92,6 @@ def photon_picture(sample: Sample, photons: Photons | None, spec: SceneSpec) -> 
         scale = camera.focal_px / (offset @ camera.forward)
         u = np.floor(scale * (offset @ camera.right) + camera.width / 2).clip(0, camera.width - 1).astype(int)
         v = np.floor(scale * (offset @ camera.down) + camera.height / 2).clip(0, camera.height - 1).astype(int)
+        # Its hue alone, as powers differ by orders of magnitude; of two photons in a pixel the last is drawn
         canvas[v, u] = power / np.maximum(power.max(axis=1, keepdims=True), 1e-30)
     return pictures.draw_albedo(canvas)

@@ -17,8 +17,11 @@ So a job that is nearly done is kept, and the worker ends within the 10 s that D
 it has no marker, it is rendered again.
 """
 
-RECYCLED, REFUSED = 75, 76
-"""The exit codes of a child that wants to be replaced by a new one, and of one whose Redis would refuse that one too"""
+RECYCLED = 75
+"""The exit code of a child that is worn out, or was stopped alone: its supervisor starts a new one at once."""
+
+REFUSED = 76
+"""The exit code of a child whose Redis refuses it, and would refuse any other: its supervisor ends."""
 
 JOB_IN_HAND, JOB_ENDED = "job in hand: ", "job ended: "
 """How lines begin in which a child reports the job that it begins, by its name, and how it has ended.
@@ -38,10 +41,10 @@ class WorkerSettings(Frozen):
     store: str
     redis_url: Annotated[str | None, Field(repr=False)] = None  # None: only with a share
     share: Share | None = None  # of the jobs, taken from the store alone; None: jobs come from Redis
-    scene_ids: tuple[str, ...] = ()  # the only scenes of a share; none: all scenes of the store, or `scene_id`
+    scene_ids: tuple[str, ...] = ()  # the only scenes of a share; none: all of the store; not beside `scene_id`
     name: Annotated[str, Field(min_length=1, max_length=128)]
     until_complete: bool = False
-    scene_id: str | None = None  # the only scene to queue jobs of and to wait for; None: all scenes of the store
+    scene_id: str | None = None  # the only scene to queue jobs of and to wait for; None: all; not beside `scene_ids`
     quiet: bool = False  # log only problems
     max_jobs: Count = 500  # after so many a new child starts, which bounds memory leaks and takes < 1 % of the time
     max_rss_bytes: Count = 8 << 30  # a CPU worker needs about 1 GB; GPU contexts some more

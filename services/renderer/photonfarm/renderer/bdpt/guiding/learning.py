@@ -93,8 +93,8 @@ class Effort:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class LightGuide:
-    """What was learned for the light paths of a scene."""
+class PathGuide:
+    """What was learned of a scene: where light paths should start, and how useful their vertices are to connect to."""
 
     starts: StartGuide
     usefulness_table: mi.Float | None  # of a `Usefulness`; None without connections
@@ -105,7 +105,7 @@ class LightGuide:
         return cls(starts, None if table is None else table_of(table, CELLS, "table of usefulness"))
 
 
-def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Totals, lanes: SparseLanes) -> LightGuide:
+def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Totals, lanes: SparseLanes) -> PathGuide:
     """The guide that the images and the totals of a launch suggest, given default probabilities of lights [N]."""
     side = tiles_per_side(lanes.images)
     weight = _weights(images.radiance, lanes, side)
@@ -122,7 +122,7 @@ def learn(layout: Layout, probability: mi.Float, images: ImageStack, totals: Tot
     splats, joined = read(weigh(splat_squares), weigh(connection_squares))
     gain = estimate_gains(layout, splats, float(joined.sum()), *read(started, edges, probability))
     table = estimate_usefulness(joined, *read(connections)) if lanes.has_connections else None
-    return LightGuide.of(StartGuide.of(layout, gain), table)
+    return PathGuide.of(StartGuide.of(layout, gain), table)
 
 
 def _weights(radiance: mi.Spectrum, lanes: SparseLanes, side: int) -> mi.Float:

@@ -21,20 +21,20 @@ _MOST_PADDING = 8192  # texels by which an image grows where it is clamped along
 
 
 @dataclass(frozen=True, slots=True)
-class Lie:
-    """How an image lies on a surface."""
+class UvTransform:
+    """Which place of an image each point of a surface shows, and how the image goes on beyond its edges."""
 
-    rows: tuple[tuple[float, ...], ...] = ((1, 0, 0), (0, 1, 0))  # its coordinates by u, v and 1 of the mesh
+    rows: tuple[tuple[float, ...], ...] = ((1, 0, 0), (0, 1, 0))  # the image's coordinates by u, v and 1 of the mesh
     wraps: tuple[str, str] = ("repeat", "repeat")  # along each of its axes
     nearest: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Map:
-    """A property of a surface (H, W, C), linear or raw; without a lie it is the same everywhere, (1, 1, C)."""
+    """A property of a surface (H, W, C), linear or raw; without a transform it is the same everywhere, (1, 1, C)."""
 
     values: images.Image
-    lie: Lie | None = None
+    transform: UvTransform | None = None
     file: Path | None = None  # an image that Mitsuba reads as it is; the values are its own, or not decoded: (0, 0, C)
 
 
@@ -62,37 +62,37 @@ class Writer:
 
     def put(self, parent: Element, name: str, part: Map, kind: Literal["raw", "colour", "light"] = "raw") -> None:
         """Add a number, a colour or an image."""
-        if part.lie is None:
+        if part.transform is None:
             numbers = part.values.ravel().tolist()
             elements.put_value(parent, name, numbers if len(numbers) > 1 else numbers[0])
             return
-        (values, lie), file = self._wrap(part.values, part.lie), part.file
+        (values, transform), file = self._wrap(part.values, part.transform), part.file
         if file is None and kind == "light":
             file = images.save_radiance(values, self.stem.with_name(f"{self.stem.name}_{name}.exr"))
         elif file is None:
             stored = images.encode(values) if kind == "colour" else values.clip(0, 1)
             file = images.save(stored, self.stem.with_name(f"{self.stem.name}_{name}.png"))
         bitmap = elements.put_bitmap(parent, name, file, raw=kind != "colour")
-        if lie.nearest:
+        if transform.nearest:
             elements.put_value(bitmap, "filter_type", "nearest")
-        if lie.wraps[0] != "repeat":
-            elements.put_value(bitmap, "wrap_mode", lie.wraps[0])
-        if lie.rows != Lie().rows:
-            rows = [(a, b, 0, c) for a, b, c in lie.rows]
+        if transform.wraps[0] != "repeat":
+            elements.put_value(bitmap, "wrap_mode", transform.wraps[0])
+        if transform.rows != UvTransform().rows:
+            rows = [(a, b, 0, c) for a, b, c in transform.rows]
             elements.put_matrix(bitmap, "to_uv", [*rows, (0, 0, 1, 0), (0, 0, 0, 1)])
 
-    def _wrap(self, values: images.Image, lie: Lie) -> tuple[images.Image, Lie]:
+    def _wrap(self, values: images.Image, transform: UvTransform) -> tuple[images.Image, UvTransform]:
         """An image that goes on in one way along both axes, as Mitsuba's do.
 
         Clamped along one axis it gets a border as wide as its coordinates reach; mirrored, its mirror image beside it.
         """
-        if lie.wraps[0] == lie.wraps[1]:
-            return values, lie
-        axis = lie.wraps.index("clamp" if "clamp" in lie.wraps else "mirror")
+        if transform.wraps[0] == transform.wraps[1]:
+            return values, transform
+        axis = transform.wraps.index("clamp" if "clamp" in transform.wraps else "mirror")
         size, left = values.shape[1 - axis], 0
         texels = np.r_[0:size, size - 1 : -1 : -1]
-        a, b, c = lie.rows[axis]
-        if lie.wraps[axis] == "clamp":
+        a, b, c = transform.rows[axis]
+        if transform.wraps[axis] == "clamp":
             ends = [size * (a * u + b * v + c) for u in self.reach[0] for v in self.reach[1]]
             over = np.array([-min(ends), max(ends) - size]).clip(0)
             if over.max() > _MOST_PADDING:
@@ -100,20 +100,22 @@ class Writer:
                 self.lose(("wrapS", "wrapT")[axis], meaning)
             left, right = (np.ceil(over.clip(max=_MOST_PADDING)) + 1).astype(int).tolist()
             texels = np.arange(-left, size + right)
-        rows, other, scale = list(lie.rows), lie.wraps[1 - axis], size / len(texels)
+        rows, other, scale = list(transform.rows), transform.wraps[1 - axis], size / len(texels)
         rows[axis] = (scale * a, scale * b, scale * c + left / len(texels))
         values = np.take(values, texels.clip(0, size - 1), axis=1 - axis)
-        return values, replace(lie, rows=tuple(rows), wraps=(other, other))
+        return values, replace(transform, rows=tuple(rows), wraps=(other, other))
 
-    def join(self, one: Map, other: Map, effect: Effect, name: str) -> tuple[images.Image, images.Image, Lie | None]:
+    def join(
+        self, one: Map, other: Map, effect: Effect, name: str
+    ) -> tuple[images.Image, images.Image, UvTransform | None]:
         """The values of two properties at the same texels, and how these lie; the mean of what lies differently."""
-        if one.lie and other.lie and one.lie != other.lie:
+        if one.transform and other.transform and one.transform != other.transform:
             meaning = "lies unlike the image that it is joined with, whose mean is taken"
             self.changes.lose(effect, name, meaning, self.place)
             other = Map(other.values.mean(axis=(0, 1), keepdims=True))
         size = np.maximum(one.values.shape[:2], other.values.shape[:2])  # each is stretched to it
         texels = [np.ix_(*(np.arange(size[i]) * of.values.shape[i] // size[i] for i in (0, 1))) for of in (one, other)]
-        return one.values[texels[0]], other.values[texels[1]], one.lie or other.lie
+        return one.values[texels[0]], other.values[texels[1]], one.transform or other.transform
 
     def put_layers(self, top: Element, opacity: Map | None, normals: Map | None, *, passes: bool = False) -> Element:
         """Put what lies above a material; the place of the material, two-sided unless it `passes` light."""
@@ -136,7 +138,7 @@ class Writer:
         With `from_flat`, as Blender reads MTL, normals go so far from the flat (0, 0, 1) to those of the map. Mitsuba's
         frame is right-handed where images lie mirrored, too, so y is turned over there.
         """
-        (a, b, _), (c, d, _) = (part.lie or Lie()).rows
+        (a, b, _), (c, d, _) = (part.transform or UvTransform()).rows
         if b or c or min(a, d) < 0:
             self.note("turns or mirrors the image, and not the directions in it", name)
         if strength == 1 and not mirrored:
@@ -144,7 +146,7 @@ class Writer:
         vectors = (2 * part.values - 1) * np.array([strength, -strength if mirrored else strength, 1], np.float32)
         if from_flat:
             vectors[..., 2] = 1 + strength * (vectors[..., 2] - 1)
-        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.lie)
+        return Map(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True) / 2 + np.float32(0.5), part.transform)
 
     def put_surface(self, place: Element, plugin: str, parts: Mapping[str, Map], *, painted: bool = False) -> None:
         """Put a material by its properties; that of a `painted` mesh has the colours of its vertices."""
@@ -159,8 +161,8 @@ class Writer:
     def light(self, glow: Map, opacity: Map | None, name: str) -> Element | None:
         """What a surface emits, if anything: Mitsuba's lights shine where their material lets light through."""
         if opacity is not None and glow.values.any():
-            values, alpha, lie = self.join(glow, opacity, "light", name)
-            glow = Map(values * alpha, lie)
+            values, alpha, transform = self.join(glow, opacity, "light", name)
+            glow = Map(values * alpha, transform)
         if glow.values.max() <= 0:
             return None
         emitter = Element("emitter", type="area")

@@ -18,7 +18,7 @@ import numpy as np
 from photonfarm.renderer.tools.importing import images
 from photonfarm.renderer.tools.importing.imported import Floats, ImportedScene
 from photonfarm.renderer.tools.importing.readers.gltf_file import GltfFile, Node, extension, numbers
-from photonfarm.renderer.tools.importing.surfaces import Lie, Map, Writer, constant
+from photonfarm.renderer.tools.importing.surfaces import Map, UvTransform, Writer, constant
 
 _OLD = "KHR_materials_pbrSpecularGlossiness"
 _PASSES, _COAT, _SPECULAR = "KHR_materials_transmission", "KHR_materials_clearcoat", "KHR_materials_specular"
@@ -128,7 +128,7 @@ class Materials:
             return constant(*factor)
         if colour:
             image = np.dstack([images.linear(image[..., :3]), image[..., 3:]])
-        return Map(image[..., channels] * np.array(factor, np.float32), self._lie(node))
+        return Map(image[..., channels] * np.array(factor, np.float32), self._read_uv_transform(node))
 
     def _image(self, node: Node, colour: bool) -> images.Image | None:
         """The pixels of a texture: of the image that all programs read, or else of a format that is read here."""
@@ -150,21 +150,21 @@ class Materials:
             self._last = {(source, colour): images.decode(data, f"{self.file.path}: image {source}", raw=not colour)}
         return self._last[source, colour]
 
-    def _lie(self, node: Node) -> Lie:
+    def _read_uv_transform(self, node: Node) -> UvTransform:
         number, moved = self.file.entry("textures", node["index"]).get("sampler"), extension(node, _TRANSFORM)
         sampler = {} if number is None else self.file.entry("samplers", number)
         (u, v), (su, sv) = moved.get("offset", (0, 0)), moved.get("scale", (1, 1))
         c, s = math.cos(moved.get("rotation", 0.0)), math.sin(moved.get("rotation", 0.0))
         wraps = [_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT")]
         rows = ((c * su, s * sv, u), (-s * su, c * sv, v))
-        return Lie(rows, (wraps[0], wraps[1]), sampler.get("magFilter") == _NEAREST)
+        return UvTransform(rows, (wraps[0], wraps[1]), sampler.get("magFilter") == _NEAREST)
 
     def _normals(self, entry: Node, look: Look, writer: Writer) -> Map | None:
         """A normal map of its strength."""
         node = entry.get("normalTexture")
         strength = node.get("scale", 1.0) if node else 1.0
         part = self._map(node, [strength and 1.0] * 3, _RGB)  # of strength 0, no image is read
-        return writer.normals(part, strength, _TRANSFORM, mirrored=look.mirrored) if part.lie else None
+        return writer.normals(part, strength, _TRANSFORM, mirrored=look.mirrored) if part.transform else None
 
     def _surface(self, entry: Node, colour: Map, painted: bool, writer: Writer) -> tuple[str, dict[str, Map]]:
         """The plugin that is nearest to a material, and its properties."""
@@ -180,7 +180,7 @@ class Materials:
             writer.lose(_PASSES, "what is thin, and metal in part, refracts as what is solid")
         elif passes:
             whole = parts["spec_trans"].values.min() >= 1 and parts["roughness"].values.max() + metal.max() <= 0
-            clear = whole and not painted and all(part.lie is None for part in parts.values())
+            clear = whole and not painted and all(part.transform is None for part in parts.values())
             if coated and (clear or not thick):
                 writer.lose(_COAT, "glass has no coat of its own")
             if clear:
@@ -218,11 +218,11 @@ class Materials:
         """The properties of `principled` for specular-glossiness, texel by texel."""
         factor = (*numbers(old, "specularFactor", _WHITE[:3]), old.get("glossinessFactor", 1.0))
         specular = self._map(old.get("specularGlossinessTexture"), factor, _RGBA, colour=True)
-        diffuse, gloss, lie = writer.join(colour, specular, "colour", _OLD)
+        diffuse, gloss, transform = writer.join(colour, specular, "colour", _OLD)
         base, metal = convert_specular_glossiness(diffuse[..., _RGB], gloss[..., _RGB])
         writer.note("becomes metal and roughness by Khronos' formulas", _OLD)
         rough = replace(specular, values=1 - specular.values[..., _ALPHA])
-        return {"base_color": Map(base, lie), "roughness": rough, "metallic": Map(metal, lie)}
+        return {"base_color": Map(base, transform), "roughness": rough, "metallic": Map(metal, transform)}
 
 
 def _opacity(entry: Node, colour: Map) -> Map | None:

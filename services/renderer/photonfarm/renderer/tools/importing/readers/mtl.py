@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
 from xml.etree.ElementTree import Element
 
 import numpy as np
@@ -16,7 +17,7 @@ from PIL import Image as Pillow
 from photonfarm.core.errors import SpecError
 from photonfarm.renderer.tools.importing import images
 from photonfarm.renderer.tools.importing.changes import Changes, Effect
-from photonfarm.renderer.tools.importing.surfaces import Lie, Map, Writer, constant
+from photonfarm.renderer.tools.importing.surfaces import Map, UvTransform, Writer, constant
 
 _CARRIED = re.compile(
     "(map_)?(kd|ke|d|pr|pm|ps|pc|aniso)|k[as]|n[si]|tr|tf|illum|sharpness|map_aat|pcr|anisor|norm|(map_)?bump"
@@ -41,23 +42,27 @@ A number ends at a space, as names of images may begin with digits.
 """
 
 _CARRIED_OPTION = re.compile(
-    r"(o|s|bm) [-+.\de ]*"  # carried over, with numbers
-    r"|(clamp|blendu|blendv|boost|texres) .*"  # carried over, or about filters
-    r"|(?!(o|s|bm) )\w+ (off|[0. ]*)"  # any other that changes nothing: off, or 0
-    r"|mm [0.]+ 1[0.]*"  # a base of 0 and a gain of 1
+    r"(o|s|bm) [-+.\de ]*"  # `s 2 2 1`: carried over, with numbers
+    r"|(clamp|blendu|blendv|boost|texres) .*"  # `clamp on`: carried over; `texres 512`: about filters
+    r"|(?!(o|s|bm) )\w+ (off|[0. ]*)"  # `cc off`, `t 0 0 0`: any other that changes nothing
+    r"|mm [0.]+ 1[0.]*"  # `mm 0 1.0`: a base of 0 and a gain of 1
 )
 """The options, as `name values`, that have their meaning here, or none by what they speak of or by their values."""
 
 _GLASS, _MIRRORS, _LIT = (4, 6, 7, 9), (3, 5, 8), range(1, 10)
 """The models of illumination that are glass, those that reflect the scene, and those of what light and shadows meet."""
 
-_Image = tuple[Path, Lie, float]  # a file, how it lies on a surface, and the strength of its bumps
+_Kind = Literal["opaque", "mask", "hidden", "clear glass"]  # how light passes through a material
+_Image = tuple[Path, UvTransform, float]  # a file, where a surface shows it, and the strength of its bumps
 
 WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
 _GREY = (0.7, 0.7, 0.7)  # the reflectance of what has no colour
+_LEAST_ETA = 1.01  # the least index of refraction of `principled`, and here of glass
+
+# These thresholds are ours; MTL has none
 _SMOOTH = 0.2  # gloss up to this α is Mitsuba's `roughplastic`, which loses light above; `principled` gains some
 _SHINES = 0.02  # gloss is modelled from this specular reflectance on
-_LEAST_ETA = 1.01  # the least index of refraction of `principled`, and here of glass
+_TINTED = 0.1  # by so much of their largest the channels of a specular colour differ
 
 
 def statements(file: Path) -> Iterator[tuple[int, str, str]]:
@@ -139,18 +144,33 @@ def _floats(options: Mapping[str, str], name: str) -> list[float]:
     return [float(word) for word in options.get(name, "").split() if word not in ("on", "off")]
 
 
-def _lie(options: Mapping[str, str]) -> Lie:
-    """How an image with options lies. MTL's v goes upwards, and Mitsuba's downwards."""
+def _read_uv_transform(options: Mapping[str, str]) -> UvTransform:
+    """Where a surface shows an image: MTL's s·v + o goes upwards, so that v downwards becomes 1 − (s·(1 − v) + o)."""
     (su, sv), (u, v) = [*_floats(options, "s"), 1.0, 1.0][:2], [*_floats(options, "o"), 0.0, 0.0][:2]
     wrap = "clamp" if options.get("clamp") == "on" else "repeat"
-    return Lie(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))
+    return UvTransform(((su, 0, u), (0, sv, 1 - sv - v)), (wrap, wrap))
 
 
 def _read_map(image: _Image, factor: Sequence[float]) -> Map:
     """An image's linear colours times a factor."""
-    file, lie, _ = image
+    file, transform, _ = image
     values = images.decode(file.read_bytes(), str(file))[..., :3]
-    return Map(images.linear(values) * np.array(factor, np.float32), lie)
+    return Map(images.linear(values) * np.array(factor, np.float32), transform)
+
+
+def _decide_kind(illum: float, opacity: float, *, is_textured: bool, may_hide: bool) -> _Kind:
+    """How light passes by `illum` and an opacity of `d` or 1 − `Tr`, which an image of opacities is multiplied with.
+
+    Clear glass would show neither images nor colours of vertices, with which a material `is_textured`. It `may_hide` if
+    an opacity of 0 is meant: exporters write `Tr 1`, or `d 0` of what shines or has images, for what is opaque.
+    """
+    if opacity == 1:
+        return "opaque"
+    if illum in _GLASS and not is_textured:
+        return "clear glass"
+    if opacity > 0:
+        return "mask"
+    return "hidden" if may_hide and not is_textured else "opaque"
 
 
 @dataclass(slots=True, eq=False)
@@ -179,17 +199,7 @@ class Material:
         self.changes.say(effect, name, meaning, f"material {self.name!r}")
 
     def put(self, top: Element, stem: Path) -> Element | None:
-        """Make a Mitsuba material of an empty element; the emitter of what shines with it.
-
-        Names of images that are changed begin with `stem`. By `illum` and opacity, which is `d` or 1 − `Tr`:
-
-            illum     is textured    opacity 1       below 1               0
-            glass     no             opaque, said    clear glass           clear glass
-            glass     yes            opaque, said    a mask of it, said    opaque, said
-            others    either         opaque          a mask of it          see `_dissolve`
-
-        Clear glass would show neither images nor colours of vertices.
-        """
+        """Make a Mitsuba material of an empty element, and images named from `stem` on; the emitter of what shines."""
         writer = Writer(stem, self.changes, f"material {self.name!r}")
         for key, (_, word, _) in self.lines.items():
             if not _CARRIED.fullmatch(key):
@@ -198,15 +208,16 @@ class Material:
         if illum not in _LIT:  # 10 is seen by its shadows alone
             meaning = f"is lit as by model {1 if illum == 0 else 2} here"
             self.say("colour" if illum == 10 else None, f"illum {illum:g}", meaning)
-        opacity, glow = self._opacity(illum), self._glow()
-        tint = self.cut("tf", WHITE) if opacity else WHITE
-        if illum in _GLASS and opacity and not self._is_textured:
+        kind, factor = self._decide_opacity(illum)
+        opacity, glow = self._opacity(factor), self._glow()
+        tint = self.cut("tf", WHITE, black_is_white=True) if opacity else WHITE
+        if kind == "clear glass":
             glass = {"int_ior": self._eta(_LEAST_ETA), "specular_transmittance": constant(*tint)}
             writer.put_surface(top, "thindielectric", glass)
             self.say(None, "illum", "becomes clear glass without a thickness, of Ni and Tf; Ke shines in full")
             return writer.light(glow, None, "map_Ke")
         if illum in _GLASS:
-            effect: Effect | None = None if {"d", "tr"} & set(self.lines) else "colour"  # many state d 1
+            effect: Effect | None = None if {"d", "tr"} & set(self.lines) else "colour"  # illum 4 with d 1 is common
             self.say(effect, f"illum {illum:g}", "is of glass, and is not here, by its d, Tr or images")
         if min(tint) < 1:
             self.say("colour", "Tf", "does not tint the light that passes through")
@@ -232,20 +243,23 @@ class Material:
     def _number(self, key: str, otherwise: float) -> float:
         return self._numbers(key, (otherwise,))[0]
 
-    def cut(self, key: str, otherwise: Sequence[float], most: float = 1.0, effect: Effect = "colour") -> list[float]:
-        """The numbers of a line from 0 to `most`, to which others are cut. Where `otherwise` is white, so is black."""
+    def cut(
+        self, key: str, otherwise: Sequence[float], *, black_is_white: bool = False, is_light: bool = False
+    ) -> list[float]:
+        """The numbers of a line, cut to 0 to 1, of light to ≥ 0; all 0 are 1 if `black_is_white`. Both are said."""
+        most = math.inf if is_light else 1.0
         values = self._numbers(key, otherwise)
         made: list[float] = np.clip(values, 0, most).tolist()
         if np.abs(np.subtract(made, values)).max() > 1e-3:  # more than rounding
-            bounds = "is below 0, and is cut to that" if most == math.inf else f"is cut to what lies in 0 to {most:g}"
-            self.say(effect, self.lines[key][1], bounds)
-        if tuple(otherwise) == WHITE and max(made) <= 0:
+            bounds = "is below 0, and is cut to that" if is_light else "is cut to what lies in 0 to 1"
+            self.say("light" if is_light else "colour", self.lines[key][1], bounds)
+        if black_is_white and max(made) <= 0:
             self.say(None, self.lines[key][1], "is black where black is not meant, and is taken for white")
             return list(WHITE)
         return made
 
     def image(self, key: str) -> _Image | None:
-        """The image of a line; None if it is not there, which is said."""
+        """The image of a line; None if it is not there, which is said: by each call, but `Changes` keeps it once."""
         line, word, rest = self.lines.get(key, (0, key, ""))
         if not rest:
             return None
@@ -260,7 +274,7 @@ class Material:
         for name, value in options.items():
             if not _CARRIED_OPTION.fullmatch(f"{name} {value}"):
                 self.say("colour", f"{word} -{name}", "is an option that is not carried over")
-        return file, _lie(options), [*_floats(options, "bm"), 1.0][0]
+        return file, _read_uv_transform(options), [*_floats(options, "bm"), 1.0][0]
 
     @property
     def _is_textured(self) -> bool:
@@ -269,34 +283,34 @@ class Material:
     def _glow(self) -> Map:
         """What it emits, by `Ke` and an image."""
         image = self.image("map_ke")
-        ke = self.cut("ke", WHITE if image else _BLACK, math.inf, "light")
+        ke = self.cut("ke", WHITE if image else _BLACK, black_is_white=image is not None, is_light=True)
         return _read_map(image, ke) if image else constant(*ke)
 
-    def _opacity(self, illum: float) -> Map | None:
-        """Its opacity; None is opaque. An image's own opacity where it has some, or else its brightness."""
-        opacity, image = self._dissolve(illum), self.image("map_d")
+    def _opacity(self, factor: float) -> Map | None:
+        """A factor times its image's own opacity, where that has some, or else brightness; None is opaque."""
+        image = self.image("map_d")
         if image is None:
-            return constant(opacity) if opacity < 1 else None
-        file, lie, _ = image
+            return constant(factor) if factor < 1 else None
+        file, transform, _ = image
         values = images.decode(file.read_bytes(), str(file), raw=True)
         grey = values[..., 3:] if values[..., 3].min() < 1 else values[..., :3].mean(axis=2, keepdims=True)
-        return Map(np.float32(opacity) * grey.clip(0, 1), lie)
+        return Map(np.float32(factor) * grey.clip(0, 1), transform)
 
-    def _dissolve(self, illum: float) -> float:
-        """Its `d`, or 1 − `Tr`. A 0 by `Tr`, or beside images or `Ke`, is hardly meant, and 1 but for clear glass."""
+    def _decide_opacity(self, illum: float) -> tuple[_Kind, float]:
+        """How light passes through it, and its opacity, by which that of an image is multiplied."""
         d, tr = self.lines.get("d"), self.cut("tr", (0.0,))[0]
         opacity = self.cut("d", (1 - tr,))[0]
         if d and d[2].lower().startswith("-halo") and opacity < 1:
             self.say("colour", "d -halo", "is as opaque at its edges as in its middle")
         if d and "tr" in self.lines and abs(opacity + tr - 1) > 0.01:
             self.say(None, f"Tr {tr:g}", f"is left out, as d says how opaque it is: {opacity:g}")
-        if opacity > 0 or (illum in _GLASS and not self._is_textured):
-            return opacity
-        if not d or self._is_textured or max(self._numbers("ke")) > 0 or "map_ke" in self.lines:
+        may_hide = d is not None and max(self._numbers("ke")) <= 0 and "map_ke" not in self.lines
+        kind = _decide_kind(illum, opacity, is_textured=opacity < 1 and self._is_textured, may_hide=may_hide)
+        if kind == "hidden":
+            self.say(None, "d 0", "is not seen, as the file says")
+        elif kind == "opaque" and opacity == 0:
             self.say(None, "d 0" if d else "Tr 1", "would be unseen by this, and is opaque")
-            return 1
-        self.say(None, "d 0", "is not seen, as the file says")
-        return opacity
+        return kind, 1 if kind == "opaque" else opacity
 
     def _normals(self, writer: Writer) -> Map | None:
         """Its normal map; an image of heights is none, which is said."""
@@ -307,16 +321,16 @@ class Material:
         image = self.image(self.relief)
         if image is None:
             return None
-        file, lie, strength = image
+        file, transform, strength = image
         values = images.decode(file.read_bytes(), str(file), raw=True)[..., :3]
         if self.relief != "norm":
-            directions = 2 * values - 1  # of length 1, and most of them upwards
+            directions = 2 * values - 1  # of length 1, and most of them upwards, by thresholds of ours
             are_long = np.abs(np.linalg.norm(directions, axis=2) - 1) < 0.1
             if are_long.mean() <= 0.9 or (directions[..., 2] - np.abs(directions[..., 0])).mean() <= 0.3:
                 self.say("colour", word, "raises no bumps, as heights are left out; export a normal map")
                 return None
             self.say(None, word, "has the colours of a normal map, and is taken for one")
-        part = Map(values, lie, file if _is_plain(file) else None)
+        part = Map(values, transform, file if _is_plain(file) else None)
         return writer.normals(part, strength, f"{word} -s", mirrored=self.mirrored, from_flat=True)
 
     def _put_gloss(self, place: Element, illum: float, writer: Writer) -> None:
@@ -333,7 +347,7 @@ class Material:
             self.say("colour", f"illum {illum:g}", "reflects as plastic does here, and not as a mirror")
         if is_glossy:
             # `roughplastic` has the colour of Ks, which is left out beside `Pr` and its like
-            is_tinted = max(ks) - min(ks) > 0.1 * max(ks) and not (is_plastic or is_pbr)
+            is_tinted = max(ks) - min(ks) > _TINTED * max(ks) and not (is_plastic or is_pbr)
             said = "becomes the gloss of plastic, by Ns" + ", without its colour" * is_tinted
             self.say("colour" if is_tinted else None, "Ks", said)
         if is_plastic:
@@ -351,8 +365,8 @@ class Material:
         for key, name in _PRINCIPLED.items():
             image = self.image(f"map_{key}")
             if image:
-                file, lie, _ = image
-                parts[name] = Map(images.decode(file.read_bytes(), str(file), raw=True)[..., :1].clip(0, 1), lie)
+                file, transform, _ = image
+                parts[name] = Map(images.decode(file.read_bytes(), str(file), raw=True)[..., :1].clip(0, 1), transform)
                 if self._number(key, 1) != 1:
                     self.say(None, self.lines[key][1], "is left out beside its image")
             elif key in self.lines:
@@ -370,14 +384,14 @@ class Material:
 
     def _colour(self) -> Map:
         image = self.image("map_kd")
-        kd = self.cut("kd", WHITE if image or self.painted else _GREY)
+        kd = self.cut("kd", WHITE if image or self.painted else _GREY, black_is_white=bool(image or self.painted))
         if image is None:
             if "kd" not in self.lines and self.lines and not self.painted:
                 self.say(None, "Kd", "is not there; the surface is grey")
             return constant(*kd)
-        file, lie, _ = image
+        file, transform, _ = image
         if min(kd) >= 1 and _is_plain(file):
-            return Map(np.zeros((0, 0, 3), np.float32), lie, file)
+            return Map(np.zeros((0, 0, 3), np.float32), transform, file)
         colour = _read_map(image, kd)
         if colour.values.max() > 1.001:
             self.say("colour", "map_Kd", "goes beyond 1, which no surface reflects, and is cut")

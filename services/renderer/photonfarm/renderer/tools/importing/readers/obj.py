@@ -278,4 +278,4 @@ def _paint(colours: Floats, material: Material) -> dict[str, Floats]:
         return {}
     if not np.isfinite(colours).all():
         material.say(None, "v", "some vertices have no colour, and are white")
-    return {"vertex_color": np.nan_to_num(colours, nan=1) * material.cut("kd", WHITE)}
+    return {"vertex_color": np.nan_to_num(colours, nan=1) * material.cut("kd", WHITE, black_is_white=True)}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from photonfarm.core.errors import IncompleteError
 from photonfarm.core.pictures import display
 from photonfarm.farm.devices import Card
 from photonfarm.plan.request import Request
@@ -145,6 +146,14 @@ def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_i
     with torch.no_grad():
         empty = opened.predict(configuration, view)
     assert float((empty - image.detach()).abs().mean()) > 0.01
+
+
+def test_a_frame_that_is_not_finite_is_refused_with_its_number(store: Path, tmp_path: Path) -> None:
+    opened = open_run(trained(store, tmp_path / "run", "cnn"), store)
+    view = sample_view(opened.spec, b"view of a test..", 0, 0)
+    broken = View(np.full(3, np.nan, np.float32), view.target)
+    with pytest.raises(IncompleteError, match="frame-0000 came out non-finite"):
+        infer.show_path(opened, rest(opened.spec), [broken, view], tmp_path / "out")
 
 
 def test_the_lines_of_the_training_page_make_a_frame(

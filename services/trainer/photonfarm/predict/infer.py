@@ -128,7 +128,10 @@ def show_frames(
 def show_path(
     opened: OpenRun, modification: Modification, views: Sequence[View], out: Path, *, fps: float = 12.0
 ) -> InferResult:
-    """Write the network's images of a configuration from some views, whose inputs are rendered: as `show_frames`."""
+    """Write the network's images of a configuration from some views, whose inputs are rendered: as `show_frames`.
+
+    Raises IncompleteError for an image that is not finite.
+    """
     with torch.no_grad():
         images = ((opened.predict(modification, view) * opened.spec.exposure).cpu().numpy() for view in views)
         return _show_images(images, len(views), out, fps, "for what the network reads and the network")
@@ -144,6 +147,8 @@ def _show_images(images: Iterator[F32], count: int, out: Path, fps: float, what:
         began = time.perf_counter()
         image = next(images)
         seconds.append(time.perf_counter() - began)
+        if not np.isfinite(image).all():
+            raise IncompleteError(f"{file.stem} came out non-finite; move the camera a little")
         write_png(enlarge(image), file)
     sentence = f"{count} frames, {1e3 * statistics.median(seconds):.1f} ms each {what}"
     films = [out / "path.gif"]

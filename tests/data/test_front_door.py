@@ -70,7 +70,7 @@ def test_public_names(package: ModuleType, names: list[str]) -> None:
         (photonfarm.renderer.load_mitsuba, "threads=None"),
         (
             photonfarm.trainer.train,
-            "store, scene, run, *, preset='small', redis_url=None, log=<built-in function print>, **settings",
+            "store, scene, run, *, preset=None, redis_url=None, log=<built-in function print>, **settings",
         ),
     ],
 )

@@ -100,7 +100,7 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
 
 def test_a_run_killed_on_either_side_of_a_return_to_a_snapshot_does_too(make_source, tiny, run, tmp_path) -> None:
     """The snapshot is older than most checkpoints, which hold it then; the rate rises until the run diverges."""
-    rising = {"learning_rate": 0.05, "seed": 1, "schedule": "cosine", "warm_up": 0.99}
+    rising = {"learning_rate": 0.04, "seed": 1, "schedule": "cosine", "warm_up": 0.99}
     settings, killed = tiny(max_steps=130, validate_every=1000, checkpoint_every=15, **rising), tmp_path / "killed"
     train(make_source(48), settings, run)
     logs = [run_folder.read_log(run / METRICS)]

@@ -20,12 +20,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from photonfarm.core.errors import BackendError
 from photonfarm.farm import devices
 from photonfarm.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
-from photonfarm.scene.spec import SceneSpec
+
+if TYPE_CHECKING:
+    from photonfarm.scene.spec import SceneSpec
 
 LLVM_VARIABLE = "DRJIT_LIBLLVM_PATH"
 VARIANT_VARIABLE = "PHOTONFARM_VARIANT"

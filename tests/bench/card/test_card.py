@@ -42,6 +42,7 @@ def test_every_part_runs_to_its_end_and_is_not_measured_again(tmp_path: Path) ->
     assert set(begun) == skipped
 
 
+@pytest.mark.slow
 def test_a_part_that_takes_too_long_does_not_lose_the_others(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setenv("PHOTONFARM_SCENES", str(tmp_path))
     parts, run = [Part("equal_time", "room"), Part("values", "veach-ajar")], describe_run(32)

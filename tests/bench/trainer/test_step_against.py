@@ -2,6 +2,8 @@
 
 from pathlib import Path
 
+import pytest
+
 from bench.trainer import train_step
 from bench.trainer.step_against import Child, compare
 from bench.trainer.train_step import filled, resized
@@ -9,6 +11,7 @@ from bench.trainer.train_step import filled, resized
 ROOT = Path(__file__).parents[3]
 
 
+@pytest.mark.slow
 def test_a_checkout_differs_in_nothing_from_itself(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(train_step, "SAMPLES", 32)
     scene_id = filled(resized(16, 64), tmp_path)

@@ -199,6 +199,7 @@ def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
     assert not (tmp_path / "without" / GOOD).exists()
 
 
+@pytest.mark.slow
 def test_a_run_whose_rate_rises_until_it_diverges_is_caught_within_thirty_steps_each_time_and_ends_well(
     make_source, tiny, run, tmp_path, monkeypatch, capsys
 ) -> None:

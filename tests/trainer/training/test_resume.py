@@ -98,6 +98,7 @@ def test_a_run_killed_at_any_steps_ends_in_the_same_weights_to_the_bit(
     assert not (killed / NEXT).exists()
 
 
+@pytest.mark.slow
 def test_a_run_killed_on_either_side_of_a_return_to_a_snapshot_does_too(make_source, tiny, run, tmp_path) -> None:
     """The snapshot is older than most checkpoints, which hold it then; the rate rises until the run diverges."""
     rising = {"learning_rate": 0.04, "seed": 1, "schedule": "cosine", "warm_up": 0.99}

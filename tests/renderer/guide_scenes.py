@@ -19,6 +19,7 @@ mi = backend.load(threads=1)
 from photonfarm.renderer.bdpt.recording import Recorders  # noqa: E402
 from photonfarm.renderer.scene.guides import view_guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.scene.materials import Materials  # noqa: E402
+from photonfarm.renderer.scene.view_rays import ViewCameras  # noqa: E402
 
 Images = NDArray[np.float64]
 Shape = dict[str, Any]
@@ -56,7 +57,8 @@ def of_keys(scene: Any, view: View, keys: list[bytes], light_samples: int, **of_
     recorders, wanted = Recorders() if len(keys) > 1 else None, GuideSpec(light_samples=light_samples)
     for key in keys:
         materials = Materials.of(scene)
-        ((_, found),) = view_guides(scene, [view], spec(**of_spec), wanted, [key], materials, NOWHERE, recorders)
+        cameras = ViewCameras.of([view], spec(**of_spec))
+        ((_, found),) = view_guides(scene, cameras, spec(**of_spec), wanted, [key], materials, NOWHERE, recorders)
         yield found
 
 

@@ -22,6 +22,7 @@ backend.load(threads=1)
 from photonfarm.renderer.bdpt.recording import Recorders  # noqa: E402
 from photonfarm.renderer.scene.guides import view_guides  # noqa: E402 - after the variant is set
 from photonfarm.renderer.scene.materials import Materials  # noqa: E402
+from photonfarm.renderer.scene.view_rays import ViewCameras  # noqa: E402
 
 Images = NDArray[np.float64]
 Lit = tuple[NDArray[np.float32], NDArray[np.float32]]
@@ -52,7 +53,15 @@ def test_a_key_gives_the_same_bytes_recorded_or_not_and_whatever_was_rendered_be
     room: LoadedScene, somewhere: View, lit: Lit
 ) -> None:
     ((_, again),) = room.inputs([somewhere], [KEY], GuideSpec(), lit)
-    told = room.scene, [somewhere], room.spec, GuideSpec(), [KEY], Materials.of(room.scene), lit
+    told = (
+        room.scene,
+        ViewCameras.of([somewhere], room.spec),
+        room.spec,
+        GuideSpec(),
+        [KEY],
+        Materials.of(room.scene),
+        lit,
+    )
     (_, plain), (_, fresh) = *view_guides(*told), *view_guides(*told, Recorders())
     assert bytes_of(again) == bytes_of(plain) == bytes_of(fresh)
 

@@ -70,26 +70,24 @@ def view_buffers(
     cameras = ViewCameras.of(views, spec)
     arrays = call_recorded(recorders, trace_albedo, cameras.kind, scene, None, cameras)
     albedo = [images["albedo"] for images in shape_images(arrays, ALBEDO, cameras, take)]
-    return with_albedo(scene, views, spec, albedo, recorders, take)
+    return with_albedo(scene, cameras, albedo, recorders, take)
 
 
 def with_albedo(
     scene: Any,
-    views: Sequence[View],
-    spec: SceneSpec,
+    cameras: ViewCameras,
     albedo: Sequence[F32],
     recorders: Recorders | None = None,
     take: Take = take_numpy,
 ) -> list[ViewBuffers]:
     """The buffers of views whose albedo (H, W, 3) is known: depth and normals are rendered."""
-    cameras = ViewCameras.of(views, spec)
     arrays = call_recorded(recorders, trace_centres, cameras.kind, scene, None, cameras)
     of_centres = shape_images(arrays, CENTRE, cameras, take)
     return [ViewBuffers(**images, albedo=mean) for images, mean in zip(of_centres, albedo, strict=True)]
 
 
 def trace_centres(scene: Any, _: Any, cameras: ViewCameras) -> Any:
-    """The depth and the normal of what the rays through the pixels' centres meet first, arrays."""
+    """The depth and the normal of what the rays through the pixels' centres meet first, interleaved."""
     ray = cameras.pixels().ray(0.5, 0.5)
     si = scene.ray_intersect(ray.ray)
     hit = si.is_valid()
@@ -98,7 +96,7 @@ def trace_centres(scene: Any, _: Any, cameras: ViewCameras) -> Any:
 
 
 def trace_albedo(scene: Any, _: Any, cameras: ViewCameras) -> Any:
-    """The mean albedo over each pixel's grid, arrays."""
+    """The mean albedo over each pixel's grid, interleaved."""
 
     def albedo(ray: PixelRay, _: Any) -> Columns:
         si = scene.ray_intersect(ray.ray)

@@ -192,12 +192,12 @@ class LoadedScene:
         """
         from photonfarm.renderer.scene.gbuffer import with_albedo
         from photonfarm.renderer.scene.guides import view_guides
-        from photonfarm.renderer.scene.view_rays import take_numpy
+        from photonfarm.renderer.scene.view_rays import ViewCameras, take_numpy
 
-        take = take or take_numpy
-        of_scene, recorders = (self.scene, views, self.spec), self._recorders
-        albedo, guides = zip(*view_guides(*of_scene, wanted, keys, self._materials, lit, recorders, take), strict=True)
-        return list(zip(with_albedo(*of_scene, albedo, recorders, take), guides, strict=True))
+        cameras, how = ViewCameras.of(views, self.spec), (self._recorders, take or take_numpy)
+        of_views = view_guides(self.scene, cameras, self.spec, wanted, keys, self._materials, lit, *how)
+        albedo, guides = zip(*of_views, strict=True)
+        return list(zip(with_albedo(self.scene, cameras, albedo, *how), guides, strict=True))
 
     def sees(self, views: Sequence[View], position: F32) -> NDArray[np.bool_]:
         """Whether each view sees points (P, 3) of the present configuration, (K, P)."""

@@ -103,7 +103,7 @@ def point_light(
     if lights is None or not wanted.light_samples:
         return np.zeros((len(keys), *position.shape), np.float32)
     shifts = shifts_of(keys, "point light", len(position))
-    count = dr.opaque(mi.UInt32, len(position))
+    count = dr.opaque(mi.UInt32, len(position))  # as data: `ViewCameras` says why a kernel needs such a number
     arguments = lights, count, floats(position), floats(normal), shifts, floats(pattern_of(0))
     kind = len(keys), len(position), lights.kinds
     return rows(call_recorded(recorders, irradiance, kind, scene, None, *arguments), len(keys), len(position))

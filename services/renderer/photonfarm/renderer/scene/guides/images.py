@@ -46,7 +46,6 @@ from photonfarm.renderer.scene.view_rays import (
     take_numpy,
 )
 from photonfarm.scene.spec import RAYS_PER_PIXEL, GuideSpec, SceneSpec
-from photonfarm.scene.view import View
 
 if TYPE_CHECKING:
     from photonfarm.renderer.bdpt.recording import Recorders
@@ -77,7 +76,7 @@ DIVISORS = {"mean_depth": "hits"} | dict.fromkeys(("beyond_albedo", "beyond_norm
 
 def view_guides(
     scene: Any,
-    views: Sequence[View],
+    cameras: ViewCameras,
     spec: SceneSpec,
     wanted: GuideSpec,
     keys: Sequence[Key],
@@ -91,7 +90,6 @@ def view_guides(
     `keys` are the views'. `lit` are positions and normals (L, 3) of the points whose irradiance is required. With
     `recorders` Python runs only once.
     """
-    cameras = ViewCameras.of(views, spec)
     lights = read_lights(scene) if scene.emitters() else None
     settings = GuideSettings(
         wanted.light_samples if lights is not None else 0,

@@ -8,8 +8,8 @@ import pytest
 
 from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import Guides, Photons, arrays_of
-from photonfarm.farm.configuration import find_configuration
 from photonfarm.plan.request import Request
+from photonfarm.renderer.jobs.path_buffers import find_configuration
 from photonfarm.scene.camera_path import Frames
 from photonfarm.scene.modification import Modification, rest, sample_modification
 from photonfarm.scene.spec_loading import load_spec

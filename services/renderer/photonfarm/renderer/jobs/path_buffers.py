@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.core.errors import IncompleteError
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.core.keys import view_key
 from photonfarm.core.records import BasePointCloud, Guides, ViewBuffers, Visibility, arrays_of
-from photonfarm.farm.configuration import find_configuration
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import (
     SceneLoader,
@@ -22,11 +21,11 @@ from photonfarm.renderer.jobs.render import (
     visibility_of,
 )
 from photonfarm.scene.camera_path import CameraPath, Frames, check_clear, orbit
-from photonfarm.scene.modification import Modification, rebuild
+from photonfarm.scene.modification import Modification, rebuild, rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.read.find import scene_named
+from photonfarm.store.read.find import Query, find_samples, scene_named
 
 
 def render_path(store: str | Path, scene: str, modification: str | None, path: CameraPath | int) -> Frames:
@@ -52,6 +51,28 @@ def find_views(
     if isinstance(path, int):
         return stored, configuration, orbit(stored.spec, path, configuration)
     return stored, configuration, check_clear(stored.spec, path.sample(), configuration)
+
+
+def find_configuration(store: Store, scene: SceneStore, text: str | None) -> Modification:
+    """The configuration of `--modification VECTOR|KEY`, as `store find` takes it; without a text, the scene at rest.
+
+    Raises SpecError for a vector of another number of groups, StoreError for a key that is in no plan.
+    """
+    if text is None:
+        return rest(scene.spec)
+    query = Query.of(modification=text)
+    wanted, groups = query.modification, len(scene.spec.groups)
+    if isinstance(wanted, np.ndarray):
+        if wanted.size != 4 * groups:
+            raise SpecError(
+                f"--modification: has {wanted.size} numbers; {4 * groups} are required, 4 for each of the "
+                f"{groups} movable groups of {scene.spec.name}"
+            )
+        return Modification.from_vector(wanted.reshape(groups, 4))
+    samples = find_samples(store, [scene.scene_id], query, limit=1).samples
+    if not samples:
+        raise StoreError(f"--modification {text}: no plan of scene {scene.scene_id} has a configuration of this key")
+    return Modification.from_vector(np.array(samples[0].modification, np.float32).reshape(groups, 4))
 
 
 def frames_of(

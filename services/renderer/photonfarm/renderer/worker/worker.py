@@ -312,8 +312,10 @@ def _read_all(pipe: int) -> bytes:
     handles signals only between its own instructions, or when one interrupts a system call.
     """
     content = bytearray()
+    poller = select.poll()  # select() takes no descriptor above 1023
+    poller.register(pipe, select.POLLIN)
     while True:
-        if select.select([pipe], [], [], POLL_S)[0]:
+        if poller.poll(POLL_S * 1000):
             part = os.read(pipe, 1 << 16)
             if not part:
                 return bytes(content)

@@ -9,14 +9,14 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
-from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.core.records import arrays_of
 from photonfarm.plan.request import Request
-from photonfarm.renderer.jobs.path_buffers import frames_of
+from photonfarm.renderer.jobs.path_buffers import find_configuration, frames_of
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.camera_path import Frames
-from photonfarm.scene.modification import rest
+from photonfarm.scene.modification import rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.store import SceneReader, Store
@@ -95,3 +95,17 @@ def test_buffers_that_are_not_finite_are_not_written(spec: SceneSpec, room: Load
 
     with pytest.raises(IncompleteError):
         frames_of(spec, rest(spec), [somewhere], load=lambda _: Broken())
+
+
+def test_a_configuration_is_a_vector_the_key_of_a_planned_one_or_the_scene_at_rest(tmp_path: Path) -> None:
+    store, spec = Store(tmp_path / "store", create=True), load_spec("room")
+    scene = store.scene(store.plan(spec, Request(modifications=3), shard_rows=8).scene_id)
+    planned = sample_modification(spec, 0, 1)
+    key = planned.key(spec.radiance_id).hex()
+    vector = " ".join(map(str, planned.vector.ravel()))
+    for text, wanted in ((key, planned), (vector, planned), (None, rest(spec))):
+        np.testing.assert_array_equal(find_configuration(store, scene, text).vector, wanted.vector)
+    with pytest.raises(SpecError):
+        find_configuration(store, scene, "0 0 0 1")
+    with pytest.raises(StoreError):
+        find_configuration(store, scene, "0" * 32)

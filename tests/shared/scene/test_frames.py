@@ -1,4 +1,4 @@
-"""The buffers of a camera path as a file, and configurations as users name them."""
+"""The buffers of a camera path as a file."""
 
 from dataclasses import fields
 from pathlib import Path
@@ -6,15 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.errors import StoreError
 from photonfarm.core.records import Guides, Photons, arrays_of
-from photonfarm.plan.request import Request
-from photonfarm.renderer.jobs.path_buffers import find_configuration
 from photonfarm.scene.camera_path import Frames
-from photonfarm.scene.modification import Modification, rest, sample_modification
-from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.modification import Modification
 from photonfarm.scene.view import View
-from photonfarm.store import Store
 
 
 def made(*, photons: bool) -> Frames:
@@ -66,17 +62,3 @@ def test_what_is_no_such_file_is_refused(tmp_path: Path) -> None:
         Frames.read(tmp_path / "missing.npz")
     with pytest.raises(StoreError):
         made(photons=False).write(tmp_path / "text.npz" / "below.npz")
-
-
-def test_a_configuration_is_a_vector_the_key_of_a_planned_one_or_the_scene_at_rest(tmp_path: Path) -> None:
-    store, spec = Store(tmp_path / "store", create=True), load_spec("room")
-    scene = store.scene(store.plan(spec, Request(modifications=3), shard_rows=8).scene_id)
-    planned = sample_modification(spec, 0, 1)
-    key = planned.key(spec.radiance_id).hex()
-    vector = " ".join(map(str, planned.vector.ravel()))
-    for text, wanted in ((key, planned), (vector, planned), (None, rest(spec))):
-        np.testing.assert_array_equal(find_configuration(store, scene, text).vector, wanted.vector)
-    with pytest.raises(SpecError):
-        find_configuration(store, scene, "0 0 0 1")
-    with pytest.raises(StoreError):
-        find_configuration(store, scene, "0" * 32)

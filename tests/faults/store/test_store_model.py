@@ -213,6 +213,7 @@ class StoreMachine(RuleBasedStateMachine):
         assert {row: compare(self.follower, row) for row in self.seen} == self.planned
         assert check_store(Store(self.root), when="now").exit_code == 0
         assert self.stores[0].storage.names("tmp") == []
+        del self.watcher, self.follower  # hypothesis keeps the machine, and with it their open files
 
 
 def compare(reader: SceneReader, row: int) -> bytes:

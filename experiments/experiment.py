@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,12 +11,15 @@ from typing import Any, Literal, Self
 from pydantic import Field, ValidationError
 
 from photonfarm.core.errors import SpecError
+from photonfarm.core.files import write_whole
 from photonfarm.core.models import Frozen, Name, sentences
+from photonfarm.scene.free_space import FreeSpace
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import parse_spec
 
 HERE = Path(__file__).parent
 SIZES = "sizes.toml"
+FREE_SPACE = "free_space.json"  # of each experiment, as experiments/free_space.py measured it
 
 SizeName = Literal["small", "card", "paper"]
 Part = Literal["fixed", "movable", "daylight", "vanishing", "static", "ablation"]
@@ -80,7 +84,18 @@ class Experiment(Frozen):
             raise SpecError(f"{file}: {'; '.join(sentences(error))}") from error
 
     def spec(self) -> SceneSpec:
-        """The scene's spec with the changes of the experiment and of the size; raises SpecError."""
+        """The scene's spec with the changes of the experiment and of the size, and free space; raises SpecError."""
+        spec, space = self.spec_without_free_space(), _read_free_spaces().get(self.name)
+        if space is None or space["of"] != spec.free_space_digest:
+            raise SpecError(
+                f"{self.name}: {FREE_SPACE} has no free space of its geometry, groups and boxes of views; "
+                f"`python experiments/free_space.py {self.name}` measures it"
+            )
+        view = spec.view.model_copy(update={"free_space": FreeSpace.model_validate(space)})
+        return spec.model_copy(update={"view": view})
+
+    def spec_without_free_space(self) -> SceneSpec:
+        """The spec with its changes, before free space is measured; raises SpecError."""
         file = HERE / self.scene
         described = merge(merge(_read_toml(file), self.changes), self.size.changes)
         described["name"] = self.name
@@ -126,6 +141,19 @@ def merge(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
         old = whole.get(key)
         whole[key] = merge(old, value) if isinstance(old, Mapping) and isinstance(value, Mapping) else value
     return whole
+
+
+def keep_free_space(name: str, space: FreeSpace) -> None:
+    """Write down an experiment's free space beside those of others, a line each."""
+    spaces = {**_read_free_spaces(), name: space.model_dump(mode="json")}
+    lines = [f"{json.dumps(name)}: {json.dumps(spaces[name])}" for name in sorted(spaces)]
+    write_whole(HERE / FREE_SPACE, "{\n" + ",\n".join(lines) + "\n}\n")
+
+
+def _read_free_spaces() -> dict[str, Any]:
+    file = HERE / FREE_SPACE
+    spaces: dict[str, Any] = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    return spaces
 
 
 def _read_toml(file: Path) -> dict[str, Any]:

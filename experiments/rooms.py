@@ -43,7 +43,7 @@ class Room:
         evaluation = report["evaluation"]
         of_all = ("samples", "units", "noise_floor", "references", "device", "threads")
         of_run = ("architecture", "parameters", "steps", "trained_on", "seconds")
-        settings = ("max_steps", "batch")
+        settings = ("max_steps", "batch", "layer_rates")
         document = {
             "title": experiment.title,
             "about": experiment.about.strip(),
@@ -56,7 +56,7 @@ class Room:
             "edit_seconds": report["edit_seconds"],
             "runs": {
                 run["name"]: {key: run[key] for key in of_run}
-                | {"settings": {key: run["settings"][key] for key in settings}}
+                | {"settings": {key: run["settings"][key] for key in settings if key in run["settings"]}}
                 for run in report["runs"]
             },
             "rows": {row["name"]: _compact(row) for row in evaluation["rows"]},
@@ -113,6 +113,16 @@ class Room:
             if run["architecture"].startswith("denoise") == denoisers
         ]
         return " or ".join(dict.fromkeys(told))
+
+    def layer_rates(self) -> str:
+        """The rates of its networks' layers, in words; reports of before these could be set have equal ones."""
+        told = {run["settings"].get("layer_rates", "equal") for run in self.document["runs"].values()}
+        return " or ".join(f"{rates} rates of layers" for rates in sorted(told))
+
+    @property
+    def has_free_space(self) -> bool:
+        """Whether its cameras were kept out of furniture and walls; reports of before that do not say so."""
+        return bool(self.document["dataset"].get("free_space", False))
 
     def time_ratio(self, name: str) -> float | None:
         """Seconds of a row's frame over those of light_transport's; None where either was not timed."""

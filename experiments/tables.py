@@ -44,9 +44,9 @@ _OF_PRESETS = (
 )
 
 RECIPES: Mapping[SizeName, str] = {
-    "small": f"{_OF_PRESETS} and averaged weights",
-    "card": f"{_OF_PRESETS}, averaged weights and bfloat16",
-    "paper": "demodulation 0.2, 2 octaves and exact occlusion",
+    "small": f"{_OF_PRESETS}, averaged weights",
+    "card": f"{_OF_PRESETS}, averaged weights, bfloat16",
+    "paper": "demodulation 0.2, 2 octaves, exact occlusion",
 }
 """What differs from the supplement in the training of its networks, beside the loss."""
 
@@ -57,7 +57,7 @@ def format_page(rooms: Sequence[Room], size: SizeName) -> str:
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
-    parts.append(explain_reading(size, summarise(rooms, lambda room: str(room.experiment.size.train["loss"]))))
+    parts.append(explain_reading(rooms, size))
     for part, (title, published) in PARTS.items():
         if of_part := [room for room in rooms if room.experiment.part == part]:
             parts += _format_part(of_part, title, published)
@@ -108,7 +108,19 @@ def introduce(rooms: Sequence[Room], size: SizeName) -> str:
     return (
         f"The size `{size}`: {sizes}. {_describe_resolution(rooms)} All networks "
         f"and denoisers but OIDN are trained on one room's images alone: {', '.join(trained)}. denoise_k and oidn 1/k "
-        "are denoisers, which are given 1/k of the pixels of one noisy half-estimate."
+        f"are denoisers, which are given 1/k of the pixels of one noisy half-estimate.{_describe_cameras(rooms)}"
+    )
+
+
+def _describe_cameras(rooms: Sequence[Room]) -> str:
+    """Which rooms are of views that are not drawn any more, if any."""
+    without = [room.name for room in rooms if not room.has_free_space]
+    if not without:
+        return ""
+    which = "All rows" if len(without) == len(rooms) else f"The rows of {', '.join(without)}"
+    return (
+        f" {which} were rendered before the experiments' specs had `view.free_space`: their cameras could stand "
+        "inside furniture, and none of their figures is of the specs as they are now."
     )
 
 
@@ -130,7 +142,7 @@ READING = """\
 ## How to read the tables
 
 **Networks.** Rows named cnn, feature_projection, light_transport and light_transport_photons are the paper's networks
-trained by our recipe (a {loss} loss, {recipe}), not by the supplement's to the letter; what differs is in
+trained by our recipe (a {loss} loss, {recipe}, {rates}), not by the supplement's to the letter; what differs is in
 [Train and evaluate](../training.md#presets). Those named guided are ours.
 
 **Errors** are against references in the metric space, clip(exposure · I, 0, 1)^(1/2.2); the references' noise is taken
@@ -156,9 +168,11 @@ renderer costs most.
 n/a: not measured, or a row that a room lacks. –: not in the paper."""
 
 
-def explain_reading(size: SizeName, loss: str) -> str:
+def explain_reading(rooms: Sequence[Room], size: SizeName) -> str:
     """What the tables' figures are, and what they can be compared with."""
-    paragraphs = READING.format(loss=loss, recipe=RECIPES[size], close=100 * CLOSE).split("\n\n")
+    loss = summarise(rooms, lambda room: str(room.experiment.size.train["loss"]))
+    rates = summarise(rooms, Room.layer_rates)
+    paragraphs = READING.format(loss=loss, recipe=RECIPES[size], rates=rates, close=100 * CLOSE).split("\n\n")
     return "\n\n".join(wrap(paragraph) for paragraph in paragraphs)
 
 

@@ -136,13 +136,32 @@ def test_a_row_is_the_mean_over_the_rooms_that_have_it_and_the_others_are_named(
 
 
 def test_the_page_begins_with_what_was_found_and_says_whose_recipe_it_is() -> None:
-    assert all("demodulation 0.2" in tables.explain_reading(size, "relative") for size in get_args(SizeName))
-    page = tables.format_page([room("night-living-room")], "small")
+    rooms = [room("night-living-room")]
+    assert all("demodulation 0.2" in tables.explain_reading(rooms, size) for size in get_args(SizeName))
+    page = tables.format_page(rooms, "small")
     heads = [line for line in page.splitlines() if line.startswith("## ")]
     assert heads[:2] == ["## What agrees with the paper, and what does not", "## How to read the tables"]
     assert heads[-1] == "## Error against the time of a frame"
     loss = Experiment.load("night-living-room", "small").size.train["loss"]
     assert f"by our recipe (a {loss} loss, demodulation 0.2, " in " ".join(page.split())
+
+
+def test_the_page_says_which_rows_are_of_cameras_in_furniture_and_how_rates_of_layers_were_chosen() -> None:
+    """By what the reports say; those of before either could be chosen say nothing."""
+    now = report()
+    now["dataset"]["free_space"] = True
+    for run in now["runs"]:
+        run["settings"]["layer_rates"] = "scaled"
+    before, after = room("night-living-room"), room("fixed-veach-ajar", now)
+    said = {
+        which: " ".join(tables.format_page(rooms, "small").split())
+        for which, rooms in {"before": [before], "after": [after], "both": [after, before]}.items()
+    }
+    assert "All rows were rendered before the experiments' specs had `view.free_space`" in said["before"]
+    assert "The rows of night-living-room were rendered before" in said["both"]
+    assert "view.free_space" not in said["after"]
+    assert "equal rates of layers" in said["before"]
+    assert "scaled rates of layers" in said["after"]
 
 
 def test_each_room_has_a_panel_with_its_name_and_what_is_left_of_the_grid_stays_empty(

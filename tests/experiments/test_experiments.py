@@ -10,16 +10,18 @@ from itertools import product
 from pathlib import Path
 from typing import Any, get_args
 
+import numpy as np
 import pytest
 
 from experiments import experiment
 from experiments.dry_run import Need
-from experiments.experiment import Experiment, Size, SizeName, list_names, merge
+from experiments.experiment import FREE_SPACE, Experiment, Size, SizeName, keep_free_space, list_names, merge
 from experiments.paper_tables import format_errors
 from experiments.rooms import Room
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
 from photonfarm.core.errors import SpecError
 from photonfarm.plan.sample_costs import SampleCosts
+from photonfarm.scene.free_space import FreeSpace, pack
 from photonfarm.scene.spec import Emitters
 from photonfarm.scene.spec_loading import SCENES_VARIABLE
 from photonfarm.trainer.report.contents import MOVABLE_LIGHTS
@@ -31,7 +33,7 @@ EXPECTED += ["static-ablation", "static-bathroom", "static-kitchen", "vanishing-
 
 
 def test_the_experiments_are_all_there_and_others_are_refused() -> None:
-    assert list_names() == EXPECTED
+    assert list_names() == EXPECTED == list(json.loads((experiment.HERE / FREE_SPACE).read_text()))
     with pytest.raises(SpecError, match="fixed-dining-room"):
         Experiment.load("kitchen-sink", "small")
 
@@ -50,6 +52,7 @@ def test_an_experiment_s_file_is_right_in_both_sizes(name: str, size: SizeName) 
 def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
     spec, paper = (Experiment.load(name, size).spec() for size in ("small", "paper"))
     assert spec.credits is not None
+    assert spec.view.free_space is not None
     assert bool(spec.lights) == name.startswith(("movable", "night", "vanishing"))
     assert (spec.emitters == Emitters(all=0)) == name.startswith(("night", "vanishing"))
     assert bool(spec.objects) != name.startswith("static")
@@ -91,6 +94,12 @@ loss = "relative"
 """
 
 
+def keep_all_free(name: str) -> None:
+    """Write down that an experiment's cameras may stand anywhere in their box."""
+    digest = Experiment.load(name, "small").spec_without_free_space().free_space_digest
+    keep_free_space(name, FreeSpace(of=digest, cells=(1, 1, 1), free=pack(np.ones((1, 1, 1), np.bool_))))
+
+
 @pytest.fixture
 def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
     from photonfarm.scene.spec_loading import find_spec
@@ -99,7 +108,21 @@ def tiny(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Experiment:
     (tmp_path / "tiny.toml").write_text(TINY)
     (tmp_path / "sizes.toml").write_text(SIZES)
     (tmp_path / "room.toml").write_text(find_spec("room").read_text())
+    keep_all_free("tiny")
     return Experiment.load("tiny", "small")
+
+
+def test_an_experiment_without_free_space_of_its_scene_is_refused(tiny: Experiment) -> None:
+    before = tiny.spec_without_free_space()
+    assert tiny.spec().view.free_space.of == before.free_space_digest
+    assert tiny.spec().scene_id != before.scene_id
+    box = {"min": [-1, 1, -1], "max": [1, 2, 1]}
+    for other in (
+        tiny.model_copy(update={"name": "other"}),
+        tiny.model_copy(update={"changes": {"view": {"origin": box}}}),
+    ):
+        with pytest.raises(SpecError, match=rf"free_space\.py {other.name}`"):
+            other.spec()
 
 
 def with_size(tiny: Experiment, **changes: Any) -> Experiment:
@@ -165,6 +188,7 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     references = report["evaluation"]["references"]
     assert (references["views"], references["spp"]) == (2, 4)
     assert rows[1]["frame_seconds"]["render"] > 0
+    assert report["dataset"]["free_space"]
     assert [run["steps"] for run in report["runs"]] == [3, 3]
     assert list(report["trained_at"]) == ["light_transport", "denoise_4", "light_transport-seed-1"]
 

@@ -127,6 +127,7 @@ class DatasetCard:
             "width": spec.film.width,
             "height": spec.film.height,
             "exposure": spec.exposure,
+            "free_space": spec.view.free_space is not None,
             "points": spec.points,
             "transport": spec.transport.model_dump(),
             "photons": spec.photons.model_dump(),

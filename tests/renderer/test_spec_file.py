@@ -69,6 +69,26 @@ def test_comments_stay_where_they_are_in_a_file_in_which_objects_and_lights_alte
 
 
 @pytest.mark.parametrize(
+    ("text", "written"),
+    [
+        (
+            "[transport]\ncard = { connections = 0, rr_depth = 3 }  # of a card\nhalf_spp = 4\n",
+            "[transport]\ncard = {connections = 1, light_ratio = 0.5}  # of a card\nhalf_spp = 4\n",
+        ),
+        (
+            "[transport.card]  # of a card\nconnections = 0  # none\nrr_depth = 3\n# last\n",
+            "[transport.card]  # of a card\nconnections = 1  # none\nlight_ratio = 0.5\n# last\n",
+        ),
+    ],
+)
+def test_a_table_within_a_table_becomes_what_is_written_and_keeps_its_form_and_comments(
+    text: str, written: str
+) -> None:
+    card = {"connections": 1, "light_ratio": 0.5}
+    assert spec_file.put(text, {"transport": {"card": card}}, where="spec") == written
+
+
+@pytest.mark.parametrize(
     "text", ["", 'name = "a"', 'name = "a"\r\n[film]\r\nwidth = 8\r\n', "[transport]", "[photons]\n"]
 )
 def test_tables_that_are_not_there_are_added_with_the_file_s_line_ends(text: str) -> None:

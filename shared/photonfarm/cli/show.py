@@ -14,7 +14,7 @@ from rich.table import Table
 
 from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import format_span
-from photonfarm.scene.spec import SceneSpec, shape_ids
+from photonfarm.scene.spec import SceneSpec, Transport, shape_ids
 
 if TYPE_CHECKING:
     from photonfarm.farm.dry_run import DryRun
@@ -58,12 +58,8 @@ def print_scene(spec: SceneSpec, as_json: bool) -> None:
             ("source", source.file or f"built-in {source.builtin}"),
             ("kind", f"dynamic, {len(spec.groups)} movable groups" if spec.groups else "static"),
             ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.fov_deg:g}°"),
-            (
-                "light transport",
-                f"depth {t.max_depth}, {t.connections} connections, light ratio {t.light_ratio:g}"
-                + ", guided light" * t.guided_light
-                + (f", {t.light_samples} light samples" if t.light_samples > 1 else ""),
-            ),
+            ("light transport", f"depth {t.max_depth}, {_describe_strategy(t)}"),
+            *([("on a card", _describe_strategy(t.on_card))] if t.card else []),
             ("half-estimates", f"2 × {t.half_spp} samples per pixel"),
             ("views from", _box(spec.view.origin.min, spec.view.origin.max)),
             ("looking at", _box(spec.view.look_at.min, spec.view.look_at.max)),
@@ -82,6 +78,16 @@ def print_scene(spec: SceneSpec, as_json: bool) -> None:
             ),
             ("movable", "shapes", "removed", "positions"),
         )
+
+
+def _describe_strategy(transport: Transport) -> str:
+    """How light is sampled, in words."""
+    return (
+        f"{transport.connections} connections, light ratio {transport.light_ratio:g}"
+        + ", guided light" * transport.guided_light
+        + (f", {transport.light_samples} light samples" if transport.light_samples > 1 else "")
+        + (f", roulette from edge {transport.rr_depth}" if transport.rr_depth != Transport().rr_depth else "")
+    )
 
 
 def bytes_per_sample(spec: SceneSpec) -> int:

@@ -17,6 +17,7 @@ from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import sample_view
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers
 from photonfarm.store.model.lease import LeasedError, hold_lease
@@ -184,6 +185,20 @@ def test_of_samples_rendered_together_only_what_is_not_finite_is_drawn_again(
     first = [seed_of(s.key, half) for s in samples for half in ("half A", "half B")]
     again = [seed_of(samples[0].key, f"{half}, attempt 1") for half in ("half A", "half B")]
     assert seeds == [*first[:6], *again, *first[6:]]
+
+
+@pytest.mark.parametrize("bad", [0, 1])
+def test_the_first_half_alone_is_that_of_the_sample_also_where_it_is_drawn_again(
+    analytic: ModuleType, recorded: type, bad: int
+) -> None:
+    loaded, key = recorded.load(analytic.small_spec()), b"k" * 16
+    view = sample_view(loaded.spec, key, 0, 0)
+    recorded.bad = bad
+    alone = estimates.half_of(loaded, key, view)
+    recorded.bad = bad
+    ((halves, thrown),) = estimates.halves_of(loaded, [(key, view)])
+    assert thrown == bad
+    np.testing.assert_array_equal(alone, halves[0])
 
 
 def test_a_half_never_takes_the_seed_of_the_other() -> None:

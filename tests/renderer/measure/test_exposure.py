@@ -55,6 +55,10 @@ def test_noise_is_taken_out_of_the_display_mean() -> None:
 # ------------------------------------------------------------------------------------------------------ of a scene
 
 
+def test_the_verb_renders_as_many_views_as_an_import_does() -> None:
+    assert {option.name: option.default for option in scene_exposure.params}["frames"] == exposure.FRAMES
+
+
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exposure, "PATHS", 1 << 13)

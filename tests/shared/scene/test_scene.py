@@ -3,8 +3,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner
 from pydantic import ValidationError
 
+from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import sentences
 from photonfarm.scene.spec import SceneSpec
@@ -53,6 +55,18 @@ def test_a_spec_file_is_read_with_its_defaults(scenes: Path, tmp_path: Path) -> 
     assert spec.objects[0].removal_probability == 0.2
     assert spec.film.width == 128
     assert [group.name for group in spec.groups] == ["ball"]
+
+
+def test_scene_show_says_what_cards_do_otherwise(scenes: Path, tmp_path: Path) -> None:
+    (file := tmp_path / "spec.toml").write_text(f"{SPEC}[transport]\nlight_samples = 2\n")
+    assert "on a card" not in CliRunner().invoke(umbrella, ["scene", "show", str(file)]).output
+    file.write_text(f"{file.read_text()}card = {{ connections = 0, rr_depth = 3 }}\n")
+    (line,) = [
+        line
+        for line in CliRunner().invoke(umbrella, ["scene", "show", str(file)]).output.splitlines()
+        if "card" in line
+    ]
+    assert line.split("on a card")[1].strip() == "0 connections, light ratio 1, 2 light samples, roulette from edge 3"
 
 
 @pytest.mark.parametrize(

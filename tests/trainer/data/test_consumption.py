@@ -10,14 +10,15 @@ from typing import Any
 
 import pytest
 
-from photonfarm.core.errors import IncompleteError
+from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
 from photonfarm.queue.connection import connect
 from photonfarm.queue.workers import read_consumed, serve
 from photonfarm.store import Store
 from photonfarm.trainer import service, train
-from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.runs import devices
+from photonfarm.trainer.runs.settings import TrainSettings, make_preset
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.loop import Hooks
 
@@ -124,3 +125,21 @@ def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene,
     assert (run / "tensorboard").is_dir() == (find_spec("tensorboard") is not None)
     with pytest.raises(IncompleteError):
         service.check(run)
+
+
+def test_a_run_goes_on_by_the_preset_that_it_was_begun_with_wherever_that_is(
+    scene, commit, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As a run that began on a card and goes on here does."""
+    settings = {"architecture": "cnn", "width": 4, "hold_out": 0.4, "minimum_samples": 1, "device": "cpu"}
+    scene.plan(Request(modifications=12), shard_rows=6)
+    for job in range(scene.jobs()):
+        commit(scene, job)
+    call = partial(train, Path(scene.storage.where), scene.scene_id, run, log=str, **settings)
+    monkeypatch.setattr(devices, "choose_preset", lambda _device: "card")
+    call(max_steps=1)
+    monkeypatch.undo()
+    assert call(max_steps=2).settings.batch == make_preset("card").batch
+    with pytest.raises(SpecError, match="batch = 8, and 2"):
+        call(max_steps=2, preset="small")
+    assert call(max_steps=3).settings.max_steps == 3

@@ -1,6 +1,7 @@
 """The frame call: a network's image of a configuration and a view, inputs rendered in the same process."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from photonfarm.plan.request import Request
 from photonfarm.predict import infer, open_run
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene import backend
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.modification import rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -132,6 +134,22 @@ def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_pat
     assert noisy is not None
     assert int(noisy.kept.sum()) == 24 * 16 // 4
     assert float(noisy.colour.sum()) > 0
+
+
+def test_a_noisy_image_that_is_not_finite_is_drawn_again(
+    store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = open_run(trained(store, tmp_path / "run", "denoise_1"), store)
+    view, plain, seeds = sample_view(opened.spec, b"view of a test..", 0, 0), LoadedScene.render_halves, []
+
+    def spoil_first(scene: LoadedScene, view: View, asked: Sequence[int], *more: int) -> np.ndarray:
+        seeds.extend(asked)
+        return plain(scene, view, asked, *more) * (np.nan if len(seeds) == 1 else 1)
+
+    monkeypatch.setattr(LoadedScene, "render_halves", spoil_first)
+    colour = opened._inputs(view).noisy.colour[0].numpy()
+    assert len(set(seeds)) == 2
+    np.testing.assert_array_equal(colour, plain(opened._scene, view, seeds[1:])[0] * np.float32(opened.spec.exposure))
 
 
 def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_in_place(

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.core.errors import SpecError
-from photonfarm.core.keys import make_key, seed_of, view_key
+from photonfarm.core.keys import make_key, view_key
 from photonfarm.core.processes import can_render
 from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
@@ -71,6 +71,7 @@ class OpenRun:
         """The network's image of a configuration from a view, (H, W, 3), linear radiance, on the network's device.
 
         It can be differentiated with respect to the network's weights. A denoiser gets a noisy image rendered for it.
+        Raises IncompleteError where photons or that image stay non-finite with other seeds.
         """
         if not np.array_equal(modification.vector, self._modification.vector):
             self._apply(Modification.from_vector(modification.vector))  # the caller may change theirs
@@ -126,8 +127,10 @@ class OpenRun:
 
     def _noisy(self, view: View, key: bytes) -> NoisyColour:
         """A noisy image of the view, of which as many pixels are kept as the network was trained with."""
+        from photonfarm.renderer.jobs.estimates import half_of
+
         sample = make_key("frame", key)
-        half = self._scene.render_half(view, seed_of(sample, "half A")) * np.float32(self._exposure)
+        half = half_of(self._scene, sample, view) * np.float32(self._exposure)
         kept = choose_kept_pixels(sample, self.spec, self._needs.kept or 1)
         return NoisyColour(self._tensor(half * kept[..., None]), self._tensor(kept))
 

@@ -31,7 +31,8 @@ def train(
     """Train on a scene's samples, or continue a run, as `photonfarm train` does; returns the run with its last weights.
 
     `store` is a folder or the URL of a bucket, and `scene` a scene's name, its id, or the beginning of its id. The
-    settings are a preset's, by default `card` on a card and `small` elsewhere, with changes by key, such as
+    settings are a preset's, by default the one that the run was begun with, and of a new run `card` on a card and
+    `small` elsewhere, with changes by key, such as
     `max_steps`, `architecture` or `width`; `photonfarm train --help` lists them. The folder `run` is that of
     `photonfarm train --run`: either goes on with what the other began. While it trains, `photonfarm train --check`
     finds the run alive, and TensorBoard, if it is installed, its curves.
@@ -49,9 +50,8 @@ def train(
     from photonfarm.store.read.find import scene_named
     from photonfarm.trainer import service
     from photonfarm.trainer.predictors.trained import TrainedRun
-    from photonfarm.trainer.runs.devices import AUTO, choose_preset
 
-    preset = preset or choose_preset(settings.get("device", AUTO))
+    preset = preset or service.find_preset(Path(run), settings)
     scene_id = scene_named(Store(store), scene)
     service.run(None, store, Path(run), preset, settings, redis_url, scene_id=scene_id, log=log)
     return TrainedRun.load(Path(run))

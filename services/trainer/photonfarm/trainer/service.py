@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,14 @@ from photonfarm.store.model.scene_store import list_scenes
 from photonfarm.store.read.find import describe_scenes
 from photonfarm.trainer.runs import user_code
 from photonfarm.trainer.runs.progress import RunProgress, follow_progress
-from photonfarm.trainer.runs.run_folder import INITIAL, lock_run, note_scene_folder, write_views
+from photonfarm.trainer.runs.run_folder import (
+    INITIAL,
+    lock_run,
+    note_preset,
+    note_scene_folder,
+    read_preset,
+    write_views,
+)
 from photonfarm.trainer.runs.settings import TrainSettings, make_settings
 
 if TYPE_CHECKING:
@@ -38,6 +45,13 @@ POLL_S = 1.0
 ALIVE_FILE = "alive"
 REPORT_S = 5.0  # between reports to the workers
 ALIVE_S = 60.0  # a run whose sign of life is older counts as dead
+
+
+def find_preset(folder: Path, changes: Mapping[str, Any]) -> str:
+    """The preset of a run for which none is named: the one that it was begun with, or else that of its device."""
+    from photonfarm.trainer.runs.devices import AUTO, choose_preset
+
+    return read_preset(folder) or choose_preset(changes.get("device", AUTO))
 
 
 def run(
@@ -87,6 +101,7 @@ def run(
                 )
             with _give_sign_of_life(folder):
                 note_scene_folder(folder, scene_folder(spec, loaded) if spec and loaded else None)
+                note_preset(folder, preset_name)
                 hooks = Hooks(stop=stop, on_record=on_record, on_wait=log, ranks=ranks)
                 _train(loaded, store, scene_id or begun_on, exposure, folder, settings, redis_url, hooks)
         if until_complete and stop.is_set():

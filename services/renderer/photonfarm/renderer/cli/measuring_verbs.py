@@ -73,7 +73,7 @@ def scene_cost(spec: str, frames: int, seconds: float | None, again: bool, as_js
 @click.option(
     "--frames",
     type=click.IntRange(2, 1000),
-    default=24,
+    default=48,
     show_default=True,
     help="Random configurations to render, a view of each.",
 )

@@ -36,10 +36,7 @@ def halves_of(scene: LoadedScene, samples: Sequence[tuple[Key, View]]) -> list[t
     """
     if not samples:
         return []
-    seeds = []
-    for key, _ in samples:
-        seed_a = next(_seeds(key, PURPOSES[0], ()))
-        seeds.append((seed_a, next(_seeds(key, PURPOSES[1], (seed_a,)))))
+    seeds = [_first_seeds(key) for key, _ in samples]
     if len(samples) == 1:
         images = scene.render_halves(samples[0][1], seeds[0])
     else:
@@ -56,6 +53,19 @@ def halves_of(scene: LoadedScene, samples: Sequence[tuple[Key, View]]) -> list[t
                 thrown += more
         estimates.append((halves, thrown))
     return estimates
+
+
+def half_of(scene: LoadedScene, key: Key, view: View) -> F32:
+    """The first of a sample's two estimates alone, (H, W, 3); raises IncompleteError if it stays non-finite."""
+    taken = _first_seeds(key)
+    half = scene.render_half(view, taken[0])
+    return half if np.isfinite(half).all() else _draw_again(scene, key, PURPOSES[0], view, taken)[0]
+
+
+def _first_seeds(key: Key) -> tuple[int, int]:
+    """Those of a sample's two estimates; they differ."""
+    seed_a = next(_seeds(key, PURPOSES[0], ()))
+    return seed_a, next(_seeds(key, PURPOSES[1], (seed_a,)))
 
 
 def _draw_again(scene: LoadedScene, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:

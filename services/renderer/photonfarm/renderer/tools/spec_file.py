@@ -97,6 +97,21 @@ def _put_table(text: str, name: str, entries: Mapping[str, int | float | dict[st
     document = tomlkit.parse(own)
     if name not in document:
         document[name] = tomlkit.table()
-    cast(tomlkit.items.AbstractTable, document[name]).update(entries)
+    _update(cast(tomlkit.items.AbstractTable, document[name]), entries)
     written = tomlkit.dumps(document)
     return written.rstrip("\r\n") + "\n" + text[len(own) :]
+
+
+def _update(table: tomlkit.items.AbstractTable, entries: Mapping[str, Any]) -> None:
+    """Write entries into a table; one that is a table already becomes equal, and keeps its form and its comments."""
+    for key, value in entries.items():
+        old = table.get(key)
+        if isinstance(value, dict) and isinstance(old, tomlkit.items.Table):
+            for gone in set(old) - set(value):
+                del old[gone]
+            _update(old, value)
+        elif isinstance(value, dict) and isinstance(old, tomlkit.items.InlineTable):
+            table[key] = tomlkit.inline_table()
+            table[key].update(value)
+        else:
+            table[key] = value

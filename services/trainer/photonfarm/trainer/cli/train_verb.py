@@ -81,7 +81,7 @@ def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
 @click.option(
     "--preset",
     type=click.Choice(list(PRESETS)),
-    help="Sizes of network and batch.  [default: card on a card, small on a processor]",
+    help="Sizes of network and batch.  [default: what the run was begun with, or card on a card, small on a processor]",
 )
 @click.option(
     "--architecture",
@@ -178,7 +178,6 @@ def train(
     """
     from photonfarm.trainer import service
     from photonfarm.trainer.cli import show
-    from photonfarm.trainer.runs.devices import AUTO, choose_preset
 
     others = (("--summary", summary), ("--check", check), ("--dry-run", dry_run))
     instead = [name for name, asked in others if asked]
@@ -191,7 +190,7 @@ def train(
     if check:
         service.check(run)
         return
-    preset = preset or choose_preset(changes.get("device", AUTO))
+    preset = preset or service.find_preset(run, changes)
     if summary:
         click.echo(service.summarise(spec, store, preset, changes))
     elif dry_run:

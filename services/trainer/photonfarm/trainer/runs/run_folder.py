@@ -23,11 +23,22 @@ from photonfarm.core.records import F32
 from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS, VIEWS
 from photonfarm.scene.spec_loading import SCENES_VARIABLE
 
-__all__ = ["CHECKPOINT", "INITIAL", "METRICS", "SETTINGS", "lock_run", "make_environment", "note_scene_folder"]
+__all__ = [
+    "CHECKPOINT",
+    "INITIAL",
+    "METRICS",
+    "SETTINGS",
+    "lock_run",
+    "make_environment",
+    "note_preset",
+    "note_scene_folder",
+    "read_preset",
+]
 
 LOCK = "lock"
 GOOD = "good.safetensors"  # a checkpoint of the last good validation, which a run that diverges goes back to
 SCENE_FOLDER = "scene-folder.txt"
+PRESET = "preset.txt"
 
 
 @contextmanager
@@ -63,6 +74,21 @@ def make_environment(folder: Path) -> dict[str, str]:
         return dict(os.environ)
     folders = filter(None, (os.environ.get(SCENES_VARIABLE), noted))
     return {**os.environ, SCENES_VARIABLE: os.pathsep.join(folders)}
+
+
+def note_preset(folder: Path, preset: str) -> None:
+    """Note which preset a run begins with; one that has a checkpoint keeps what was noted."""
+    if not (folder / CHECKPOINT).exists():
+        with store_errors("note the preset", folder):
+            (folder / PRESET).write_text(f"{preset}\n")
+
+
+def read_preset(folder: Path) -> str | None:
+    """The preset that a run was begun with; None where none was begun, or it was not noted."""
+    try:
+        return (folder / PRESET).read_text().strip() if (folder / CHECKPOINT).exists() else None
+    except (OSError, UnicodeDecodeError):
+        return None
 
 
 class MetricsLog:

@@ -11,11 +11,14 @@ from photonfarm.trainer.training.recent_losses import BEFORE, FEW, LOOK_EVERY, R
 Losses = np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 
 
-def looks(losses: Losses) -> list[int]:
-    """The steps at which a run of these losses is found to diverge."""
-    told = losses.tolist()
-    ends = range(LOOK_EVERY, len(told) + 1, LOOK_EVERY)
-    return [end for end in ends if judge(told[max(end - LOOK_EVERY - BEFORE, 0) : end]).is_diverging]
+def looks(losses: Losses, untrained: Losses | None = None) -> list[int]:
+    """The steps at which a run of these losses is found to diverge; without `untrained` ones the first are these."""
+    told, first = losses.tolist(), (losses if untrained is None else untrained)[:FEW].tolist()
+    return [
+        end
+        for end in range(LOOK_EVERY, len(told) + 1, LOOK_EVERY)
+        if judge(told[max(end - LOOK_EVERY - BEFORE, 0) : end], first[:end]).is_diverging
+    ]
 
 
 def two_values(share: float) -> Callable[[np.random.Generator, int], Losses]:
@@ -36,6 +39,27 @@ def test_losses_of_a_heavy_tail_never_send_a_run_back(name: str) -> None:
     """A run of the supplement's length, whose loss falls to a hundredth on the way."""
     rng, steps = np.random.default_rng(0), 150_000
     assert looks(HEAVY_TAILS[name](rng, steps) * np.geomspace(1, 0.01, steps)) == []
+
+
+@pytest.mark.parametrize("name", HEAVY_TAILS)
+def test_the_first_steps_of_a_run_that_learns_nothing_never_send_it_back(name: str) -> None:
+    """1000 runs, whose losses are a third to 1.2 of those that the untrained network has on the same batches."""
+    rng = np.random.default_rng(1)
+    noise = HEAVY_TAILS[name](rng, 1000 * (BEFORE + LOOK_EVERY)).reshape(1000, -1)
+    losses = noise * np.exp(rng.uniform(np.log(1 / 3), np.log(1.2), noise.shape))
+    assert [looks(*run) for run in zip(losses, noise, strict=True)] == [[]] * 1000
+
+
+@pytest.mark.parametrize("name", HEAVY_TAILS)
+@pytest.mark.parametrize("begins", [1, 4, 15, 25, 40, 60])
+def test_a_divergence_in_the_first_steps_is_found_under_the_same_noise(name: str, begins: int) -> None:
+    """Losses grow by a half a step to 100 000 times theirs, and stay there, as a network's whose weights are lost."""
+    grown = np.minimum(1.5 ** np.maximum(np.arange(200) - begins, 0), 1e5)
+    for seed in range(20):
+        noise = HEAVY_TAILS[name](np.random.default_rng(seed), 200)
+        found = looks(noise * grown, noise)
+        assert found
+        assert begins < found[0] <= begins + 50
 
 
 @pytest.mark.parametrize("name", HEAVY_TAILS)
@@ -71,18 +95,22 @@ def test_losses_that_are_a_little_higher_from_now_on_are_no_divergence() -> None
     assert looks(np.concatenate([rng.uniform(0.5, 1, 200), rng.uniform(1.5, 4, 200)])) == []
 
 
-def test_a_loss_that_is_not_finite_is_one_at_once_and_otherwise_the_first_ones_are_not_judged() -> None:
-    assert judge([1.0, float("nan")]).is_diverging
-    assert judge([1.0] * 500 + [float("inf")]).is_diverging
+def test_a_loss_that_is_not_finite_is_one_at_once_and_otherwise_the_first_ones_are_judged_by_untrained_ones() -> None:
+    assert judge([1.0, float("nan")], []).is_diverging
+    assert not judge([1.0] * LOOK_EVERY, [1.0, float("nan")]).is_diverging, "the batch was damaged, and is gone"
+    assert judge([1.0] * 500 + [float("inf")], []).is_diverging
     few = [1.0] * (FEW - 1) + [1e9] * LOOK_EVERY
-    assert not judge(few).is_diverging
-    assert judge([1.0, *few]).is_diverging
+    assert not judge(few, []).is_diverging
+    assert judge([1.0, *few], []).is_diverging
+    assert judge([1e9] * LOOK_EVERY, [1.0] * LOOK_EVERY).is_diverging
+    assert not judge([1e9] * (LOOK_EVERY - 1), [1.0] * LOOK_EVERY).is_diverging
+    assert not judge([1e9] * BEFORE + [1e9] * LOOK_EVERY, [1.0] * FEW).is_diverging, "by then they are usual"
 
 
 def test_a_loss_that_may_be_negative_is_judged_alike() -> None:
     """By its distance from the usual one, in units of that."""
-    assert not judge([-1.0] * 100 + [-0.9] * 10).is_diverging
-    assert judge([-1.0] * 100 + [4.0] * 10).is_diverging
+    assert not judge([-1.0] * 100 + [-0.9] * 10, []).is_diverging
+    assert judge([-1.0] * 100 + [4.0] * 10, []).is_diverging
 
 
 def test_losses_are_read_all_at_once_and_continue_from_a_checkpoint() -> None:

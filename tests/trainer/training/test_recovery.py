@@ -199,6 +199,20 @@ def test_a_run_of_too_high_a_rate_recovers_and_ends_far_better_than_without(
     assert not (tmp_path / "without" / GOOD).exists()
 
 
+@pytest.mark.parametrize("loss", ["linear", "relative"])
+def test_a_run_that_diverges_from_its_first_step_is_caught_by_its_tenth(
+    make_source, tiny, run, tmp_path, loss: str
+) -> None:
+    """No validation on the way finds it, and its own losses are all of a run that diverges."""
+    settings = tiny(learning_rate=0.02, loss=loss, max_steps=30, validate_every=30, checkpoint_every=30)
+    without = train(make_source(48), settings.model_copy(update={"recover": False}), tmp_path / "without")
+    outcome = train(make_source(48), settings, run)
+    first = records(run, "recovered")[0]
+    assert (first["cause"], first["step"], first["back_to"]) == ("loss", LOOK_EVERY, 0)
+    assert first["losses"]["now"] > FACTOR * first["losses"]["usual"]
+    assert outcome.last_error < 0.1 * without.last_error
+
+
 @pytest.mark.slow
 def test_a_run_whose_rate_rises_until_it_diverges_is_caught_within_thirty_steps_each_time_and_ends_well(
     make_source, tiny, run, tmp_path, monkeypatch, capsys

@@ -134,15 +134,21 @@ class Ranks:
         if self.size == 1:
             return loss.detach()
         gradients = [torch.zeros_like(w) if w.grad is None else w.grad for w in weights]
-        sums = torch.cat([*(g.flatten() for g in gradients), loss.detach().reshape(1)]) * count
-        sums = torch.cat([sums, sums.new_full((1,), count)])
-        with self._others_there():
-            distributed.all_reduce(sums)
+        own = torch.cat([*(g.flatten() for g in gradients), loss.detach().reshape(1)])
+        *means, mean_loss = torch.split(self.average(own, count), [*(g.numel() for g in gradients), 1])
         self.within_step = False
-        *means, mean_loss = torch.split(sums[:-1] / sums[-1], [*(g.numel() for g in gradients), 1])
         for weight, mean in zip(weights, means, strict=True):
             weight.grad = mean.view_as(weight)
         return mean_loss[0]
+
+    def average(self, means: Tensor, count: int) -> Tensor:
+        """Means over the joint batch, (k,), given those over the `count` samples here."""
+        if self.size == 1:
+            return means
+        sums = torch.cat([means * count, means.new_full((1,), count)])
+        with self._others_there():
+            distributed.all_reduce(sums)
+        return sums[:-1] / sums[-1]
 
     @contextmanager
     def lead(self) -> Iterator[None]:

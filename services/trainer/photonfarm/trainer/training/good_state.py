@@ -14,11 +14,12 @@ from torch import Tensor
 
 from photonfarm.core.errors import store_errors
 from photonfarm.trainer.data.batch import TrainingBatch
+from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import GOOD
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.learner import DivergedError, Learner
-from photonfarm.trainer.training.recent_losses import LOOK_EVERY, Judgement, RecentLosses, judge
+from photonfarm.trainer.training.recent_losses import FEW, LOOK_EVERY, Judgement, RecentLosses, judge
 
 NEXT = "good.next.safetensors"  # in the run's folder too, until the checkpoint that refers to it is written
 WITHOUT = "remove it, and the run goes on, with nothing to go back to before its next good validation"
@@ -55,7 +56,8 @@ class GoodState:
         self._is_new = False  # not in any file yet
         self.step: int | None = None  # at which it was kept; None if nothing is
         self.recoveries = 0
-        self._losses = RecentLosses()
+        self._losses, self._untrained = RecentLosses(), RecentLosses()
+        self._first_network: Network | None = None  # as it was before any step
         self._snapshot: dict[str, Any] | None = None  # `step`, `losses`, and the `learner`'s state
 
     def keep(self, step: int, rest: Mapping[str, Any] | None = None) -> None:
@@ -70,11 +72,13 @@ class GoodState:
         """
         if self._settings.recover and self._snapshot is None:
             self._take_snapshot(number)
+        if self._settings.recover:
+            self._add_untrained_loss(number, batch)
         self._losses.add(self._learner.step(number, batch))
         done = number + 1
         if done % LOOK_EVERY and done % self._settings.checkpoint_every:
             return None
-        judgement = judge(self._losses.read())
+        judgement = judge(self._losses.read(), self._untrained.read())
         if self._snapshot is None:
             if not math.isfinite(judgement.now):
                 raise DivergedError(f"step {done}: {judgement.sentence}")
@@ -83,6 +87,15 @@ class GoodState:
         elif judgement.is_calm and done - self._snapshot["step"] >= SNAPSHOT_EVERY:
             self._take_snapshot(done)
         return None
+
+    def _add_untrained_loss(self, number: int, batch: TrainingBatch) -> None:
+        """In the first steps, add what the loss of this batch is without any."""
+        if number >= FEW:
+            self._first_network = None
+            return
+        if self._first_network is None:
+            self._first_network = self._learner.make_untrained()
+        self._untrained.add(self._learner.compute_loss(self._first_network, batch))
 
     def _take_snapshot(self, step: int) -> None:
         learner = _copy(self._learner.state())
@@ -126,11 +139,11 @@ class GoodState:
         return {"good": self.step, "recoveries": self.recoveries, "rate_factor": self._learner.rate_factor}
 
     def recent(self, step: int) -> dict[str, Any]:
-        """The losses, and the snapshot, for a checkpoint at a step, which is itself the snapshot if that is as old."""
+        """The losses and the snapshot, for a checkpoint at a step, which is itself the snapshot if that is as old."""
         snapshot = self._snapshot
         if snapshot is not None and snapshot["step"] == step:
             snapshot = {**snapshot, "learner": None}
-        return {"losses": self._losses.state(), "snapshot": snapshot}
+        return {"losses": self._losses.state(), "untrained": self._untrained.state(), "snapshot": snapshot}
 
     def restore(self, state: dict[str, Any], run: Path) -> None:
         """Continue, and let the learner continue, from a checkpoint's state and the file beside it.
@@ -147,6 +160,7 @@ class GoodState:
             self._kept, self.step = kept, own["good"]
         if recent := state.get("recent"):  # a validated state, taken for a checkpoint, has none
             self._losses.restore(recent["losses"])
+            self._untrained.restore(recent["untrained"])
             if snapshot := recent["snapshot"]:
                 self._snapshot = {**snapshot, "learner": _copy(snapshot["learner"] or self._learner.state())}
 

@@ -170,9 +170,9 @@ class Learner:
 
     def __init__(self, frame: SceneFrame, settings: TrainSettings, ranks: Ranks) -> None:
         """Make the untrained network of a scene, on the device of this process."""
-        self._settings, self._ranks = settings, ranks
+        self._settings, self._ranks, self._frame = settings, ranks, frame
         self._device = ranks.device(settings.device)
-        self.network = build(settings.network, frame, settings.seed).to(self._device)
+        self.network = self.make_untrained()
         self._loss, self.verdict = find_loss(settings.loss)  # the loss, and the result of the test of its unbiasedness
         self.optimiser = build_optimiser(group_weights(self.network, settings), settings)
         self.average = WeightAverage(self.network, settings.average) if settings.average else None
@@ -204,6 +204,17 @@ class Learner:
         if self.average is not None:
             self.average.take(self.network)
         return mean_loss
+
+    def make_untrained(self) -> Network:
+        """Make the network as it is before any step."""
+        return build(self._settings.network, self._frame, self._settings.seed).to(self._device)
+
+    @torch.no_grad()
+    def compute_loss(self, network: Network, batch: TrainingBatch) -> Tensor:
+        """The loss of a network on the whole batch, (), of which a part is here; as `step` returns it."""
+        batch = batch.to(self._device).for_training()
+        loss = self._loss(predict_image(network, batch.inputs), batch.target)
+        return self._ranks.average(loss.reshape(1), len(batch.rows))[0]
 
     def state(self) -> dict[str, Any]:
         """The weights, their average if there is one, and the optimiser's state, for a checkpoint."""

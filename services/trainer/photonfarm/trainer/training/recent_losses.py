@@ -18,7 +18,7 @@ LOOK_EVERY = 10  # steps; equal on every device, so that runs are
 BEFORE = 100  # steps, before those
 
 FEW = 30
-"""The losses before below which there is no judgement: a run's first, which fall steeply, say little."""
+"""The losses below which those before say nothing of what is usual; and the first steps whose untrained losses do."""
 
 SHARE = 0.1
 """The share of the losses before that exceed the usual ones."""
@@ -35,7 +35,7 @@ class Judgement:
     """What the last losses say of a run."""
 
     now: float  # the loss that `HIGH` of the last ones reach
-    usual: float  # the loss that only `SHARE` of those before exceed; infinite while there are too few
+    usual: float  # the loss that only `SHARE` of those before exceed, or of the untrained ones if these are lower
     is_diverging: bool
     is_calm: bool  # the median of the last ones is a usual loss
 
@@ -47,8 +47,11 @@ class Judgement:
         return f"the loss is {self.now:.5g} or more in {HIGH} of {LOOK_EVERY} steps, and was up to {self.usual:.5g}"
 
 
-def judge(losses: Sequence[float]) -> Judgement:
-    """Judge the last `LOOK_EVERY` losses by those before.
+def judge(losses: Sequence[float], untrained: Sequence[float]) -> Judgement:
+    """Judge the last `LOOK_EVERY` losses by those before, and in the first `BEFORE` steps by the `untrained` ones too.
+
+    These are the losses of the network as it was before any step, on the batches of the first steps. So a run that
+    diverges from its beginning does not pass its own faults off as usual.
 
     It is no fault of a run that a batch holds rare bright samples, and to go back on their account would darken what it
     learns, as clipping does. So what counts is how many losses are unusual, and not by how much. Whatever the tail of
@@ -56,14 +59,21 @@ def judge(losses: Sequence[float]) -> Judgement:
     """
     if not all(map(math.isfinite, losses)):
         return Judgement(math.nan, math.nan, is_diverging=True, is_calm=False)
-    last, before = sorted(losses[-LOOK_EVERY:]), sorted(losses[:-LOOK_EVERY])
+    last, before = sorted(losses[-LOOK_EVERY:]), losses[:-LOOK_EVERY]
     now = last[-min(HIGH, len(last))]
-    if len(before) < FEW:
-        return Judgement(now, math.inf, is_diverging=False, is_calm=True)
-    usual = before[math.ceil((1 - SHARE) * len(before)) - 1]
+    first = list(filter(math.isfinite, untrained))  # those of a damaged batch are not
+    by_untrained = _find_usual(first) if first and len(before) < BEFORE else math.inf
+    usual = min(_find_usual(before) if len(before) >= FEW else math.inf, by_untrained)
+    if len(last) < LOOK_EVERY or usual == math.inf:
+        return Judgement(now, usual, is_diverging=False, is_calm=True)
     is_high = now > usual + (FACTOR - 1) * abs(usual)
     is_calm = last[LOOK_EVERY // 2] <= usual
     return Judgement(now, usual, is_diverging=is_high and last[-UNUSUAL] > usual, is_calm=is_calm)
+
+
+def _find_usual(losses: Sequence[float]) -> float:
+    """The loss that only `SHARE` of these exceed."""
+    return sorted(losses)[math.ceil((1 - SHARE) * len(losses)) - 1]
 
 
 class RecentLosses:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import sys
 import time
 from itertools import product
 from pathlib import Path
@@ -13,13 +14,14 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from experiments import experiment
+from experiments import experiment, run
 from experiments.dry_run import Need
 from experiments.experiment import FREE_SPACE, Experiment, Size, SizeName, keep_free_space, list_names, merge
 from experiments.paper_tables import format_errors
 from experiments.rooms import Room
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
-from photonfarm.core.errors import SpecError
+from experiments.tables import format_page
+from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.plan.sample_costs import SampleCosts
 from photonfarm.scene.free_space import FreeSpace, pack
 from photonfarm.scene.spec import Emitters
@@ -133,6 +135,66 @@ def test_the_size_card_is_for_ten_minutes_a_network_and_has_the_most_telling_fir
     found = Experiment.load("fixed-veach-ajar", "card")
     assert [run.name for run in found.trained()[:2]] == ["guided_transport", "denoise_1"]
     assert all(run.train["max_seconds"] == 600 for run in found.trained())
+
+
+SMALLEST_CARD = """
+title = "A room for a card"
+part = "movable"
+about = "For the test."
+scene = "room.toml"
+
+[card]
+about = "as the size card, but for its numbers"
+changes = { film = { width = 32, height = 32 }, transport = { half_spp = 1 }, points = 256, photons = { paths = 64 } }
+modifications = 16
+hold_out = 0.4
+references = { views = 2, spp = 4 }
+
+[card.train]
+max_steps = 3
+width = 4
+points = 128
+"""
+
+
+def call_run(monkeypatch: pytest.MonkeyPatch, work: Path, *arguments: str) -> int:
+    monkeypatch.setattr(sys, "argv", ["run.py", "room-of-a-card", "--size", "card", "--work", str(work), *arguments])
+    return run.main()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+@pytest.mark.usefixtures("tiny")
+def test_the_size_card_runs_to_its_end_and_goes_on_where_its_minutes_were_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All of what sizes.toml says of it, at another film, width and number of images and steps."""
+    shutil.copy(Path(experiment.__file__).with_name("sizes.toml"), tmp_path)
+    (tmp_path / "tiny.toml").unlink()
+    (tmp_path / "room-of-a-card.toml").write_text(SMALLEST_CARD)
+    keep_all_free("room-of-a-card")
+    found, work = Experiment.load("room-of-a-card", "card"), tmp_path / "work"
+    stages = Stages(found, work / "card" / found.name, 2)
+    stages.write_spec()
+    stages.render()
+
+    assert call_run(monkeypatch, work, "--minutes", "0.2") == IncompleteError.exit_code
+    names = [run.name for run in found.trained()]
+    begun = [(stages.folder / "logs" / f"train-{name}.log").is_file() for name in names]
+    assert len(names) == 12
+    assert begun == sorted(begun, reverse=True), "the most telling come first"
+    assert not begun[-1]
+    ended = [stages._checkpoint(run) for run in found.trained() if stages._is_trained(run)]
+    before = [file.stat().st_mtime_ns for file in ended]
+    assert call_run(monkeypatch, work) == 0
+    assert before == [file.stat().st_mtime_ns for file in ended]
+
+    report = json.loads((stages.folder / "report/report.json").read_text())
+    assert [row["name"] for row in report["evaluation"]["rows"]] == [*names, *(f"oidn 1/{kept}" for kept in (1, 4, 16))]
+    assert all(run["steps"] == 3 and run["settings"]["batch"] == 8 for run in report["runs"])
+    assert all(run["settings"]["network"]["precision"] == "bfloat16" for run in report["runs"])
+    page = " ".join(format_page([Room.read(found, stages.folder / "report/report.json", "1234567")], "card").split())
+    assert "averaged weights, bfloat16, scaled rates of layers" in page
 
 
 def test_what_does_not_begin_for_want_of_time_leaves_no_commit(tiny: Experiment, tmp_path: Path) -> None:

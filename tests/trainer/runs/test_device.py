@@ -1,5 +1,7 @@
 """Which device a name stands for, and training on CUDA where there is one."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,13 @@ from held_out_errors import held_out_errors
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.devices import choose_preset, describe_device, round_convolutions, usable_device
+from photonfarm.trainer.runs.devices import (
+    choose_preset,
+    compute_deterministically,
+    describe_device,
+    round_convolutions,
+    usable_device,
+)
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.loop import train
@@ -58,6 +66,38 @@ def test_on_cuda_tf32_is_that_of_the_network_that_makes_the_image_and_of_its_gra
         network = NetworkSettings(width=4, precision=precision)
         train(make_source(24), tiny(network=network, device="cuda"), run / precision)
         assert torch.backends.cudnn.allow_tf32 is (precision != "float32")
+
+
+def test_only_a_card_is_told_to_keep_to_an_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.backends.cudnn, "benchmark", True)
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", "")
+    try:
+        compute_deterministically(torch.device("cpu"))
+        assert not torch.are_deterministic_algorithms_enabled()
+        compute_deterministically(torch.device("cuda"))
+        assert torch.are_deterministic_algorithms_enabled()
+        assert not torch.backends.cudnn.benchmark
+        assert os.environ["CUBLAS_WORKSPACE_CONFIG"] == ":4096:8"
+    finally:
+        torch.use_deterministic_algorithms(mode=False)
+
+
+@pytest.mark.parametrize("architecture", ["light_transport_photons", "guided_transport_photons"])
+def test_a_run_that_goes_on_is_the_same_to_the_bit_on_a_card_too_if_told_so(
+    make_source, tiny, run, tmp_path, architecture: str
+) -> None:
+    """On a processor the setting changes nothing, and the first run is without it."""
+    network = NetworkSettings(width=4, architecture=architecture)
+    try:
+        train(make_source(24, photons=16), tiny(network=network, deterministic=HAS_CUDA), run)
+        for steps in (5, 12):
+            resumed = tiny(network=network, deterministic=True, max_steps=steps)
+            train(make_source(24, photons=16), resumed, tmp_path / "resumed")
+        weights = [checkpoint.load(folder / CHECKPOINT)["network"] for folder in (run, tmp_path / "resumed")]
+        assert [name for name, weight in weights[0].items() if not torch.equal(weight, weights[1][name])] == []
+        assert torch.are_deterministic_algorithms_enabled() is HAS_CUDA
+    finally:
+        torch.use_deterministic_algorithms(mode=False)
 
 
 @pytest.mark.skipif(HAS_CUDA, reason="there is a CUDA device")

@@ -42,8 +42,21 @@ def usable_device(name: str) -> torch.device:
         raise SpecError(f"device = {name!r}: cannot be used here: {str(error).splitlines()[0]}") from error
     if device.type == "cuda":
         torch.backends.cudnn.allow_tf32 = False
-        torch.backends.cudnn.benchmark = True
+        torch.backends.cudnn.benchmark = not torch.are_deterministic_algorithms_enabled()
     return device
+
+
+def compute_deterministically(device: torch.device) -> None:
+    """Let torch make equal values of equal ones on CUDA, from now on in this process; a processor does so anyway.
+
+    Sums are taken in a fixed order then, and no convolution is chosen by its time, which differs from one process to
+    the next. cuBLAS heeds its variable if it has not computed before. An operation that torch has in no such form, as a
+    user's network may hold, raises torch's own RuntimeError, which names it.
+    """
+    if device.type == "cuda":
+        os.environ["CUBLAS_WORKSPACE_CONFIG"] = ":4096:8"
+        torch.backends.cudnn.benchmark = False
+        torch.use_deterministic_algorithms(mode=True)
 
 
 def is_asynchronous(device: torch.device) -> bool:

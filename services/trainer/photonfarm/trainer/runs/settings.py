@@ -194,6 +194,8 @@ class TrainSettings(Frozen):
     device: str = "auto"  # cuda where torch has one, and otherwise the cpu
     compile: Compilation = "off"  # "on": torch.compile makes kernels for the U-Net, which takes minutes at first, and
     # is slower than without on a CPU (docs/results/train_step.md); "graphs": with CUDA graphs too
+    deterministic: bool = False  # on a card, that a run that was killed ends in the weights of one that was not, to the
+    # bit, as on a processor anyway; it costs time, as no sum is taken in the order in which its terms are ready
     resident_gb: Literal["auto"] | Annotated[float, Field(ge=0)] = "auto"  # of decoded samples that are kept on the
     # device; "auto": on CUDA while a quarter of the card is free, and none on a CPU, beside whose memory the files lie
 

@@ -20,7 +20,7 @@ from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import build, predict_image
 from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.runs.devices import Ranks
+from photonfarm.trainer.runs.devices import Ranks, compute_deterministically
 from photonfarm.trainer.runs.settings import Compilation, TrainSettings
 from photonfarm.trainer.training.losses import find_loss
 
@@ -172,6 +172,8 @@ class Learner:
         """Make the untrained network of a scene, on the device of this process."""
         self._settings, self._ranks, self._frame = settings, ranks, frame
         self._device = ranks.device(settings.device)
+        if settings.deterministic:
+            compute_deterministically(self._device)
         self.network = self.make_untrained()
         self._loss, self.verdict = find_loss(settings.loss)  # the loss, and the result of the test of its unbiasedness
         self.optimiser = build_optimiser(group_weights(self.network, settings), settings)

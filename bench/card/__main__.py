@@ -36,6 +36,10 @@ LEAST_S = 5.0
 """The least time with which a part is begun."""
 
 
+OF_TIMES = """Milliseconds and rates are by the clock of a card; where a processor renders they are of its time, of all
+cores together, however much else is at work. First calls compile what no earlier run left in Dr.Jit's cache."""
+
+
 @dataclass(frozen=True, slots=True)
 class Part:
     """One measurement of a kind: of a room, or of an architecture."""
@@ -130,7 +134,7 @@ def measure_apart(part: Part, run: dict[str, Any], out: Path, limit_s: float) ->
 def page(parts: Sequence[Part], run: dict[str, Any], out: Path) -> str:
     """What was found, by kind, and what is missing."""
     kept = {part: read_kept(part, run, out) for part in parts}
-    text = [f"# The device {run['device']}"]
+    text = [f"# The device {run['device']}", OF_TIMES]
     for kind, module in KINDS.items():
         found = {part.of: kept[part] for part in parts if part.kind == kind}
         whole = {of: each for of, each in found.items() if "missing" not in each}

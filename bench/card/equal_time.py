@@ -129,10 +129,12 @@ class RenderedRoom:
 
 
 def timed_s(work: Callable[[], Any]) -> tuple[float, Any]:
-    """The seconds by the clock of some work, and its result."""
-    began = time.perf_counter()
+    """The seconds of some work, of the processor where that renders, and its result."""
+    from photonfarm.renderer.scene import backend
+
+    began = backend.work_s()
     found = work()
-    return time.perf_counter() - began, found
+    return backend.work_s() - began, found
 
 
 def guide_by_albedo(scene: LoadedScene, view: View) -> Guide:

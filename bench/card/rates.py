@@ -87,7 +87,7 @@ def describe(found: Mapping[str, Mapping[str, Any]]) -> str:
                 method,
                 f"{row['millions']:.3g}",
                 "" if method == BARE else f"×{path / row['millions']:.2f}",
-                f"{row['first_s']:.1f}",
+                f"{row['first_s']:.2g}",
             ]
             for method, row in of["rows"].items()
         ]

@@ -67,6 +67,7 @@ def scene_show(spec: str, as_json: bool) -> None:
     help="Say what would be planned, its size and cost, and what should teach more at that cost; write nothing.",
 )
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
+@device_option
 @json_option
 def submit(
     spec: str,
@@ -88,6 +89,7 @@ def submit(
     from photonfarm.cli import show
     from photonfarm.farm import dry_run as dry
     from photonfarm.farm import submission
+    from photonfarm.farm.devices import AUTO, DEVICE_VARIABLE, is_card_wanted
     from photonfarm.farm.hold_out_checks import find_hold_out_warning
     from photonfarm.scene.plausibility import warnings
     from photonfarm.scene.spec_loading import NamedSpec
@@ -102,7 +104,11 @@ def submit(
     else:
         url = None if no_queue else redis_url
         result = submission.submit(
-            named, store, url, request, retry=retry, shard_rows=shard_rows, halves_from=halves_from
+            *(named, store, url, request),
+            retry=retry,
+            shard_rows=shard_rows,
+            on_card=is_card_wanted(os.environ.get(DEVICE_VARIABLE) or AUTO),
+            halves_from=halves_from,
         )
     show.print_submission(result, as_json)
 

@@ -89,6 +89,14 @@ def worker_devices(name: str, cards: Cards) -> tuple[str, ...]:
     return tuple(f"{CUDA}:{card.number}" for card in cards.cards) if name in (AUTO, CUDA) else (name,)
 
 
+def is_card_wanted(name: str) -> bool:
+    """Whether a device's name stands for a card, wherever that is: by its name, or for `auto` as this machine has one.
+
+    That workers run where plans are made is a guess.
+    """
+    return name.startswith(CUDA) or (name == AUTO and not cards_here().trouble)
+
+
 def visible_device(card: Card) -> str:
     """The value of CUDA_VISIBLE_DEVICES that leaves this card alone, within what it leaves already."""
     visible = [each.strip() for each in os.environ.get(VISIBLE_VARIABLE, "").split(",") if each.strip()]

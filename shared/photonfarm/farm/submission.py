@@ -29,7 +29,7 @@ JOBS_EACH = 4
 """The jobs that each worker should have at least, so that none idles for long while others render the last ones."""
 
 MOST_S = 10.0
-"""The longest that a job should take, in core-seconds."""
+"""The longest that a job should take, in seconds of a core or a card."""
 
 LEAST_S = 2.0
 """The shortest, whatever JOBS_EACH says: a scene's jobs are all of one size, and large plans may follow a small one."""
@@ -42,23 +42,34 @@ PATHS_PER_S = 250_000.0
 
 DEPTH = 8
 
+CARD_SAMPLE_S, CARD_PATHS_PER_S = 0.05, 20_000_000.0
+"""The same of a card: an H200, whose samples took 20 to 80 ms beside 17 to 25 million paths a second of bdpt."""
 
-def estimate_sample_seconds(spec: SceneSpec) -> float:
-    """The estimated core-seconds of a sample; those of real rooms are up to three times more or less."""
+CARD_ROWS = 64
+"""The most samples of a job for a card: of a small image as many as this fill it together."""
+
+
+def estimate_sample_seconds(spec: SceneSpec, *, on_card: bool = False) -> float:
+    """The estimated seconds of a core, or a card, for a sample; of real rooms they are up to three times more or less.
+
+    Without `on_card` a core renders.
+    """
     film, transport = spec.film, spec.transport
+    each_s, paths_per_s = (CARD_SAMPLE_S, CARD_PATHS_PER_S) if on_card else (SAMPLE_S, PATHS_PER_S)
     paths = film.width * film.height * 2 * transport.half_spp  # of both halves
-    return SAMPLE_S + paths * max(transport.max_depth, 1) / DEPTH / PATHS_PER_S
+    return each_s + paths * max(transport.max_depth, 1) / DEPTH / paths_per_s
 
 
-def choose_rows_per_job(spec: SceneSpec, request: Request, workers: int = WORKERS) -> int:
+def choose_rows_per_job(spec: SceneSpec, request: Request, workers: int = WORKERS, *, on_card: bool = False) -> int:
     """The samples of a job for a scene whose first request this is: some seconds of work, and several jobs a worker.
 
     Jobs of many seconds keep workers idle at the end, and show nothing for long; jobs of less than a second cost more
-    than they render, in files and markers.
+    than they render, in files and markers. Cards render what takes cores minutes in seconds, so jobs for them have more
+    samples.
     """
-    sample_s = estimate_sample_seconds(spec)
+    sample_s = estimate_sample_seconds(spec, on_card=on_card)
     shared_out = max(request.samples // (workers * JOBS_EACH), round(LEAST_S / sample_s))
-    rows = max(1, min(shared_out, round(MOST_S / sample_s), SHARD_ROWS))
+    rows = max(1, min(shared_out, round(MOST_S / sample_s), CARD_ROWS if on_card else SHARD_ROWS))
     of_configuration = request.views_per_modification * request.passes
     return rows - rows % of_configuration if rows > of_configuration else rows  # so that photons are rendered once
 
@@ -99,18 +110,20 @@ def submit(
     retry: bool = False,
     shard_rows: int | None = None,
     workers: int = WORKERS,
+    on_card: bool = False,
     halves_from: str | None = None,
 ) -> Submission:
     """Plan the new samples of a request, and queue every missing job of the store unless `redis_url` is None.
 
-    Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`.
+    Without `shard_rows`, a scene's first request gets jobs of some seconds, several for each of the `workers`,
+    which render `on_card` or on cores.
     `halves_from` is a scene of the store by its id or how it begins: jobs take over the halves it has. Without it, that
     is the scene of the same radiance with most of them, if there is one.
     With `retry` also jobs that were set aside. While somebody has the scene for itself, this waits and says so. Raises
     SpecError, StoreError, or QueueError; in the last case the plan is kept, and idle workers queue it later.
     """
     opened = Store(store, create=True)
-    usual = choose_rows_per_job(named.spec, request, workers)
+    usual = choose_rows_per_job(named.spec, request, workers, on_card=on_card)
     other = scene_named(opened, halves_from) if halves_from else find_same_radiance(opened, named.spec)
     before = stored_spec(opened.storage, named.spec.scene_id)
     replaced = None if before is None else _describe_replaced(before, named.spec)

@@ -102,7 +102,13 @@ def run_farm(
     with ExitStack() as stack:
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
-        planned = submit(named, store, redis.url, request, retry=True, shard_rows=shard_rows, workers=workers)
+        planned = submit(
+            *(named, store, redis.url, request),
+            retry=True,
+            shard_rows=shard_rows,
+            workers=workers,
+            on_card=CPU not in devices,
+        )
         say(f"{format_count(planned.planned, 'sample')} planned, {planned.planned_before} planned before")
         if references:
             added = top_up(named, store, redis.url, str(reference_spp), where=which, retry=True)

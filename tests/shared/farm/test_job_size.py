@@ -2,13 +2,17 @@
 
 import pytest
 import store_samples as samples
+from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
 from photonfarm.farm import submission
-from photonfarm.farm.submission import choose_rows_per_job, estimate_sample_seconds
+from photonfarm.farm.devices import DEVICE_VARIABLE
+from photonfarm.farm.submission import CARD_ROWS, choose_rows_per_job, estimate_sample_seconds
 from photonfarm.plan.request import SHARD_ROWS, Request
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
+from photonfarm.store.read.find import scene_named
 
 
 def spec_of(side: int, half_spp: int) -> SceneSpec:
@@ -27,6 +31,29 @@ def test_jobs_of_a_large_plan_take_some_seconds() -> None:
         rows = choose_rows_per_job(spec, Request(modifications=100_000), workers=8)
         assert rows == 1 or rows * estimate_sample_seconds(spec) <= 1.5 * submission.MOST_S
         assert rows in (1, SHARD_ROWS) or rows * estimate_sample_seconds(spec) >= submission.LEAST_S
+
+
+def test_jobs_for_a_card_have_more_samples_and_take_some_seconds_of_it() -> None:
+    request = Request(modifications=100_000)
+    for side, half_spp, most in ((64, 4, CARD_ROWS), (256, 4, CARD_ROWS), (256, 16, CARD_ROWS), (512, 64, 10)):
+        spec = spec_of(side, half_spp)
+        rows = choose_rows_per_job(spec, request, workers=1, on_card=True)
+        seconds = rows * estimate_sample_seconds(spec, on_card=True)
+        assert choose_rows_per_job(spec, request, workers=1) < rows <= most
+        assert submission.LEAST_S <= seconds <= 1.5 * submission.MOST_S
+
+
+def test_submit_sizes_jobs_for_the_device_that_it_is_told(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether or not this machine has it."""
+    rows = []
+    for name, device in (("room", "cuda"), ("cornell", "cpu")):
+        monkeypatch.setenv(DEVICE_VARIABLE, device)
+        command = ["submit", name, "--store", str(store.root), "--no-queue", "--modifications", "1000"]
+        done = CliRunner().invoke(umbrella, command)
+        assert done.exit_code == 0, done.output
+        rows.append(Store(store.root).scene(scene_named(store, name)).plans()[0].shard_rows)
+    assert SHARD_ROWS < rows[0] <= CARD_ROWS
+    assert rows[1] <= SHARD_ROWS
 
 
 def test_a_configuration_is_not_split_over_jobs_if_one_holds_it() -> None:

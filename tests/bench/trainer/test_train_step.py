@@ -1,9 +1,12 @@
 """Steps and images of every network are timed, those with guides too."""
 
+import pytest
+
 from bench.trainer.train_step import WHOLE, WorkTimer, filled, for_architecture, measure, resized, shown
 from photonfarm.trainer.runs.settings import make_preset
 
 
+@pytest.mark.slow
 def test_every_network_takes_its_steps_and_its_parts_are_timed(tmp_path) -> None:
     where = tmp_path, filled(resized(16, 64), tmp_path, 32)
     settings = make_preset("small", network={"width": 4, "points": 64})

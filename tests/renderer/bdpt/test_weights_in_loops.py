@@ -231,8 +231,15 @@ def lit_by_everything(size: int) -> Any:
     return scene
 
 
-@pytest.mark.parametrize("guided", [False, True])
-@pytest.mark.parametrize("build", [hard_scenes.cornell, lit_by_everything])
+@pytest.mark.parametrize(
+    ("build", "guided"),
+    [
+        (hard_scenes.cornell, False),
+        (hard_scenes.cornell, True),
+        pytest.param(lit_by_everything, False, marks=pytest.mark.slow),
+        (lit_by_everything, True),
+    ],
+)
 def test_weights_of_a_render_are_the_oracles(build: Any, guided: bool, recorder: Recorder) -> None:
     scene = mi.load_dict(build(SIZE), optimize=False)
     lights, lens, guide, useful = read_lights(scene), Pinhole.of(scene), None, None

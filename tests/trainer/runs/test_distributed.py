@@ -275,6 +275,7 @@ def test_a_batch_smaller_than_the_group_is_refused(monkeypatch: pytest.MonkeyPat
         pass
 
 
+@pytest.mark.slow
 def test_torchrun_trains_a_store_with_two_processes(scene, commit, run) -> None:
     scene.plan(Request(modifications=12), shard_rows=12)
     commit(scene, 0)

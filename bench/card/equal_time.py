@@ -162,8 +162,7 @@ def load_oidn() -> list[tuple[str, Denoiser, Callable[[LoadedScene, View], Guide
     """Open Image Denoise on the device that renders, by label. Raises SpecError where it is not installed."""
     import torch
 
-    from photonfarm.trainer.predictors.denoisers import Oidn
-    from photonfarm.trainer.predictors.trained import OIDN
+    from photonfarm.trainer.predictors.denoisers import OIDN, Oidn
 
     device = torch.device("cuda" if on_card() else "cpu")
 

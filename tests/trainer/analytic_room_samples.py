@@ -81,6 +81,12 @@ class AnalyticSource:
     def modification_keys(self, rows: Sequence[int]) -> list[Key]:
         return [self.modification_key(row) for row in rows]
 
+    def earlier_passes(self, row: int) -> NDArray[np.int64]:
+        return np.arange(row, row)  # each row is a view of its own
+
+    def read_radiance(self, row: int) -> F32:
+        return self.read(row).radiance
+
     def view_keys(self, rows: Sequence[int]) -> list[Key]:
         return [self.view_key(row) for row in rows]
 

@@ -12,4 +12,4 @@ from photonfarm.trainer.networks.inputs import Needs
 def batch_of(source: SceneReader, rows: Sequence[int], needs: Needs) -> TrainingBatch:
     """The samples of these rows, with all points if points are needed, exposed."""
     dataset = SceneDataset(source, needs.fields, exposure=source.spec.exposure)
-    return read_batch(source, dataset, rows, needs.kept)
+    return read_batch(source, dataset, rows, needs)

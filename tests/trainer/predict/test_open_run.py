@@ -130,8 +130,7 @@ def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_pat
     with torch.no_grad():
         one, again = (opened.predict(rest(opened.spec), view) for _ in range(2))
     torch.testing.assert_close(one, again, rtol=0, atol=0)
-    noisy = opened._inputs(view).noisy
-    assert noisy is not None
+    noisy = opened._noisy(view)
     assert int(noisy.kept.sum()) == 24 * 16 // 4
     assert float(noisy.colour.sum()) > 0
 
@@ -147,9 +146,24 @@ def test_a_noisy_image_that_is_not_finite_is_drawn_again(
         return plain(scene, view, asked, *more) * (np.nan if len(seeds) == 1 else 1)
 
     monkeypatch.setattr(LoadedScene, "render_halves", spoil_first)
-    colour = opened._inputs(view).noisy.colour[0].numpy()
+    colour = opened._noisy(view).colour[0].numpy()
     assert len(set(seeds)) == 2
     np.testing.assert_array_equal(colour, plain(opened._scene, view, seeds[1:])[0] * np.float32(opened.spec.exposure))
+
+
+def test_a_frame_from_a_noisy_half_goes_from_one_pass_to_several_and_to_two_halves(store: Path, tmp_path: Path) -> None:
+    opened = open_run(trained(store, tmp_path / "run", "guided_denoise"), store)
+    view, at = sample_view(opened.spec, b"view of a test..", 0, 0), rest(opened.spec)
+    with torch.no_grad():
+        one, several, both = (
+            opened.predict(at, view, **how) for how in ({}, {"passes": 3}, {"passes": 3, "both": True})
+        )
+    three, others = opened._noisy(view, 3), opened._noisy(view, 3, other=True)
+    assert three.variance is not None
+    spread = float((three.colour - others.colour).mean(dim=-1).square().mean())
+    assert spread == pytest.approx(2 * float(three.variance.mean()), rel=0.5)
+    assert not torch.equal(one, several)
+    assert not torch.equal(several, both)
 
 
 def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_in_place(

@@ -13,9 +13,9 @@ import torch
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Needs
-from photonfarm.trainer.predictors.denoisers import Oidn, fill_in
+from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
 from photonfarm.trainer.predictors.evaluation import measure, read_batches
-from photonfarm.trainer.predictors.trained import OIDN, ReadyPredictor
+from photonfarm.trainer.predictors.trained import ReadyPredictor
 from photonfarm.trainer.runs.settings import OidnQuality
 
 pytest.importorskip("mitsuba_oidn", reason="the extra `oidn` is not installed")

@@ -109,7 +109,8 @@ def of_architecture(seen: Seen, architecture: Architecture) -> Rendered:
     tensors = SampleTensors(seen.spec, ARCHITECTURES[architecture].needs.fields, exposure=seen.spec.exposure)
     memory = tensors.empty(1)
     tensors.fill(memory, 0, seen.sample)
-    batch = TrainingBatch.of((0,), (seen.sample.key,), memory)
+    kept = torch.ones(1, SIZE, SIZE, dtype=torch.bool) if ARCHITECTURES[architecture].needs.kept else None
+    batch = TrainingBatch.of((0,), (seen.sample.key,), memory, kept)
     settings = TrainSettings(network=network_settings, learning_rate=2e-3)
     network = build(settings.network, SceneFrame.of(seen.spec, *seen.base, settings.network), 0)
     noisy, converged = torch.from_numpy(seen.noisy), torch.from_numpy(seen.converged)
@@ -190,10 +191,11 @@ def test_noisy_targets_give_the_gradient_of_the_clean_image_for_every_weight_ten
         pytest.param("guided_transport", "relative", marks=pytest.mark.slow),
         pytest.param("guided_photons", "relative", marks=pytest.mark.slow),
         ("guided_transport_photons", "relative"),
+        pytest.param("guided_denoise", "relative", marks=pytest.mark.slow),
     ],
 )
 def test_so_they_do_for_networks_that_are_told_of_light(seen, architecture: Architecture, name: str) -> None:
-    """Direct light, gloss, lit points and photons are noisy, and have seen nothing of the targets' noise."""
+    """Direct light, gloss, lit points, photons and a half are noisy, and have seen nothing of the targets' noise."""
     holds(of_architecture(seen, architecture), LOSSES[name], shows=0.5)  # little is left to learn, and to pull
 
 

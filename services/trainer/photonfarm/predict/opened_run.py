@@ -9,6 +9,7 @@ Shape letters: H W image, P points, K photon slots.
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,15 +68,20 @@ class OpenRun:
         self._images, self._device = predictor.images, predictor.device
         self._apply(rest(self.spec))
 
-    def predict(self, modification: Modification, view: View) -> Tensor:
+    def predict(self, modification: Modification, view: View, *, passes: int = 1, both: bool = False) -> Tensor:
         """The network's image of a configuration from a view, (H, W, 3), linear radiance, on the network's device.
 
-        It can be differentiated with respect to the network's weights. A denoiser gets a noisy image rendered for it.
-        Raises IncompleteError where photons or that image stay non-finite with other seeds.
+        It can be differentiated with respect to the network's weights. A network that is given a noisy half gets one
+        rendered, and guided_denoise the mean over `passes` of them; with `both`, the image is the mean of two, each
+        from a half of its own. Raises IncompleteError where photons or halves stay non-finite with other seeds.
         """
         if not np.array_equal(modification.vector, self._modification.vector):
             self._apply(Modification.from_vector(modification.vector))  # the caller may change theirs
-        return self._images(self._inputs(view))[0] / self._exposure
+        inputs = self._inputs(view)
+        if not self._needs.kept:
+            return self._images(inputs)[0] / self._exposure
+        halves = [self._noisy(view, passes, other=other) for other in (False, True)[: 1 + both]]
+        return torch.stack([self._images(replace(inputs, noisy=half))[0] for half in halves]).mean(0) / self._exposure
 
     def _apply(self, modification: Modification) -> None:
         """Bring the scene into a configuration, and its points and photons."""
@@ -97,12 +103,14 @@ class OpenRun:
             ((buffers, guides),) = self._scene.inputs([view], [key], self.spec.guides, self._lit, take=take_torch)
         else:
             buffers, guides = self._scene.buffers(view, take=take_torch), None
+        images = {name: self._tensor(image) for name, image in arrays_of(buffers).items()}
         return Inputs(
             world_to_camera=self._tensor(Camera.of(view, self.spec).world_to_camera.astype(np.float32)),
-            **{name: self._tensor(image) for name, image in arrays_of(buffers).items()},
+            depth=images["depth"],
+            albedo=images["albedo"],
+            normal=images["normal"],
             points=self._point_inputs(view) if self._needs.points else None,
             photons=None if self._photons is None else self._photon_inputs(view, self._photons),
-            noisy=self._noisy(view, key) if self._needs.kept else None,
             guides=None if guides is None else self._guide_inputs(arrays_of(guides)),
         )
 
@@ -125,14 +133,22 @@ class OpenRun:
         arrays["seen"] = self._scene.sees([view], photons.position)[0] & present
         return PhotonInputs(**{name: self._tensor(values) for name, values in arrays.items()})
 
-    def _noisy(self, view: View, key: bytes) -> NoisyColour:
-        """A noisy image of the view, of which as many pixels are kept as the network was trained with."""
+    def _noisy(self, view: View, passes: int = 1, *, other: bool = False) -> NoisyColour:
+        """A noisy image of the view, or an `other` one, with as many pixels kept as in training.
+
+        It is the mean over passes, with the variance of that, if the network is given several.
+        """
         from photonfarm.renderer.jobs.estimates import half_of
 
-        sample = make_key("frame", key)
-        half = half_of(self._scene, sample, view) * np.float32(self._exposure)
-        kept = choose_kept_pixels(sample, self.spec, self._needs.kept or 1)
-        return NoisyColour(self._tensor(half * kept[..., None]), self._tensor(kept))
+        sample = make_key("frame", view_key(self._key, view.vector))
+        count = passes if self._needs.passes else 1
+        numbers = range(count * other, count * (1 + other))
+        keys = [make_key(sample, number) if number else sample for number in numbers]
+        images = np.stack([half_of(self._scene, key, view) for key in keys]) * np.float32(self._exposure)
+        kept, variance = choose_kept_pixels(sample, self.spec, self._needs.kept or 1), None
+        if len(images) > 1:
+            variance = self._tensor(images.mean(axis=-1).var(axis=0, ddof=1) / len(images))
+        return NoisyColour(self._tensor(images.mean(axis=0) * kept[..., None]), self._tensor(kept), variance)
 
 
 def take_torch(values: Any) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any, Self
 
@@ -27,7 +27,8 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 from photonfarm.trainer.data.batch import TrainingBatch, allocate_memory, count_bytes
 from photonfarm.trainer.networks import build, find_kind
-from photonfarm.trainer.networks.inputs import SceneFrame
+from photonfarm.trainer.networks.inputs import SceneFrame, require
+from photonfarm.trainer.predictors.half_filter import settle_filter
 from photonfarm.trainer.runs.devices import Ranks, describe_device, usable_device
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import Learner, name_compile_errors
@@ -77,6 +78,9 @@ class MadeUpScene:
             tensor.copy_(values < 0.5 if tensor.dtype == torch.bool else values)
         kept = torch.rand(size, spec.film.height, spec.film.width, generator=generator) < 0.5 if needs.kept else None
         batch = TrainingBatch.of(range(size), (b"made up",) * size, tensors, kept)
+        if needs.passes and settings.filter.startswith("oidn"):  # as if they were filtered
+            a, b = (replace(half, filtered=half.colour) for half in map(require, (batch.inputs.noisy, batch.other)))
+            batch = replace(batch, inputs=replace(batch.inputs, noisy=a), other=b)
         inputs = batch.inputs
         for place, (origin, target) in enumerate(0.5 * torch.rand(size, 2, 3, generator=generator).numpy()):
             camera = Camera.of(View(origin - 0.5, target + 0.5), spec)
@@ -212,6 +216,7 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
 
     Raises SpecError for a device that is not there, and for a network that cannot be built or compiled.
     """
+    settings = settle_filter(settings)
     torch.set_num_threads(settings.threads)
     scene, network, device = MadeUpScene.of(spec), settings.network, usable_device(settings.device)
     frame = scene.frame(network)

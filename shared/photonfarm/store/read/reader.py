@@ -241,6 +241,11 @@ class SceneReader:
         rows = rows[rows < len(self._complete)]  # a plan may be younger than the last marker
         return rows[self._complete[rows]]
 
+    def earlier_passes(self, row: int) -> NDArray[np.int64]:
+        """The rows of a complete sample's view before it in the same job, ascending: they are complete if it is."""
+        first = row - row % self._plans[0].shard_rows
+        return first + np.flatnonzero(self._view_row[first:row] == self.view_row(row))
+
     def view_row(self, row: int) -> int:
         """The row of a sample's view: equal for all its passes."""
         self._check_complete(np.array([row]))

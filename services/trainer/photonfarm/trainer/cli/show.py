@@ -32,13 +32,21 @@ def print_record(of: dict[str, Any]) -> None:
     if of["kind"] == "recovered":
         click.echo(f"step {of['step']}: {_format_recovery(of)}", err=True)
     if of["kind"] == "validation":
-        there = f"on {of['held_out']} of {of['samples']} samples; "
+        there = f"on {of['held_out']} of {of['samples']} samples; {_format_rounds(of)}"
         click.echo(
             f"step {of['step']}: held-out error {format_estimate(of['error'], of['standard_error'])} "
             f"({format_estimate(of['shown_error'], None)} up to white) {there}"
             + progress.format_waits(of["waits"], of["samples_per_used"]),
             err=True,
         )
+
+
+def _format_rounds(of: dict[str, Any]) -> str:
+    """How often a network was given each half, and whether it has learned by heart what it goes with."""
+    if "excess" not in of:
+        return ""
+    heart = " and learns their noise by heart, as its loss is below that of clean images" if of["excess"] < 0 else ""
+    return f"has seen each half in {of['rounds']:.1f} rounds{heart}; "
 
 
 def print_dry_run(estimate: DryRun, as_json: bool) -> None:

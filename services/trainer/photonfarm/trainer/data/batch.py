@@ -5,7 +5,7 @@ Shape letters: B batch, H W image.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Key, Stream
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, map_tensors
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, map_tensors, require
 from photonfarm.trainer.runs.devices import is_asynchronous
 
 FREE_SHARE = 0.25
@@ -37,20 +37,36 @@ class TrainingBatch:
     units: tuple[Key, ...]  # by which each is held out: equal for samples that are not independent
     inputs: Inputs
     target: Tensor  # (B, 2, H, W, 3) half-estimates A and B, or (B, 1, …) with noisy colour; linear radiance × exposure
+    other: NoisyColour | None = None  # with noisy colour, which is A's: the same of B
 
     @classmethod
     def of(
-        cls, rows: Sequence[int], units: Sequence[Key], tensors: Mapping[str, Tensor], kept: Tensor | None = None
+        cls,
+        rows: Sequence[int],
+        units: Sequence[Key],
+        tensors: Mapping[str, Tensor],
+        kept: Tensor | None = None,
+        variance: Tensor | None = None,
     ) -> TrainingBatch:
-        """What a `SceneDataset` has read, (B, …) by field, in the same memory; and A's `kept` pixels, (B, H, W)."""
+        """What a `SceneDataset` has read, (B, …) by field, in the same memory; and A's `kept` pixels, (B, H, W).
+
+        With the `variance` of both halves, (B, 2, H, W), each has its own.
+        """
         target = tensors["radiance"]
-        noisy = None if kept is None else NoisyColour(target[:, 0] * kept[..., None], kept)
-        return cls(tuple(rows), tuple(units), Inputs.of(tensors, noisy), target)
+        if kept is None:
+            return cls(tuple(rows), tuple(units), Inputs.of(tensors), target)
+        own = (None, None) if variance is None else variance.unbind(1)
+        a, b = (NoisyColour(target[:, half] * kept[..., None], kept, own[half]) for half in (0, 1))
+        return cls(tuple(rows), tuple(units), Inputs.of(tensors, a), target, b)
 
     def to(self, device: torch.device) -> TrainingBatch:
         """The same batch on a device; itself on the CPU. A card may still be copying, as by `Inputs.to`."""
-        target = self.target.to(device, non_blocking=is_asynchronous(device))
-        return TrainingBatch(self.rows, self.units, self.inputs.to(device), target)
+
+        def move(tensor: Tensor) -> Tensor:
+            return tensor.to(device, non_blocking=is_asynchronous(device))
+
+        other = None if self.other is None else map_tensors(move, self.other)
+        return TrainingBatch(self.rows, self.units, self.inputs.to(device), move(self.target), other)
 
     def for_training(self) -> TrainingBatch:
         """The batch with targets that no input depends on: itself, unless its inputs hold noisy colour.
@@ -58,11 +74,9 @@ class TrainingBatch:
         Otherwise it is twice as long: the samples with A in the inputs and B as the target, (B, 1, H, W, 3), then the
         same samples with both exchanged (Lehtinen et al., Noise2Noise, 2018). The same pixels are kept of both.
         """
-        noisy = self.inputs.noisy
-        if noisy is None:
+        if self.other is None:
             return self
-        half_b = NoisyColour(self.target[:, 1] * noisy.kept[..., None], noisy.kept)
-        inputs = map_tensors(lambda *both: torch.cat(both), self.inputs, replace(self.inputs, noisy=half_b))
+        inputs = map_tensors(lambda *both: torch.cat(both), self.inputs, replace(self.inputs, noisy=self.other))
         target = torch.cat([self.target[:, 1:], self.target[:, :1]])
         return TrainingBatch(2 * self.rows, 2 * self.units, inputs, target)
 
@@ -137,8 +151,7 @@ class ResidentSamples:
         parts = {row: _take_one(moved, place) for place, row in enumerate(fresh.rows)}
         for row, part in parts.items():
             if self._has_room(needed := count_bytes(part)):
-                inputs = map_tensors(torch.clone, part.inputs)
-                self._kept[row] = TrainingBatch(part.rows, part.units, inputs, torch.clone(part.target))
+                self._kept[row] = _map_batch(torch.clone, part)
                 self._bytes += needed
         return _join_samples([parts[row] if row in parts else self._kept[row] for row in rows]) if rows else moved
 
@@ -158,13 +171,19 @@ def count_bytes(record: Any) -> int:
 
 def _take_one(batch: TrainingBatch, place: int) -> TrainingBatch:
     """One sample of a batch, in the batch's memory."""
-    inputs = map_tensors(lambda tensor: tensor[place : place + 1], batch.inputs)
-    return TrainingBatch((batch.rows[place],), (batch.units[place],), inputs, batch.target[place : place + 1])
+    one = _map_batch(lambda tensor: tensor[place : place + 1], batch)
+    return replace(one, rows=(batch.rows[place],), units=(batch.units[place],))
 
 
 def _join_samples(samples: Sequence[TrainingBatch]) -> TrainingBatch:
     """Samples as a batch in memory of its own."""
     rows, units = (tuple(getattr(sample, name)[0] for sample in samples) for name in ("rows", "units"))
-    first, *others = (sample.inputs for sample in samples)
-    inputs = map_tensors(lambda *parts: torch.cat(parts), first, *others)
-    return TrainingBatch(rows, units, inputs, torch.cat([sample.target for sample in samples]))
+    return replace(_map_batch(lambda *parts: torch.cat(parts), *samples), rows=rows, units=units)
+
+
+def _map_batch(change: Callable[..., Tensor], batch: TrainingBatch, *others: TrainingBatch) -> TrainingBatch:
+    """The batch with `change` applied to each tensor, and to the matching ones of other batches."""
+    inputs = map_tensors(change, batch.inputs, *(each.inputs for each in others))
+    target = change(batch.target, *(each.target for each in others))
+    other = None if batch.other is None else map_tensors(change, batch.other, *(require(each.other) for each in others))
+    return TrainingBatch(batch.rows, batch.units, inputs, target, other)

@@ -5,6 +5,7 @@ Samples are drawn in rounds, which choose the least drawn ones more often.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from typing import Any
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from photonfarm.core.keys import Stream, make_key
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.networks import find_kind
 from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.settings import TrainSettings
 
@@ -111,7 +113,9 @@ class BatchStream:
         self._known: set[int] = set()
         self._asked: deque[tuple[int, ...]] = deque()  # drawn, not yet trained on
         self._restored: list[tuple[int, ...]] = []  # the same of an earlier session, not requested in this one yet
+        self._rounds = settings.rounds if find_kind(settings.network.architecture).needs.passes else math.inf
         self.complete = False  # everything planned has arrived
+        self.last_step: int | None = None  # at which all rounds are over; None while more is to come, or without end
         self.arrived: list[int] = []  # rows, in order of arrival
         self.growth: list[tuple[int, int]] = []  # (batches drawn by then, rows that had arrived)
         self.held_out: list[int] = []
@@ -131,17 +135,21 @@ class BatchStream:
             self.growth.append((self.drawn, len(self.arrived)))
             self.held_out.extend(row for row, is_held_out in new.items() if is_held_out)
             self._sampler.add(row for row, is_held_out in new.items() if not is_held_out)
+        last = self._rounds * len(self.training_rows) // self._settings.batch if self.complete else math.inf
+        if last < math.inf and last != self.last_step:
+            self.last_step = int(last)
+            self._ranks.send("last", self.last_step)
 
     def may_draw(self) -> bool:
         """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and `minimum_samples` have arrived.
 
-        Neither limit applies once everything planned has arrived.
+        Once everything planned has arrived, there is no limit but that of `rounds`, where a network has one.
         """
         arrived, s = len(self.training_rows), self._settings
-        if self.complete:
-            return arrived > 0
         draws = (self.drawn + 1) * s.batch
-        return arrived >= s.minimum_samples and draws <= s.replay_ratio * arrived + s.replay_buffer
+        if self.complete:
+            return arrived > 0 and draws <= self._rounds * arrived
+        return arrived >= s.minimum_samples and draws <= min(s.replay_ratio, self._rounds) * arrived + s.replay_buffer
 
     def draw_ahead(self, until: int) -> bool:
         """Draw and request batches, up to `prefetch` ahead and up to batch `until`; False if no batch is requested."""
@@ -186,6 +194,7 @@ class BatchStream:
             "sampler": self._sampler.state(),
             "asked": [list(rows) for rows in (*self._restored, *self._asked)],
             "drawn": self.drawn,
+            "last_step": self.last_step,
             "arrived": torch.tensor(self.arrived, dtype=torch.int64),
             "growth": torch.tensor(self.growth, dtype=torch.int64).reshape(-1, 2),
             "held_out": torch.tensor(self.held_out, dtype=torch.int64),
@@ -194,7 +203,7 @@ class BatchStream:
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from what `state` returned."""
         self._sampler.restore(state["sampler"])
-        self.drawn = state["drawn"]
+        self.drawn, self.last_step = state["drawn"], state.get("last_step")
         self.arrived = state["arrived"].tolist()
         self.growth = [(drawn, arrived) for drawn, arrived in state["growth"].tolist()]
         self.held_out = state["held_out"].tolist()

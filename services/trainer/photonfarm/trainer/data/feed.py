@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from photonfarm.core.keys import Key
+from photonfarm.core.keys import Key, Stream
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import SceneDataset
 from photonfarm.plan.hold_out import are_held_out, enough, units_of
@@ -49,11 +49,14 @@ class Feed:
         clock: Callable[[], float] = time.monotonic,
         needs: Needs | None = None,
         resident: ResidentSamples | None = None,
+        finish: Callable[[TrainingBatch, Sequence[Key]], TrainingBatch] | None = None,
     ) -> None:
         """Feed a batch with the inputs that the settings' network needs, or those in `needs`.
 
-        With `resident`, samples are kept there, and batches are on its device.
+        With `resident`, samples are kept there, and batches are on its device. What is read, of samples of some keys,
+        is what `finish` makes of it.
         """
+        self._finish = finish
         self._source, self._settings, self._clock = source, settings, clock
         self._needs = needs or find_kind(settings.network.architecture).needs
         self._resident = resident if resident is not None and resident.makes_batches else None
@@ -222,7 +225,9 @@ class Feed:
             self._poll()
             time.sleep(NAP_S)
         fresh = rows if self._resident is None else self._resident.list_lacking(rows)
-        batch = read_batch(self._source, self._dataset, fresh, self._needs.kept, memory)
+        batch = read_batch(self._source, self._dataset, fresh, self._needs, memory)
+        if self._finish is not None and fresh:
+            batch = self._finish(batch, self._source.sample_keys(fresh))
         return batch if self._resident is None else self._resident.batch(rows, batch)
 
 
@@ -230,13 +235,35 @@ def read_batch(
     source: SceneReader,
     dataset: SceneDataset,
     rows: Sequence[int],
-    kept: int | None = None,
+    needs: Needs,
     memory: dict[str, Tensor] | None = None,
 ) -> TrainingBatch:
-    """Read complete samples of a source by its dataset; with `kept`, one of so many pixels of A is noisy colour."""
+    """Read complete samples of a source by its dataset, with the noisy colour of A that is needed."""
     film = dataset.spec.film.height, dataset.spec.film.width
-    pixels = None
-    if kept:
-        chosen = [choose_kept_pixels(key, dataset.spec, kept) for key in source.sample_keys(rows)]
+    pixels = variance = None
+    tensors = dataset.read(rows, memory)
+    if needs.kept:
+        chosen = [choose_kept_pixels(key, dataset.spec, needs.kept) for key in source.sample_keys(rows)]
         pixels = torch.from_numpy(np.array(chosen, np.bool_).reshape(-1, *film))
-    return TrainingBatch.of(rows, units_of(source, rows), dataset.read(rows, memory), pixels)
+    if needs.passes:
+        samples = zip(rows, tensors["radiance"], strict=True)
+        variance = torch.stack([_average_passes(source, dataset, row, halves) for row, halves in samples])
+    return TrainingBatch.of(rows, units_of(source, rows), tensors, pixels, variance)
+
+
+def _average_passes(source: SceneReader, dataset: SceneDataset, row: int, halves: Tensor) -> Tensor:
+    """Replace the halves of a sample (2, H, W, 3) by their means with earlier passes of its view in the same job.
+
+    How many these are is drawn by the sample's key: none to all. So one network learns from any number of samples. As
+    a job is committed whole, the same ones are there whenever the row is read. Returns the variance of the means of
+    colour, (2, H, W), from the passes; -1 if there is one alone.
+    """
+    earlier = source.earlier_passes(row)
+    count = int(Stream(source.sample_keys([row])[0], "passes").uniform(1)[0] * (len(earlier) + 1))
+    if not count:
+        return halves.new_full(halves.shape[:3], -1.0)
+    factor = dataset.spec.exposure
+    others = [torch.from_numpy(source.read_radiance(int(each))) * factor for each in earlier[-count:]]
+    passes = torch.stack([halves.clone(), *others])
+    halves.copy_(passes.mean(dim=0))
+    return passes.mean(dim=-1).var(dim=0) / len(passes)

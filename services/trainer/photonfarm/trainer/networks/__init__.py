@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.networks.guided import Guided
+from photonfarm.trainer.networks.guided_denoise import GuidedDenoise
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.networks.network import Network
@@ -45,6 +46,7 @@ ARCHITECTURES: dict[str, NetworkKind] = {
     "guided_transport_photons": NetworkKind(
         partial(Guided, transport=LitPoints, photons=True), Needs(photons=True, guides=True)
     ),
+    "guided_denoise": NetworkKind(GuidedDenoise, Needs(guides=True, kept=1, passes=True)),
     **{f"denoise_{kept}": NetworkKind(Denoiser, Needs(points=False, kept=kept)) for kept in (1, 4, 16, 32, 64)},
 }
 

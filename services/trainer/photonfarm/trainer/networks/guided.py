@@ -84,11 +84,12 @@ class Guided(Network):
         transport: type[LitPoints] | None = None,
         photons: bool = False,
         further: int = 0,
+        outputs: int = 3,
     ) -> None:
         """Take `further` channels of a kind of guided network beside those of transport, photons and guides."""
         photon_light = PhotonLight(frame, settings.architecture, bounces=1) if photons else None
         further += (CHANNELS if transport else 0) + (3 * len(WINDOWS) if photons else 0)
-        super().__init__(settings, frame, further=further + GUIDE_CHANNELS)
+        super().__init__(settings, frame, further=further + GUIDE_CHANNELS, outputs=outputs)
         self.lit_points = transport(frame, settings.lit_points) if transport else None
         self.photon_light = photon_light
 

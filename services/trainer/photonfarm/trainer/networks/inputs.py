@@ -87,6 +87,7 @@ class Needs:
     photons: bool = False
     guides: bool = False
     kept: int | None = None  # one of so many pixels of half A is an input, in noisy colour; None: no colour
+    passes: bool = False  # with `kept`: half A is the mean over passes, where a view has several, and is filtered
 
     @property
     def fields(self) -> tuple[str, ...]:
@@ -120,10 +121,12 @@ class PhotonInputs:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NoisyColour:
-    """The kept pixels of one half-estimate."""
+    """The kept pixels of one half-estimate, and what follows from it alone."""
 
     colour: Tensor  # (B, H, W, 3) linear radiance × exposure, zero where not kept
     kept: Tensor  # (B, H, W) bool
+    variance: Tensor | None = None  # (B, H, W) of its mean colour, from its passes; −1: there is one alone
+    filtered: Tensor | None = None  # (B, H, W, 3) as a denoiser shows it
 
 
 GLOSSY = 0.2

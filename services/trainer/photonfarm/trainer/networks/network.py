@@ -44,7 +44,7 @@ class ImageSynthesisLayer(nn.Module):
     loss are float32, as are all weights.
     """
 
-    def __init__(self, channels_in: int, width: int, precision: Precision = "float32") -> None:
+    def __init__(self, channels_in: int, width: int, precision: Precision = "float32", outputs: int = 3) -> None:
         super().__init__()
         self.precision = precision
         widths = [width << level for level in range(HALVINGS + 1)]
@@ -52,10 +52,10 @@ class ImageSynthesisLayer(nn.Module):
         self.encode = nn.ModuleList(ConvBlock(w) for w in widths)
         self.join = nn.ModuleList(Convolution(fine + coarse, fine) for fine, coarse in pairwise(widths))
         self.decode = nn.ModuleList(ConvBlock(w) for w in widths[:-1])
-        self.out = Convolution(width, 3)
+        self.out = Convolution(width, outputs)
 
     def forward(self, x: Tensor) -> Tensor:
-        """(B, channels_in, H, W) → (B, 3, H, W), exposed linear radiance."""
+        """(B, channels_in, H, W) → (B, outputs, H, W); 3 of them are exposed linear radiance."""
         x = self._features(x.bfloat16() if self.precision == "bfloat16" else x)
         return self.out(x.float())
 
@@ -129,7 +129,9 @@ class Network(nn.Module):
 
     centre: Tensor
 
-    def __init__(self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0, narrower: int = 1) -> None:
+    def __init__(
+        self, settings: NetworkSettings, frame: SceneFrame, *, further: int = 0, narrower: int = 1, outputs: int = 3
+    ) -> None:
         """Take `further` channels beside the image-space ones; the U-Net is so many times `narrower` than set."""
         super().__init__()
         self.optics = frame.optics
@@ -139,7 +141,7 @@ class Network(nn.Module):
         self.demodulation = settings.demodulation
         self.register_buffer("centre", torch.from_numpy(frame.centre), persistent=False)
         width = max(settings.width // narrower, 1)
-        self.image_synthesis = ImageSynthesisLayer(further + IMAGE_CHANNELS, width, settings.precision)
+        self.image_synthesis = ImageSynthesisLayer(further + IMAGE_CHANNELS, width, settings.precision, outputs)
 
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure: what is known + the U-Net's output × its factor."""
@@ -173,7 +175,7 @@ class Network(nn.Module):
         return torch.cat([self.optics.rays(inputs.world_to_camera), depth, inputs.albedo, inputs.normal], dim=-1)
 
     def synthesise(self, channels: Tensor) -> Tensor:
-        """(B, H, W, C) → (B, H, W, 3). Channels stay last in memory, as CPUs and tensor cores take them."""
+        """(B, H, W, C) → (B, H, W, outputs). Channels stay last in memory, as CPUs and tensor cores take them."""
         round_convolutions(channels.device, self.image_synthesis.precision)
         return self.image_synthesis(channels.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 

@@ -20,6 +20,7 @@ Shape letters: B batch, H W image.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from importlib import import_module
 from types import ModuleType
 
@@ -81,6 +82,9 @@ def _blur(image: Tensor, sigma: float) -> Tensor:
     planes = functional.conv2d(planes, window[None, None, None, :], padding=(0, reach))
     return planes.reshape(len(image), 3, *image.shape[1:3]).movedim(1, -1)
 
+
+OIDN: Mapping[str, OidnQuality] = {"oidn": "high", "oidn-balanced": "balanced", "oidn-fast": "fast"}
+"""The qualities by the names of the denoisers."""
 
 PACKAGE = "mitsuba_oidn"
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -17,13 +17,14 @@ from photonfarm.store import SceneReader
 from photonfarm.trainer.networks import build, find_kind
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network
-from photonfarm.trainer.predictors.denoisers import Oidn, fill_in
+from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
 from photonfarm.trainer.predictors.evaluation import DevicePredictor, make_network_predictor
+from photonfarm.trainer.predictors.half_filter import HalfFilter, uses_denoiser
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
-from photonfarm.trainer.runs.settings import OidnQuality, ReadyDenoiser, TrainSettings
+from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
 from photonfarm.trainer.runs.user_code import is_own, name_in_errors
 
 
@@ -94,10 +95,10 @@ class TrainedRun:
         """The network as a predictor on a device. SpecError if the device is not usable."""
         predict = make_network_predictor(self.network(spec, base).to(usable_device(device)).eval())
         named = name_in_errors(architecture=self.settings.network.architecture)
-        return replace(predict, images=named(predict.images))
-
-
-OIDN: Mapping[ReadyDenoiser, OidnQuality] = {"oidn": "high", "oidn-balanced": "balanced", "oidn-fast": "fast"}
+        if not uses_denoiser(self.settings):
+            return replace(predict, images=named(predict.images))
+        filtered = HalfFilter(self.settings, predict.device)
+        return replace(predict, images=lambda inputs: predict.images(filtered(inputs)))
 
 
 @dataclass(frozen=True, slots=True)

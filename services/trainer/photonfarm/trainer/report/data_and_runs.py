@@ -24,7 +24,6 @@ from photonfarm.trainer.predictors.evaluation import (
     HeldOutErrors,
     average_colours,
     make_constant_predictor,
-    make_network_predictor,
     measure,
     read_batches,
 )
@@ -261,9 +260,9 @@ class Baselines:
                 raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
             some = training[:: -(-len(training) // MOST_TRAINING)]
             colour, shown_colour = average_colours(read_batches(feed, some, settings.batch))
-            network = TrainedRun.load(run.folder, INITIAL).network(feed.spec, feed.base)
+            untrained = TrainedRun.load(run.folder, INITIAL).predictor(feed.spec, feed.base, "cpu")
             return cls(
                 measure(make_constant_predictor(colour), read_batches(feed, rows, settings.batch)),
                 measure(make_constant_predictor(shown_colour), read_batches(feed, rows, settings.batch)),
-                measure(make_network_predictor(network), read_batches(feed, rows, settings.batch)),
+                measure(untrained, read_batches(feed, rows, settings.batch)),
             )

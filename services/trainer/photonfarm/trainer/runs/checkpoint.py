@@ -12,7 +12,8 @@ import json
 import os
 import platform
 from collections.abc import Mapping, Sequence
-from importlib.metadata import version
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSetting
 FORMAT = 5
 ANEW = "remove it, and the run begins anew"
 TENSOR = "tensor"
+OIDN = "mitsuba-oidn"  # which filters what some networks are given
 
 LASTING = ("scene_id", "exposure", "network", "batch", "hold_out", "optimiser", "loss", "seed")
 """The settings that a run keeps for ever. The others may change when it is resumed."""
@@ -160,6 +162,8 @@ def _put_together(value: Any, tensors: Mapping[str, Tensor]) -> Any:
 def list_versions() -> dict[str, str]:
     """The versions of the packages that a run's arithmetic depends on."""
     others = {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__}
+    with suppress(PackageNotFoundError):
+        others[OIDN] = version(OIDN)
     return {"photonfarm": version("photonfarm"), **others}
 
 
@@ -171,6 +175,7 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     kept = [name for name in ("scene_id", "exposure") if name in state and name in identity]
     then, now = ({**{name: one[name] for name in kept}, **one["settings"]} for one in (state, identity))
     check_version(path, then["network"])
+    then["network"].setdefault("filter", now["network"]["filter"])  # which came with the networks that it matters to
     changed = differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
@@ -188,7 +193,10 @@ def check_version(path: Path, network: Mapping[str, Any]) -> None:
 
     A missing key would take today's default, and make another network.
     """
-    if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
+    lacking = [key for key in NetworkSettings.model_fields if key not in network]
+    if network.get("architecture") != "guided_denoise":  # the only one that it matters to
+        lacking = [key for key in lacking if key != "filter"]
+    if missing := ", ".join(lacking):
         raise SpecError(
             f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder "
             "(--run)"

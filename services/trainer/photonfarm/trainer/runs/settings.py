@@ -82,7 +82,9 @@ def refuse_biasing(settings: Any) -> Any:
 
 Occlusion = Literal["exact", "window"]
 PaperNetwork = Literal["cnn", "feature_projection", "light_transport", "light_transport_photons"]
-GuidedNetwork = Literal["guided", "guided_transport", "guided_photons", "guided_transport_photons"]  # ours
+GuidedNetwork = Literal[  # ours
+    "guided", "guided_transport", "guided_photons", "guided_transport_photons", "guided_denoise"
+]
 Architecture = Literal[PaperNetwork, GuidedNetwork, "denoise_1", "denoise_4", "denoise_16", "denoise_32", "denoise_64"]
 Precision = Literal["float32", "tf32", "bfloat16"]
 Maxima = Literal["absolute", "relative"]
@@ -97,6 +99,9 @@ ReadyDenoiser = Literal["none", "fill-in", "oidn", "oidn-balanced", "oidn-fast"]
 or its quickest."""
 
 OidnQuality = Literal["high", "balanced", "fast"]  # as the package names them
+
+HalfFilterName = Literal["auto", "own", "oidn", "oidn-balanced", "oidn-fast"]
+"""Open Image Denoise by the names above; a filter of our own; or, until a run begins, whichever is there."""
 
 
 def _check_choice(kind: Any) -> BeforeValidator:
@@ -137,6 +142,8 @@ class NetworkSettings(Frozen):
     precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case;
     # "tf32" is of NVIDIA's cards alone (docs/results/train_step.md)
     lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
+    filter: HalfFilterName = "auto"  # of the half that guided_denoise is given: "own", or Open Image Denoise; "auto":
+    # its fast quality where it is installed, and "own" elsewhere, as is settled once a run begins
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it
 
@@ -182,6 +189,8 @@ class TrainSettings(Frozen):
     hold_out: Annotated[float, Field(gt=0, lt=1)] = 1 / 16  # share of the configurations never trained on
     replay_ratio: Positive = 64.0  # draws per sample that has arrived, while more are to come
     replay_buffer: Annotated[int, Field(ge=0)] = 256  # draws allowed beyond that
+    rounds: Positive = 12.0  # draws of each sample, at most, by guided_denoise: it could learn by heart what a half
+    # goes with, and 13 rounds were fine where 45 tripled the error
     minimum_samples: Count = 8  # training samples to wait for before the first step
     catch_up: Annotated[int, Field(ge=0)] = 2  # further draws a round for a sample that has been drawn less than others
 
@@ -206,7 +215,7 @@ class TrainSettings(Frozen):
 
     @model_validator(mode="after")
     def _has_the_other_half(self) -> Self:
-        if self.loss == "paired" and self.network.architecture.startswith("denoise"):
+        if self.loss == "paired" and "denoise" in self.network.architecture:
             raise ValueError(
                 f"has loss = 'paired', which weights each half by the other; {self.network.architecture} is given one "
                 "of them, and 'linear' or 'relative' are its losses"

@@ -17,8 +17,8 @@ from torch import Tensor, nn
 
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.trainer.data.batch import TrainingBatch
-from photonfarm.trainer.networks import build, predict_image
-from photonfarm.trainer.networks.inputs import SceneFrame
+from photonfarm.trainer.networks import build, find_kind, predict_image
+from photonfarm.trainer.networks.inputs import SceneFrame, require
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.devices import Ranks, compute_deterministically
 from photonfarm.trainer.runs.settings import Compilation, TrainSettings
@@ -67,8 +67,8 @@ def group_weights(network: nn.Module, settings: TrainSettings) -> list[dict[str,
     return [{"params": weights, "factor": factor} for factor, weights in groups.items()]
 
 
-def compute_rate(step: int, settings: TrainSettings) -> float:
-    """The learning rate of a step, by the schedule of the settings.
+def compute_rate(step: int, settings: TrainSettings, last: int | None = None) -> float:
+    """The learning rate of a step, by the schedule of the settings; of a run that ends at step `last`, if before.
 
     "epochs": learning_rate × decay^epoch, where an epoch is a number of samples drawn [supplement 3.1]. "cosine" is
     ours: linearly up over the `warm_up` (Goyal et al., Accurate, Large Minibatch SGD, 2017, 2.2), then by
@@ -76,11 +76,16 @@ def compute_rate(step: int, settings: TrainSettings) -> float:
     """
     if settings.schedule == "epochs":
         return settings.learning_rate * settings.decay ** (step * settings.batch // settings.epoch_samples)
-    rising = int(settings.warm_up * settings.max_steps)
+    end = settings.max_steps if last is None else min(last, settings.max_steps)
+    rising = int(settings.warm_up * end)
     if step < rising:
         return settings.learning_rate * ((step + 1) / rising)
-    fallen = min((step - rising) / (settings.max_steps - rising), 1.0)
+    fallen = min((step - rising) / max(end - rising, 1), 1.0)
     return settings.learning_rate * ((1 + math.cos(math.pi * fallen)) / 2)
+
+
+MEMORY = 0.995
+"""Of the running mean of what a loss exceeds its floor by: 200 steps."""
 
 
 class WeightAverage:
@@ -180,6 +185,9 @@ class Learner:
         self.average = WeightAverage(self.network, settings.average) if settings.average else None
         compile_network(self.network, settings.compile, self._device)  # and not the average, copied before
         self.rate_factor = 1.0  # times the schedule; not part of the state below
+        self.last_step: int | None = None  # at which the data end the run; not part of the state either
+        self._sees_halves = find_kind(settings.network.architecture).needs.kept == 1  # and all of their pixels
+        self.excess: Tensor | None = None  # (), of the loss over that of the clean image; None if it sees no halves
 
     @property
     def predicting(self) -> Network:
@@ -188,7 +196,7 @@ class Learner:
 
     def rate(self, number: int) -> float:
         """The learning rate of step `number`, of layers whose factor is 1."""
-        return self.rate_factor * compute_rate(number, self._settings)
+        return self.rate_factor * compute_rate(number, self._settings, self.last_step)
 
     def step(self, number: int, batch: TrainingBatch) -> Tensor:
         """Take an optimiser step on this process' part of a batch [supplement 3.1]; returns the whole batch's loss, ().
@@ -199,7 +207,10 @@ class Learner:
             options["lr"] = self.rate(number) * options["factor"]
         self.optimiser.zero_grad()
         batch = batch.to(self._device).for_training()
-        loss = self._loss(predict_image(self.network, batch.inputs), batch.target)
+        image = predict_image(self.network, batch.inputs)
+        loss = self._loss(image, batch.target)
+        if self._sees_halves and batch.inputs.noisy is not None:
+            self._note_excess(number, image.detach(), batch, loss.detach())
         torch.autograd.backward(loss)
         mean_loss = self._ranks.average_gradients(list(self.network.parameters()), loss, len(batch.rows))
         self.optimiser.step()
@@ -218,11 +229,31 @@ class Learner:
         loss = self._loss(predict_image(network, batch.inputs), batch.target)
         return self._ranks.average(loss.reshape(1), len(batch.rows))[0]
 
+    @torch.no_grad()
+    def _note_excess(self, number: int, image: Tensor, batch: TrainingBatch, loss: Tensor) -> None:
+        """Add a step to the running mean of the loss less its floor, which no network but by heart gets below.
+
+        The clean image's loss is noise alone, mean (B − I)². For halves A and B that is mean (A − B)² / 2, with the
+        loss's own weights; A is the input.
+        """
+        noisy = require(batch.inputs.noisy)
+        apart = (noisy.colour[:, None] - batch.target) / math.sqrt(2)
+        excess = loss - self._loss(image, image[:, None] + apart)
+        decay = min(MEMORY, (1 + number) / (10 + number))
+        self.excess = excess if self.excess is None else torch.lerp(excess, self.excess, decay)
+
+    def describe_halves(self, steps_of_each: float) -> dict[str, float]:
+        """Of a network of halves: the rounds over them, and the excess; nothing of others."""
+        if self.excess is None:
+            return {}
+        return {"rounds": round(steps_of_each * self._settings.batch, 2), "excess": float(self.excess)}
+
     def state(self) -> dict[str, Any]:
         """The weights, their average if there is one, and the optimiser's state, for a checkpoint."""
         memory = [dict(self.optimiser.state.get(weight, {})) for weight in self.network.parameters()]
         average = None if self.average is None else self.average.state()
-        return {"network": self.network.state_dict(), "average": average, "optimiser_state": memory}
+        weights = {"network": self.network.state_dict(), "average": average, "optimiser_state": memory}
+        return weights if self.excess is None else {**weights, "excess": self.excess}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Continue from a `state`; the optimiser keeps its present settings.
@@ -230,6 +261,7 @@ class Learner:
         If the state has no average, it begins with the weights, as averaging may be switched on when a run is resumed.
         """
         self.network.load_state_dict(state["network"])
+        self.excess = None if state.get("excess") is None else state["excess"].to(self._device)
         self.optimiser.state.clear()
         for weight, memory in zip(self.network.parameters(), state["optimiser_state"], strict=True):
             if memory:

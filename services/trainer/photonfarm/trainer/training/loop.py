@@ -24,6 +24,7 @@ from photonfarm.trainer.data.batch_stream import BatchStream
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.predictors.evaluation import make_network_predictor, read_batches
+from photonfarm.trainer.predictors.half_filter import choose_filter, settle_filter
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import Ranks, usable_device
 from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used, share_waits
@@ -46,7 +47,7 @@ class TrainingOutcome:
     """How a session of training ended."""
 
     step: int
-    reason: str  # "steps", "seconds" or "stopped"
+    reason: str  # "steps", "seconds", "rounds" or "stopped"
     last_error: float | None  # held-out, noise removed; None if it ended before the first validation
 
 
@@ -90,7 +91,7 @@ def train(source: SceneReader, settings: TrainSettings, run: Path, hooks: Hooks 
     the held-out error are not finite, or much worse than before, and there is no good state, or the run has gone back
     too often; the last checkpoint stays.
     """
-    hooks = hooks or Hooks()
+    hooks, settings = hooks or Hooks(), settle_filter(settings)
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
     watch = Stopwatch(hooks.clock, "wait_data", hooks.waited, hooks.on_phase)
@@ -106,7 +107,7 @@ def train(source: SceneReader, settings: TrainSettings, run: Path, hooks: Hooks 
         watch.turn("start")
         own = {"architecture": settings.network.architecture, "loss": settings.loss}
         resident = ResidentSamples(hooks.ranks.device(settings.device), settings.resident_gb)
-        fed = Feed(source, settings, hooks.clock, resident=resident)
+        fed = Feed(source, settings, hooks.clock, resident=resident, finish=choose_filter(settings, run))
         with fed as feed, name_in_errors(**own), name_compile_errors(settings.compile):
             return Session(feed, settings, run, watch, hooks, presence).run()
 
@@ -232,6 +233,8 @@ class Session:
             return "stopped"
         if self._step >= self._settings.max_steps:
             return "steps"
+        if self._stream.last_step is not None and self._step >= self._stream.last_step:
+            return "rounds"
         if self._settings.max_seconds is not None and sum(self._watch.seconds.values()) >= self._settings.max_seconds:
             return "seconds"
         return None
@@ -323,6 +326,7 @@ class Session:
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
             waits=share_waits(seconds := self._watch.seconds, self._seconds_logged),
+            **self._learner.describe_halves(self._step / max(len(self._stream.training_rows), 1)),
             **self._counts(),
         )
         self._seconds_logged = seconds
@@ -376,6 +380,7 @@ class Session:
 
     def _train_step(self, batch: TrainingBatch) -> None:
         with self._watch.on("train"):
+            self._learner.last_step = self._stream.last_step
             setback = self._good.take_step(self._step, batch)
         self._step += 1
         self._report_draws()

@@ -21,6 +21,7 @@ from photonfarm.store.model.lease import LeasedError
 from photonfarm.trainer.data.batch import ResidentSamples
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import SceneFrame
+from photonfarm.trainer.predictors.half_filter import choose_filter, settle_filter
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import Ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
@@ -34,15 +35,18 @@ def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings,
 
     A resumed run is read from the folder `run`, which rank 0 writes. Raises what `train` does.
     """
+    settings = settle_filter(settings)
     torch.set_num_threads(settings.threads)
     command, value = ranks.receive()
     if command == "end":
         return
     own = settings.model_copy(update={"batch": -(-settings.batch // ranks.size)})
     resident = ResidentSamples(ranks.device(settings.device), settings.resident_gb)
-    with Feed(source(value["scene_id"], value["exposure"]), own, resident=resident) as feed:
+    samples, finish = source(value["scene_id"], value["exposure"]), choose_filter(settings, run)
+    with Feed(samples, own, resident=resident, finish=finish) as feed:
         frame = SceneFrame.of(feed.spec, *feed.base, settings.network)
-        good, step = GoodState(Learner(frame, settings, ranks), settings), value["step"]
+        learner, step = Learner(frame, settings, ranks), value["step"]
+        good = GoodState(learner, settings)
         if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run)
         with name_compile_errors(settings.compile):
@@ -53,6 +57,8 @@ def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings,
                 elif command == "take":
                     good.take_step(step, feed.take())
                     step += 1
+                elif command == "last":
+                    learner.last_step = value
                 elif command == "keep":
                     good.keep(value)
                 elif command == "back":

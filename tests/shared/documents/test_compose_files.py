@@ -39,5 +39,12 @@ def test_a_service_on_a_card_reserves_it_with_the_parts_of_the_driver_that_it_us
     assert f"`{variable}`" in (ROOT / "docs/configuration.md").read_text()
 
 
+def test_kernels_outlive_the_worker_that_compiled_them_and_are_every_workers() -> None:
+    renderer = read_services("docker-compose.yml")["renderer"]
+    folder = Path(renderer["environment"]["DRJIT_CACHE_DIR"])
+    assert "${PHOTONFARM_DATA:-./data}:/data" in renderer["volumes"]
+    assert folder.parent == Path(renderer["environment"]["PHOTONFARM_STORE"]).parent == Path("/data")
+
+
 def test_renderers_on_a_card_use_no_other_device() -> None:
     assert read_services("docker-compose.gpu.yml")["renderer"]["environment"]["PHOTONFARM_DEVICE"] == "cuda"

@@ -61,7 +61,8 @@ securityContext:
 - { name: PHOTONFARM_REDIS_URL, value: "redis://{{ include "photonfarm.name" . }}-redis:6379/0" }
 - { name: PHOTONFARM_REDIS_PASSWORD_FILE, value: /run/photonfarm/redis_password }
 - { name: PHOTONFARM_SCENES, value: /scenes }
-- { name: HOME, value: /tmp } # kernels are cached there
+- { name: HOME, value: /tmp }
+- { name: DRJIT_CACHE_DIR, value: {{ ternary "/cache/kernels" "/data/kernels" (ne .Values.bucket.url "") }} } # compiled once for all workers of the volume
 {{- if .Values.bucket.url }}
 - { name: PHOTONFARM_CACHE, value: /cache }
 - { name: PHOTONFARM_CACHE_GB, value: {{ .Values.bucket.cacheGB | quote }} }

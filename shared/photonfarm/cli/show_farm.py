@@ -19,6 +19,7 @@ from photonfarm.cli.show import make_table, print_json, print_table
 from photonfarm.core.formatting import format_bytes
 from photonfarm.core.waiting import format_span
 from photonfarm.farm.progress import FarmProgress, SceneProgress, describe_failed
+from photonfarm.scene.poor_views import describe_counts
 
 if TYPE_CHECKING:
     from photonfarm.farm.watch import FarmWatch
@@ -101,6 +102,8 @@ def list_lines(farm: FarmProgress, store: str | Path) -> Iterator[str]:
     """What cannot be read, the queue, what workers and trainers do, and what waits for what."""
     for scene in farm.scenes:
         yield from (f"{scene.status.name} {scene.status.scene_id}: {fault}" for fault in scene.faults)
+        if poor := describe_counts(scene.status.views):
+            yield f"{scene.status.name} {scene.status.scene_id}: {poor}"
     yield f"queue: {farm.describe_queue()}"
     yield from (f"  worker {name} {activity}" for name, activity in farm.queue.activities.items())
     yield from (f"  {wait.sentence}" for wait in farm.waits if wait.kind != "job_failed")

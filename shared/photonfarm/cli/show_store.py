@@ -19,6 +19,7 @@ from photonfarm.core.errors import StoreError
 from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import SILENCE_S
 from photonfarm.farm.join import JoinedScene
+from photonfarm.scene.poor_views import describe_counts
 from photonfarm.store import Store
 from photonfarm.store.check.check import CheckProgress, SceneReport, StoreReport
 from photonfarm.store.model.findings import FindingGroup, Remedy
@@ -101,6 +102,8 @@ def _print_scene(scene: SceneReport) -> None:
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
         click.echo(f"  A against B: {scene.halves.in_words}")
+    if poor := describe_counts(scene.views):
+        click.echo(f"  {poor}")
     for group in scene.groups:
         click.echo(f"  {group.count} × {group.cause.label}: {group.cause.sentence} ({group.cause.remedy.value})")
         for f in group.first:

@@ -27,9 +27,15 @@ Doubt = tuple[str, str]
 
 
 def warnings(named: NamedSpec) -> list[str]:
-    """The doubts about a spec, each as one sentence after the line of its file."""
-    lines = SpecLines.of(named.file)
-    return [f"{lines.place(key)}: {sentence}" for key, sentence in doubts(named.spec, named.lights)]
+    """The doubts about a spec, each as one sentence after the line of its file; and that its free space is not known.
+
+    The built-in rooms are known to have cameras in the open nearly everywhere.
+    """
+    lines, found = SpecLines.of(named.file), doubts(named.spec, named.lights)
+    if named.spec.view.free_space is None and named.spec.scene.file is not None:
+        keep_out = "`photonfarm scene free-space SPEC --write` keeps them out"
+        found.append(("view.origin", f"cameras may stand inside furniture, where images are black; {keep_out}"))
+    return [f"{lines.place(key)}: {sentence}" for key, sentence in found]
 
 
 def doubts(spec: SceneSpec, lights: frozenset[str]) -> list[Doubt]:

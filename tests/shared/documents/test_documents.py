@@ -123,7 +123,7 @@ def get_setting(settings: TrainSettings, key: str) -> object:
 
 def format_setting(value: object) -> str:
     """A setting's value as the page has it."""
-    if value is None:
+    if value in (None, ()):
         return "–"
     if isinstance(value, bool):
         return str(value).lower()

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from analytic_room import render, visibility
 from analytic_room_samples import known
 
 from photonfarm.core.errors import CorruptError, IncompleteError
@@ -15,7 +16,9 @@ from photonfarm.plan.request import Request
 from photonfarm.scene.view import Camera
 from photonfarm.store import Figures, JobWriter, SceneReader, Store
 from photonfarm.store.check.check import check_store
+from photonfarm.trainer.data.batch_stream import BatchStream
 from photonfarm.trainer.data.feed import Feed
+from photonfarm.trainer.runs.devices import Ranks
 
 
 def test_no_configuration_is_on_both_sides_of_the_hold_out(make_source) -> None:
@@ -172,3 +175,30 @@ def test_where_a_look_at_the_store_takes_long_looks_are_rare(repaired, tiny, mon
         feed.ask([0])
         assert feed.take().rows == (0,), "batches do not wait for the next look"
     assert len(looks) == 1, "the next one is due 4 s after the first"
+
+
+def test_views_that_are_skipped_are_never_drawn_and_stay_held_out(scene, commit, tiny) -> None:
+    """Rows 0 to 3 are unlit, and so is 14, close to a wall; without the setting they are drawn as all others are."""
+    scene.plan(Request(modifications=16), shard_rows=8)
+    rows = scene.job_rows(0)
+    with JobWriter(scene, rows) as out:
+        for sample in rows.samples:
+            shown = rows.modifications[sample.modification_row], rows.views[sample.view_row]
+            clean, buffers = render(scene.spec, *shown)
+            lit = 0 if sample.row < 4 else 1
+            out.radiance(sample.row, np.stack([clean, clean]) * lit)
+            seen = visibility(scene.spec, scene.base()[1], *shown, None)
+            out.view(sample.view_row, buffers, known(clean * lit, buffers, 256), seen)
+        out.commit(Figures(core_s=1, wall_s=1, redrawn=0, worker="test", versions={"test": "1"}))
+    commit(scene, 1)
+
+    def drawn(**changes: Any) -> tuple[set[int], list[int]]:
+        settings = tiny(prefetch=16, hold_out=0.1, **changes)
+        with Feed(SceneReader(scene.storage.root, scene.scene_id), settings) as feed:
+            stream = BatchStream(feed, settings, Ranks())
+            stream.draw_ahead(16)
+            return {row for rows in stream.state()["asked"] for row in rows}, stream.held_out
+
+    everything, held_out = drawn()
+    assert everything | set(held_out) == set(range(16))
+    assert drawn(skip_views=["unlit"]) == (everything - {0, 1, 2, 3, 14}, held_out)

@@ -8,7 +8,7 @@ a scene at a time: memory holds the plans, 32 bytes a sample, and one row of eac
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -54,6 +54,7 @@ class SceneReport:
     samples: int
     size_bytes: int
     halves: HalvesResult | None
+    views: Mapping[str, int]  # `all` that could be read, and poor ones by their kinds
     groups: tuple[FindingGroup, ...]
     set_aside: tuple[str, ...]  # "job 12", "base", "spec"
 
@@ -205,7 +206,7 @@ class _SceneCheck:
         return self._markers[job]
 
     def _report(self, name: str | None, totals: CheckTotals, set_aside: list[str]) -> SceneReport:
-        read = totals.jobs, totals.samples, totals.size_bytes, totals.halves.result()
+        read = totals.jobs, totals.samples, totals.size_bytes, totals.halves.result(), dict(totals.views)
         return SceneReport(self._scene_id, name, *read, self._findings.groups(), tuple(set_aside))
 
     # ----------------------------------------------------------------------------------------------------------- repair

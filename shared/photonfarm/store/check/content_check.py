@@ -6,6 +6,7 @@ Shape letters: H W image, T tests.
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from math import ceil, log, sqrt
@@ -151,6 +152,7 @@ class CheckTotals:
 
     halves: HalvesTest
     fingerprints: Fingerprints = field(default_factory=Fingerprints)
+    views: Counter[str] = field(default_factory=Counter)  # `all`, and poor ones by their kinds
     jobs: int = 0
     samples: int = 0
     size_bytes: int = 0
@@ -159,6 +161,7 @@ class CheckTotals:
         """Add the totals of other jobs of the scene."""
         self.halves.merge(other.halves)
         self.fingerprints.merge(other.fingerprints)
+        self.views.update(other.views)
         for name in ("jobs", "samples", "size_bytes"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 

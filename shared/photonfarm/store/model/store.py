@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TypeVar
@@ -210,6 +211,7 @@ class SceneStatus:
     marker_error: str | None  # why the first of these cannot be read
     markers_without_plan: int = 0  # of committed jobs that no plan has: the last plan is missing
     error: str | None = None  # why the scene cannot be read; all numbers are 0 then
+    views: Mapping[str, int] = field(default_factory=dict)  # `all` that jobs counted, and poor ones by `PoorKind`
 
 
 READERS = 8
@@ -246,12 +248,14 @@ def scene_status(scene: SceneStore) -> SceneStatus:
         sum(unreadable for *_, unreadable, _ in sums),
         str(errors[0]) if errors else None,
         sum(job >= jobs or job in withdrawn for job in committed),
+        views=dict(sum((views for *_, views, _, _ in sums), Counter())),
     )
 
 
-def _sum_markers(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int, int, StoreError | None]:
-    """Bytes, core seconds and redrawn renders by the markers of some jobs; unreadable markers, and the first error."""
+def _sum_markers(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int, Counter[str], int, StoreError | None]:
+    """Bytes, core seconds, redrawn renders and views by some jobs' markers; unreadable markers, and the first error."""
     size_bytes, core_s, redrawn, errors = 0, 0.0, 0, []
+    views = Counter[str]()
     for job in jobs:
         try:
             marker = scene.marker(job)
@@ -262,4 +266,5 @@ def _sum_markers(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int, i
         size_bytes += sum(file["size"] for file in marker["files"].values())
         core_s += marker["figures"]["core_s"]
         redrawn += marker["figures"]["redrawn"]
-    return size_bytes, core_s, redrawn, len(errors), errors[0] if errors else None
+        views.update(marker["figures"].get("views", {}))  # without them in jobs of older versions
+    return size_bytes, core_s, redrawn, views, len(errors), errors[0] if errors else None

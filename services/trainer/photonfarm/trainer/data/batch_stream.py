@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Stream, make_key
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
@@ -159,9 +160,21 @@ class BatchStream:
             self.look()
             if not self.may_draw():
                 break
-            self._ask(self._sampler.draw(self._settings.batch))
+            self._ask(self._draw())
             self.drawn += 1
         return bool(self._asked)
+
+    def _draw(self) -> tuple[int, ...]:
+        """The rows of the next batch; skipped ones are drawn and passed over. Raises SpecError if all are skipped."""
+        rows: list[int] = []
+        size, rounds = self._settings.batch, 2 + self._settings.catch_up
+        for _ in range(size * rounds * len(self.training_rows)):  # by then each row has come so many times
+            drawn = self._sampler.draw(size - len(rows))
+            rows += (row for row in drawn if not self._feed.is_skipped(row))
+            if len(rows) == size:
+                return tuple(rows)
+        skipped = ", ".join(self._settings.skip_views)
+        raise SpecError(f"skip_views: without views that are {skipped}, none of those that have arrived is left")
 
     def _ask(self, rows: tuple[int, ...]) -> None:
         self._asked.append(rows)

@@ -18,7 +18,9 @@ from photonfarm.core.keys import Key, Stream
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import SceneDataset
 from photonfarm.plan.hold_out import are_held_out, enough, units_of
+from photonfarm.scene.poor_views import find_poor
 from photonfarm.store import SceneReader
+from photonfarm.store.read.batch import Batch
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, allocate_memory, choose_kept_pixels
 from photonfarm.trainer.networks import find_kind
 from photonfarm.trainer.networks.inputs import Needs
@@ -69,6 +71,7 @@ class Feed:
         self._sides: set[bool] = set()  # whether samples so far are held out
         self._units: set[Key] = set()  # what is held out as one, until some are and some are not
         self._known: set[int] = set()  # rows that have arrived
+        self._skipped: dict[int, bool] = {}  # by row, of those that were asked for
         self._missing: set[int] = set()  # rows that are known, and were set aside and are not complete again yet
         self._complete = False
         self._error: BaseException | None = None
@@ -166,6 +169,16 @@ class Feed:
         """A share that splits what has arrived, where the settings' one leaves one side empty; None if none does."""
         with self._lock:
             return enough(self._units, least=0.0)
+
+    def is_skipped(self, row: int) -> bool:
+        """Whether a row is never trained on, by `skip_views`; its sample is read for that, once."""
+        if not self._settings.skip_views:
+            return False
+        if row not in self._skipped:
+            (sample,) = self._source.read_samples([row], Batch.empty(self.spec, 1, guides=True))
+            kinds = find_poor(self.spec, {**sample.images, "photon_seen": sample.seen_photons})
+            self._skipped[row] = not set(self._settings.skip_views).isdisjoint(kinds)
+        return self._skipped[row]
 
     def _raise(self) -> None:
         if self._error is not None:

@@ -17,6 +17,7 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Count, Frozen, Positive, sentences
 from photonfarm.plan.hold_out import HOLD_OUT
+from photonfarm.scene.poor_views import PoorKind
 from photonfarm.trainer.runs.user_code import is_own
 
 PAGE = "docs/results/networks.md"
@@ -187,6 +188,7 @@ class TrainSettings(Frozen):
     max_seconds: Positive | None = None  # wall time of all sessions of the run together
 
     hold_out: Annotated[float, Field(gt=0, lt=1)] = 1 / 16  # share of the configurations never trained on
+    skip_views: tuple[PoorKind, ...] = ()  # kinds of views that are never trained on, by their inputs alone (ours)
     replay_ratio: Positive = 64.0  # draws per sample that has arrived, while more are to come
     replay_buffer: Annotated[int, Field(ge=0)] = 256  # draws allowed beyond that
     rounds: Positive = 12.0  # draws of each sample, at most, by guided_denoise: it could learn by heart what a half

@@ -13,13 +13,14 @@ from photonfarm.renderer.tools.check.samples import Cameras, Samples
 from photonfarm.renderer.tools.check.shapes import Placed
 from photonfarm.renderer.tools.measure.exposure import TARGET
 from photonfarm.scene.plausibility import doubts, group_key
+from photonfarm.scene.poor_views import hand_of
 from photonfarm.scene.spec import Movable, SceneSpec
 from photonfarm.scene.spec_loading import SpecLines
 
 MEANS = (0.2, 0.7)
 """Display means between which nothing is said."""
 
-INSIDE = 0.02
+INSIDE = NEAR = 0.02
 BEHIND = 0.01
 EMPTY = 0.01
 BLACK_BACKS = 0.05
@@ -133,6 +134,13 @@ def _check_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
             "view.origin",
             f"{percent(cameras.inside_share)} of the cameras stand inside objects, most of them inside {most}; keep "
             "origin away from furniture, or cameras out of it by `photonfarm scene free-space SPEC --write`",
+        )
+    elif cameras.near.mean() >= NEAR:
+        yield Finding(
+            "view.origin",
+            f"{percent(cameras.near.mean())} of the views show little but a surface within a hand "
+            f"({hand_of(spec):.2g}); `photonfarm scene free-space SPEC --write` keeps cameras away from surfaces",
+            serious=False,
         )
     well = cameras.placed_well
     if not well.any():

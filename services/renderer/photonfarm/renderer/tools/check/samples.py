@@ -26,6 +26,7 @@ from photonfarm.renderer.scene.surroundings import LEAVING, NONE
 from photonfarm.renderer.scene.view_rays import ViewCameras
 from photonfarm.renderer.tools.measure import exposure
 from photonfarm.scene.modification import Modification, rebuild, sample_modification
+from photonfarm.scene.poor_views import are_near, hand_of
 from photonfarm.scene.spec import Film, SceneSpec
 from photonfarm.scene.view import View, sample_view
 
@@ -59,6 +60,7 @@ class Cameras:
     behind: NDArray[np.bool_]  # (N,) outside the room, with a wall between them and nearly all look-at points
     nothing: NDArray[np.bool_]  # (N,) no surface at all in the image
     dark: F32  # (N,) the share of the image that shows the black back of a one-sided surface
+    near: NDArray[np.bool_]  # (N,) within a hand of what at least half of the image shows
     seen: F32  # (N,) the share of the points that the view sees
 
     def __len__(self) -> int:
@@ -82,7 +84,8 @@ class Cameras:
 
 def join_cameras(parts: Sequence[Cameras]) -> Cameras:
     """The cameras of several configurations."""
-    arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in ("behind", "nothing", "dark", "seen"))
+    names = ("behind", "nothing", "dark", "near", "seen")
+    arrays = (np.concatenate([getattr(part, name) for part in parts]) for name in names)
     return Cameras(tuple(name for part in parts for name in part.inside), *arrays)
 
 
@@ -92,26 +95,30 @@ def examine_cameras(scene: LoadedScene, views: Sequence[View], cloud: F32) -> Ca
     origin, target = (np.stack([getattr(view, name) for view in views]) for name in ("origin", "target"))
     here = scene.surroundings(origin)
     sights = sight_shares(scene.scene, origin, target)
-    hit, dark = _images(scene, views)
+    hit, dark, near = _images(scene, views)
     return Cameras(
         inside=tuple(None if number == NONE else ids[number] for number in here.solid),
         behind=(here.leaving > LEAVING) & (sights < BEHIND),
         nothing=hit == 0,
         dark=dark,
+        near=near,
         seen=scene.sees(views, cloud).mean(axis=1, dtype=np.float32),
     )
 
 
-def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32]:
-    """The shares of images that show a surface between the near and the far plane, and a black back; (N,) each."""
+def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32, NDArray[np.bool_]]:
+    """Shares of images: with a surface between near and far plane, with a black back; and which are near; (N,) each."""
     coarse = scene.spec.model_copy(update={"film": Film(width=RAYS_ALONG, height=RAYS_ALONG)})
-    si = scene.scene.ray_intersect(ViewCameras.of(views, coarse).pixels().ray(0.5, 0.5).ray)
+    sent = ViewCameras.of(views, coarse).pixels().ray(0.5, 0.5)
+    si = scene.scene.ray_intersect(sent.ray)
     hit = si.is_valid()
+    depth = dr.select(hit, (si.t + sent.before) * sent.along, 0)
     lit = reflects_here(si) | (si.shape.is_emitter()) | mi.has_flag(si.bsdf().flags(), mi.BSDFFlags.Transmission)
     dark = hit & ~lit
-    dr.eval(hit, dark)
+    dr.eval(hit, dark, depth)
     shares = [np.array(mask).reshape(len(views), -1).mean(axis=1, dtype=np.float32) for mask in (hit, dark)]
-    return shares[0], shares[1]
+    near = are_near(hand_of(scene.spec), np.array(depth).reshape(len(views), RAYS_ALONG, RAYS_ALONG))
+    return shares[0], shares[1], near
 
 
 @dataclass(frozen=True, slots=True, eq=False)

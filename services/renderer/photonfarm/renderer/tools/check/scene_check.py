@@ -146,6 +146,8 @@ def _list_facts(check: SceneCheck) -> list[tuple[str, str]]:
         ("cameras inside objects", f"{percent(cameras.inside_share)}{holders and f' ({holders})'}"),
         ("cameras that look through a wall from outside", percent(cameras.behind.mean())),
         ("cameras that see no surface", percent(cameras.nothing.mean())),
+        ("cameras within a hand of what they see", percent(cameras.near.mean())),
+        ("black pictures", f"{(~images.halves.any(axis=(1, 2, 3, 4))).sum()} of {len(images.halves)}"),
         ("points that a view sees", f"{median * points:.0f} of {points}; 5 % of views: below {low * points:.0f}"),
         (
             "display mean",

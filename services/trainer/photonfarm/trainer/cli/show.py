@@ -27,6 +27,9 @@ def print_record(of: dict[str, Any]) -> None:
     if of["kind"] == "changes":
         changed = ", ".join(f"{key} = {now!r} (before {then!r})" for key, (then, now) in of["changes"].items())
         click.echo(f"settings changed at step {of['step']}: {changed}", err=True)
+    if of["kind"] == "start":
+        anew = f", but for {', '.join(of['anew'])}, which is of another scene's points" if of["anew"] else ""
+        click.echo(f"begins with the weights of step {of['of_step']} of run {of['run']}{anew}", err=True)
     if of["kind"] == "loss":
         click.echo(f"loss {of['loss']} is unbiased: {of['verdict']}", err=True)
     if of["kind"] == "recovered":

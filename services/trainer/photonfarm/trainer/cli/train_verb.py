@@ -101,6 +101,12 @@ def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
 )
 @click.option("--batch", type=click.IntRange(1), help="Samples per step.  [default: the preset's]")
 @click.option("--seed", type=click.IntRange(0), help="Of the weights and the draws; 0 is a seed.  [default: 0]")
+@click.option(
+    "--start-from",
+    type=click.Path(file_okay=False),
+    metavar="RUN",
+    help="Begin with the weights of another run, of this scene or a similar one.",
+)
 @click.option("--replay-ratio", type=click.FloatRange(0, min_open=True), help="Draws per sample that has arrived.")
 @click.option(
     "--hold-out",

@@ -36,10 +36,10 @@ ANEW = "remove it, and the run begins anew"
 TENSOR = "tensor"
 OIDN = "mitsuba-oidn"  # which filters what some networks are given
 
-LASTING = ("scene_id", "exposure", "network", "batch", "hold_out", "optimiser", "loss", "seed")
+LASTING = ("scene_id", "exposure", "network", "batch", "hold_out", "optimiser", "loss", "seed", "start_from")
 """The settings that a run keeps for ever. The others may change when it is resumed."""
 
-OPTIONS = ("architecture", "precision", "demodulation", "batch", "hold_out", "optimiser", "loss", "seed")
+OPTIONS = ("architecture", "precision", "demodulation", "batch", "hold_out", "optimiser", "loss", "seed", "start_from")
 """The settings with an option of their own on the command line; --set takes the others."""
 
 UNREADABLE = (SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError)

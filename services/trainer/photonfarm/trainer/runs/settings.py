@@ -184,6 +184,7 @@ class TrainSettings(Frozen):
     recover: bool = True  # where it gets much worse than it was, or is not finite, a run goes back to good weights,
     # with half the rate, so that a night of training ends little worse than it once was
 
+    start_from: str | None = None  # the folder of a run whose weights it begins with; it is read before the first step
     max_steps: Count = 150_000  # [S 4]
     max_seconds: Positive | None = None  # wall time of all sessions of the run together
 

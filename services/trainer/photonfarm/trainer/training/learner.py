@@ -248,6 +248,12 @@ class Learner:
             return {}
         return {"rounds": round(steps_of_each * self._settings.batch, 2), "excess": float(self.excess)}
 
+    def begin_with(self, weights: dict[str, Tensor]) -> None:
+        """Take weights before the first step."""
+        self.network.load_state_dict(weights)
+        if self.average is not None:
+            self.average.restore({"weights": weights, "steps": 0})
+
     def state(self) -> dict[str, Any]:
         """The weights, their average if there is one, and the optimiser's state, for a checkpoint."""
         memory = [dict(self.optimiser.state.get(weight, {})) for weight in self.network.parameters()]

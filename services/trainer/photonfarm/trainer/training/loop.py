@@ -34,6 +34,7 @@ from photonfarm.trainer.runs.user_code import name_in_errors
 from photonfarm.trainer.training.good_state import GoodState, Setback, settle_files
 from photonfarm.trainer.training.learner import DivergedError, Learner, name_compile_errors
 from photonfarm.trainer.training.other_ranks import Presence
+from photonfarm.trainer.training.start_from import start_from
 from photonfarm.trainer.training.validation import Comparison, Show, Validation, compare, validate
 
 T = TypeVar("T")
@@ -128,6 +129,7 @@ class Session:
         self._best: dict[str, Any] | None = None  # the state of the run's best validation
         self._stream = BatchStream(feed, settings, hooks.ranks)
         self._step = 0
+        self._origin: dict[str, Any] = {}  # the run whose weights this session began with
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
@@ -159,6 +161,8 @@ class Session:
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
         kept = self._log.cut(self._step if continues else -1)
         self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
+        if self._origin:
+            self._log.write("start", step=0, **self._origin)
         if changed:
             self._log.write("changes", step=self._step, changes=changed)
         if self._learner.verdict is not None:
@@ -168,6 +172,8 @@ class Session:
     def _start(self) -> Changes:
         self._send_begin(continues=False)
         settle_files(self._run, None)
+        if (other := self._settings.start_from) is not None:
+            self._origin = start_from(Path(other), self._learner, self._feed.spec.scene_id, self._settings)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
 

@@ -28,6 +28,7 @@ from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.good_state import GoodState
 from photonfarm.trainer.training.learner import Learner, name_compile_errors
+from photonfarm.trainer.training.start_from import start_from
 
 
 def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings, run: Path, ranks: Ranks) -> None:
@@ -49,6 +50,8 @@ def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings,
         good = GoodState(learner, settings)
         if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run)
+        elif settings.start_from:
+            start_from(Path(settings.start_from), learner, value["scene_id"], settings)
         with name_compile_errors(settings.compile):
             while (received := ranks.receive())[0] != "end":
                 command, value = received

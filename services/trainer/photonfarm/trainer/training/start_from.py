@@ -1,0 +1,44 @@
+"""A run that begins with the weights of another one, of this scene or a similar one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from photonfarm.core.errors import SpecError
+from photonfarm.core.models import differing
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.settings import TrainSettings
+from photonfarm.trainer.training.learner import Learner
+
+SAME = ("architecture", "width", "descriptor", "octaves", "maxima", "emission", "demodulation")
+"""The settings that say what a network's weights are, and what they are for."""
+
+OF_POINTS = "descriptor"
+"""The weights that belong to the points of one scene's cloud, and say nothing of those of another."""
+
+
+def start_from(run: Path, learner: Learner, scene_id: str, settings: TrainSettings) -> dict[str, Any]:
+    """Give an untrained learner the weights by which a run predicts; its steps, rate and optimiser begin anew.
+
+    Descriptors of points begin anew too, unless the run is of this scene and has as many points. Returns what the log
+    says of it. Raises StoreError if there is no such run; SpecError, with each setting that differs, if its weights are
+    of another network.
+    """
+    state, own = checkpoint.load(run / CHECKPOINT), learner.network.state_dict()
+    weights = dict(average["weights"] if (average := state.get("average")) else state["network"])
+    changed = differing(state["settings"]["network"], settings.network.model_dump(mode="json"))
+    is_same_cloud = state["scene_id"] == scene_id and "points" not in changed
+    anew = [] if is_same_cloud else sorted({OF_POINTS} & own.keys() & weights.keys())
+    weights |= {name: own[name] for name in anew}
+    shapes, needed = ({name: tuple(each.shape) for name, each in of.items()} for of in (weights, own))
+    if named := [key for key in changed if key in SAME] or (list(changed) if shapes != needed else []):
+        values = "; ".join(f"{key} = {changed[key][0]!r} there, and {changed[key][1]!r} is asked for" for key in named)
+        raise SpecError(
+            f"start_from = {str(run)!r}: its weights are of another network: {values}; give the same values"
+        )
+    if shapes != needed:
+        raise SpecError(f"start_from = {str(run)!r}: its weights do not fit the network as its code is now")
+    learner.begin_with(weights)
+    return {"run": str(run), "of_step": state["step"], "of_scene": state["scene_id"], "anew": anew}

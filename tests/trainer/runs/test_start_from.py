@@ -1,0 +1,77 @@
+"""Runs that begin with the weights of another run."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.checkpoint import read_settings
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, read_log
+from photonfarm.trainer.training.loop import train
+
+NETWORK = {"width": 4, "architecture": "light_transport", "points": 64, "descriptor": 2}
+
+
+@pytest.fixture
+def begin(make_source: Callable[..., Any], tiny: Callable[..., Any], tmp_path: Path) -> Callable[..., Path]:
+    """Train a run of this name by settings, of the analytic room or, by `photons`, of another one."""
+
+    def trained(name: str, photons: int = 0, steps: int = 3, **settings: Any) -> Path:
+        described = tiny(**{"network": NETWORK, "average": 0.9, "max_steps": steps, **settings})
+        train(make_source(24, photons=photons), described, tmp_path / name)
+        return tmp_path / name
+
+    return trained
+
+
+def predicting(run: Path) -> dict[str, torch.Tensor]:
+    return checkpoint.load(run / CHECKPOINT)["average"]["weights"]
+
+
+def test_a_run_begins_with_the_weights_that_another_predicts_by(begin: Callable[..., Path]) -> None:
+    first = begin("first")
+    second = begin("second", start_from=str(first), seed=5, learning_rate=1e-12)
+    (said,) = (record for record in read_log(second / METRICS) if record["kind"] == "start")
+    assert (said["run"], said["of_step"], said["anew"]) == (str(first), 3, [])
+    for name, tensor in predicting(first).items():
+        assert torch.equal(tensor, checkpoint.load(second / INITIAL)["network"][name])
+        torch.testing.assert_close(predicting(second)[name], tensor, rtol=0, atol=1e-9)
+    assert read_settings(second).start_from == str(first)
+    begin(
+        "second", start_from=str(first), seed=5, learning_rate=1e-12, steps=4
+    )  # goes on, whatever became of the other
+    with pytest.raises(SpecError):
+        begin("second", seed=5, steps=5)
+
+
+def test_descriptors_of_another_scenes_points_begin_anew(begin: Callable[..., Path]) -> None:
+    first = begin("first")
+    fresh, second = begin("fresh", photons=8), begin("second", photons=8, start_from=str(first))
+    untrained, begun = (checkpoint.load(run / INITIAL)["network"] for run in (fresh, second))
+    assert torch.equal(begun["descriptor"], untrained["descriptor"])
+    rest = begun.keys() - {"descriptor"}
+    assert all(torch.equal(begun[name], predicting(first)[name]) for name in rest)
+    fewer = begin("fewer", start_from=str(first), network={**NETWORK, "points": 32})
+    assert read_log(fewer / METRICS)[0]["anew"] == ["descriptor"]
+
+
+@pytest.mark.parametrize(
+    ("network", "named"),
+    [
+        ({"architecture": "cnn"}, "architecture = 'light_transport' there, and 'cnn'"),
+        ({"width": 8, "octaves": 1}, "width = 4 there, and 8 .*octaves = 2 there, and 1"),
+        ({"maxima": "relative"}, "maxima"),
+    ],
+)
+def test_weights_of_another_network_are_refused_by_each_setting(
+    begin: Callable[..., Path], network: dict[str, Any], named: str
+) -> None:
+    first = begin("first", steps=1)
+    with pytest.raises(SpecError, match=named):
+        begin("second", start_from=str(first), network={**NETWORK, **network})
+    with pytest.raises(StoreError):
+        begin("third", start_from=str(first.with_name("none")))

@@ -130,6 +130,19 @@ class Stop:
         return self._is_set
 
 
+@contextmanager
+def stop_on_signals() -> Iterator[Stop]:
+    """A `Stop` that SIGTERM and SIGINT set, unless this is not the main thread, which gets signals."""
+    stop = Stop()
+    names = (signal.SIGTERM, signal.SIGINT) if threading.current_thread() is threading.main_thread() else ()
+    before = [signal.signal(name, lambda *_: stop.set()) for name in names]
+    try:
+        yield stop
+    finally:
+        for name, handler in zip(names, before, strict=True):
+            signal.signal(name, handler)
+
+
 def is_gone(process: int) -> bool:
     """Whether no process of this machine, or container, has that number."""
     try:

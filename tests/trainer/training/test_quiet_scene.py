@@ -16,6 +16,7 @@ from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.processes import stop_on_signals
 from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.model.lease import hold_lease
@@ -25,7 +26,7 @@ from photonfarm.trainer.runs.devices import join_ranks
 from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training import other_ranks
-from photonfarm.trainer.training.loop import Hooks, stop_on_signals, train
+from photonfarm.trainer.training.loop import Hooks, train
 from photonfarm.trainer.training.other_ranks import assist
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

@@ -13,6 +13,7 @@ import torch
 from held_out_errors import held_out_errors
 
 from photonfarm.core.errors import IncompleteError
+from photonfarm.core.processes import stop_on_signals
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.trainer import service
@@ -22,7 +23,7 @@ from photonfarm.trainer.runs.devices import describe_device, usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, METRICS
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.learner import DivergedError
-from photonfarm.trainer.training.loop import Hooks, stop_on_signals, train
+from photonfarm.trainer.training.loop import Hooks, train
 
 
 def weights(run) -> dict[str, torch.Tensor]:

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from redis import Redis, RedisError
 
 from photonfarm.core.errors import IncompleteError, QueueError, SpecError, StoreError
-from photonfarm.core.processes import Stop, repeat
+from photonfarm.core.processes import Stop, repeat, stop_on_signals
 from photonfarm.scene.spec import Film
 from photonfarm.scene.spec_loading import load_spec, scene_folder
 from photonfarm.store import SceneReader, Store
@@ -78,7 +78,7 @@ def run(
     signal stops it.
     """
     from photonfarm.trainer.runs.devices import describe_device, join_ranks
-    from photonfarm.trainer.training.loop import Hooks, stop_on_signals
+    from photonfarm.trainer.training.loop import Hooks
     from photonfarm.trainer.training.other_ranks import assist
 
     settings = make_settings(preset_name, changes)

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
@@ -50,19 +47,6 @@ class TrainingOutcome:
     step: int
     reason: str  # "steps", "seconds", "rounds" or "stopped"
     last_error: float | None  # held-out, noise removed; None if it ended before the first validation
-
-
-@contextmanager
-def stop_on_signals() -> Iterator[Stop]:
-    """A `Stop` for `train` that SIGTERM and SIGINT set, unless this is not the main thread, which gets signals."""
-    stop = Stop()
-    names = (signal.SIGTERM, signal.SIGINT) if threading.current_thread() is threading.main_thread() else ()
-    before = [signal.signal(name, lambda *_: stop.set()) for name in names]
-    try:
-        yield stop
-    finally:
-        for name, handler in zip(names, before, strict=True):
-            signal.signal(name, handler)
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +113,6 @@ class Session:
         self._best: dict[str, Any] | None = None  # the state of the run's best validation
         self._stream = BatchStream(feed, settings, hooks.ranks)
         self._step = 0
-        self._origin: dict[str, Any] = {}  # the run whose weights this session began with
         self._last_error: float | None = None
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
@@ -159,10 +142,8 @@ class Session:
         changed = self._continue(path) if (continues := path.exists()) else self._start()
         with store_errors("write the settings", self._run):
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
-        kept = self._log.cut(self._step if continues else -1)
+        kept = self._log.cut(self._step) if continues else []
         self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
-        if self._origin:
-            self._log.write("start", step=0, **self._origin)
         if changed:
             self._log.write("changes", step=self._step, changes=changed)
         if self._learner.verdict is not None:
@@ -172,8 +153,10 @@ class Session:
     def _start(self) -> Changes:
         self._send_begin(continues=False)
         settle_files(self._run, None)
+        self._log.cut(-1)
         if (other := self._settings.start_from) is not None:
-            self._origin = start_from(Path(other), self._learner, self._feed.spec.scene_id, self._settings)
+            begun = start_from(Path(other), self._learner, self._feed.spec.scene_id, self._settings)
+            self._log.write("start", step=0, **begun)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}
 

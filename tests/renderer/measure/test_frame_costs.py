@@ -193,6 +193,9 @@ def test_each_part_is_charged_with_its_own_seconds(
         "photons_seen_s": 8192,
     }
     assert {k: render.median for k, render in costs.renders().items()} == {4: 12, 1: 24}
+    for seconds, timed in ((1, 1), (3.5 * sum(part.median for part in costs.parts().values()), 2)):
+        few = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[], timed=5, seconds=seconds)
+        assert (len(few.edit_s), few.renders()) == (timed, {}), "in limited time, warm-ups included; without images"
 
 
 # ------------------------------------------------------------------------------------------------------------- the verb

@@ -18,7 +18,7 @@ def test_each_is_the_best_colour_by_its_own_error() -> None:
     """A lamp fills one of four blocks: it makes most of the mean, and little of the mean that a display shows."""
     image = torch.full((2 * BLOCK, 2 * BLOCK, 3), 0.2)
     image[:BLOCK, :BLOCK] = 100.0
-    colour, shown = average_colours(iter([batch(image)]))
+    colour, shown = average_colours([np.stack([image, image])])
     np.testing.assert_allclose(colour, (100 + 3 * 0.2) / 4, rtol=1e-6)
     np.testing.assert_allclose(shown, (1 + 3 * 0.2) / 4, rtol=1e-6)
     of_colour, of_shown = (measure(make_constant_predictor(each), iter([batch(image)])) for each in (colour, shown))

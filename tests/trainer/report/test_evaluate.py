@@ -18,7 +18,7 @@ from photonfarm.core.pictures import display
 from photonfarm.plan.hold_out import are_held_out
 from photonfarm.plan.request import Request
 from photonfarm.scene.modification import sample_modification
-from photonfarm.store import SceneStore
+from photonfarm.store import SceneReader, SceneStore
 from photonfarm.store.read.merge import MergedView
 from photonfarm.trainer.compare.evaluate import compare
 from photonfarm.trainer.compare.evaluation_page import (
@@ -89,14 +89,36 @@ def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured,
     rows = [line.removeprefix("| ").split(" ")[0] for line in lines[2:]]
     assert rows == ["denoise_4", "light_transport", "oidn", "fill-in"]
     assert lines[0].count("|") == lines[-1].count("|")
-    said = [line for line in result.stderr.splitlines() if line.endswith(": 3 samples")]
-    assert said[2:] == ["oidn 1/4: 3 samples", "fill-in 1/4: 3 samples"]
+    said = result.stderr.splitlines()
+    assert said[0] == "networks are loaded and timed", "each part of the work is told"
+    of_samples = [line for line in said if line.endswith(": 3 samples")]
+    assert of_samples == [f"{runs[0].name}, oidn 1/4, fill-in 1/4: 3 samples", f"{runs[1].name}: 3 samples"]
     documents = [json.loads((run.folder / EVALUATION).read_text()) for run in runs]
     assert documents[0] == documents[1]
     assert documents[0]["rows"][2]["predictor"] == "oidn 1/4"
     assert documents[0]["rows"][2]["linear_mse"]["mean"] < documents[0]["rows"][0]["linear_mse"]["mean"]
     pictures = [np.asarray(Image.open(run.folder / COMPARISON)) for run in runs]
     assert np.array_equal(*pictures)
+
+
+def test_predictors_that_read_the_same_read_each_sample_once(measured, trained, monkeypatch) -> None:
+    """Beside the sample that each is timed on, and those that are shown."""
+    read: list[int] = []
+    whole = SceneReader.read_batch
+
+    def counted(self: SceneReader, rows: Any, *into: Any) -> Any:
+        read.extend(np.asarray(rows).tolist())
+        return whole(self, rows, *into)
+
+    monkeypatch.setattr(SceneReader, "read_batch", counted)
+    alone = compare(measured.store, [TrainedRun.load(measured.runs[1])])
+    once = len(read)
+    assert once == alone.samples + 1 + len(alone.shown)
+    read.clear()
+    found = compare(measured.store, [TrainedRun.load(measured.runs[1]), trained()], [("none", 4), ("fill-in", 4)])
+    assert len(read) == once + 3 + found.samples, "the other run reads points, and no noisy colour"
+    assert [row.name for row in found.rows][2:] == ["none 1/4", "fill-in 1/4"]
+    assert found.rows[0].held_out.per_sample.tolist() == alone.rows[0].held_out.per_sample.tolist()
 
 
 def test_the_foot_says_what_the_figures_cannot(measured) -> None:

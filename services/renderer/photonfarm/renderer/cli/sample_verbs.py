@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from functools import partial
 from pathlib import Path
@@ -86,10 +87,8 @@ def buffers(
     "--kept",
     type=click.IntRange(1),
     multiple=True,
-    default=(1,),
-    show_default=True,
     metavar="K",
-    help="Time a half-estimate with one pixel in K kept; may be repeated.",
+    help="Time a half-estimate with one pixel in K kept, too; may be repeated.",
 )
 @click.option(
     "--timed",
@@ -98,6 +97,12 @@ def buffers(
     show_default=True,
     metavar="FRAMES",
     help="Frames to time, after some that do not count.",
+)
+@click.option(
+    "--seconds",
+    type=click.FloatRange(0, min_open=True),
+    default=math.inf,
+    help="Begin no further frame after so much time; one is timed at least.  [default: no limit]",
 )
 @click.option(
     "--points",
@@ -114,6 +119,7 @@ def measure_frames(
     rows: tuple[int, ...],
     kept: tuple[int, ...],
     timed: int,
+    seconds: float,
     points: int | None,
     out: Path,
 ) -> None:
@@ -128,10 +134,10 @@ def measure_frames(
     from photonfarm.renderer.tools.measure.frame_costs import write_frame_costs
 
     with tell_waiting(partial(click.echo, err=True), f"timing {timed} frames"):
-        costs = write_frame_costs(store, scene, rows, kept, timed, points, out)
+        costs = write_frame_costs(store, scene, rows, kept, timed, points, out, seconds)
     parts = {**costs.parts(), **{f"render_s 1/{k}": render for k, render in costs.renders().items()}}
     click.echo(", ".join(f"{name} {seconds.median:.4f}" for name, seconds in parts.items()))
-    click.echo(f"{out}: {len(rows)} rows, {timed} timed frames")
+    click.echo(f"{out}: {len(rows)} rows, {len(costs.edit_s)} timed frames")
 
 
 @click.command()

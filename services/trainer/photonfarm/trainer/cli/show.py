@@ -91,6 +91,8 @@ def show_progress() -> Iterator[OnProgress]:
                     bars.remove_task(bar)  # the bars of predictors stay
                 name, since_s, samples = what, time.monotonic(), Steps(total)
                 bar = bars.add_task(markup.escape(name), total=total or None)
+                if not total and not console.is_terminal:
+                    click.echo(name, err=True)
             samples.reach(done)
             if bar is not None:
                 bars.update(bar, completed=done)

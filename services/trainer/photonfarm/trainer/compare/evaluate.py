@@ -6,7 +6,7 @@ exactly. The columns of the paper's tables concern what a display shows, and nee
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, TypedDict
@@ -15,24 +15,22 @@ import numpy as np
 import torch
 
 from photonfarm.core.archives import Seconds
-from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.store import SceneReader
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, References, Target, read_references
 from photonfarm.trainer.data.batch import TrainingBatch, count_kept
-from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.metrics.features import Features, Inception, load_inception
 from photonfarm.trainer.metrics.image_metrics import ImageMetrics, confidence_interval, measure_images, metric_space
 from photonfarm.trainer.networks.inputs import Inputs
 from photonfarm.trainer.predictors.evaluation import (
-    NONE_COMPLETE,
     DevicePredictor,
     HeldOutErrors,
     Predictor,
-    measure,
-    read_batches,
+    measure_together,
+    read_in_turn,
     time_by_turns,
 )
 from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun, list_predictors
@@ -46,10 +44,13 @@ It gets the first predictor's images (H, W, 3), and the references that some row
 """
 
 MeasureProgress = Callable[[str, int, int], object]
-"""A callback with a predictor's name, the number of samples it was measured on so far, and of all samples.
+"""A callback with the names of predictors, the number of samples they were measured on so far, and of all samples.
 
 Other parts of the work are told by their name, 0 and 0.
 """
+
+
+AnyPredictor = TrainedRun | ReadyPredictor
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,6 +103,7 @@ class Evaluation:
     references: References | None
     rows: tuple[PredictorRow, ...]
     shown: tuple[Target, ...]
+    beside: tuple[HeldOutErrors, ...] = ()  # of the predictors that were measured beside the first one
 
     @property
     def samples(self) -> int:
@@ -159,12 +161,14 @@ def compare(
     device: str = "auto",
     on_progress: MeasureProgress | None = None,
     choose: Choose | None = None,
+    beside: Callable[[SceneReader], Sequence[Predictor]] | None = None,
 ) -> Evaluation:
     """Compare runs, and denoisers given one of so many pixels, on the first `most` views that no run was trained on.
 
     Each view is measured once, by its first sample, however many passes of it there are. References are files
     `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space.
-    FID, KID and Feature L1 take most of the time; `without_inception` leaves them out. Raises SpecError for runs of
+    FID, KID and Feature L1 take most of the time; `without_inception` leaves them out. What `beside` makes with the
+    samples' reader is measured on what the first run reads. Raises SpecError for runs of
     different scenes, for references of another size, for a film with too few pixels to keep some, and for a package
     that is missing; IncompleteError if no held-out sample is complete.
     """
@@ -178,19 +182,25 @@ def compare(
     references_by_row = {} if references is None else read_references(references, samples)
     shown = samples.to_show(references_by_row)
     network = load_inception(inception, str(place)) if references_by_row and not without_inception else None
-    test = _Test(store, samples, references_by_row, network, str(place), on_progress or (lambda *_: None))
+    test = _Test(samples, references_by_row, network, str(place), on_progress or (lambda *_: None))
     predictors = list_predictors(runs, denoisers)
     test.on_progress("networks are loaded and timed", 0, 0)
     calls = [test.load(predictor) for predictor in predictors]
     times, predicts = time_by_turns(calls), [predict for predict, _ in calls]
     del calls  # with the inputs on the device
-    rows: list[PredictorRow] = []
-    for predictor, predict, seconds in zip(predictors, predicts, times, strict=True):
-        held_out, metrics, images = test.measure(predictor, predict, {*references_by_row, *shown})
+    rows: dict[int, PredictorRow] = {}
+    errors_beside: list[HeldOutErrors] = []
+    for alike in _group_alike(predictors):
+        others = beside(samples.source) if beside and not rows else ()
+        pairs = [(predictors[number], predicts[number]) for number in alike]
+        errors, images, units = test.measure(pairs, others, {*references_by_row, *shown})
+        errors_beside += errors[len(alike) :]
         if choose and not rows:
-            shown += [row for row in dict.fromkeys(choose(images, references_by_row)) if row not in shown]
-        kept_images = {row: images[row] for row in shown if row in images}
-        rows.append(PredictorRow(predictor.name, predictor.needs.kept, held_out, seconds, metrics, kept_images))
+            shown += [row for row in dict.fromkeys(choose(images[0], references_by_row)) if row not in shown]
+        for number, held_out, own in zip(alike, errors, images, strict=False):
+            predictor, seen = predictors[number], {row: own[row] for row in shown if row in own}
+            metrics = test.compare_images(predictor, own, units)
+            rows[number] = PredictorRow(predictor.name, predictor.needs.kept, held_out, times[number], metrics, seen)
     return Evaluation(
         scene=spec.name,
         scene_id=first.scene_id,
@@ -199,9 +209,19 @@ def compare(
         device=describe_device(place),
         threads=first.settings.threads,
         references=References.of(references_by_row, spec.transport.half_spp),
-        rows=tuple(rows),
+        rows=tuple(rows[number] for number in range(len(predictors))),
         shown=tuple(samples.target(row, references_by_row.get(row)) for row in shown),
+        beside=tuple(errors_beside),
     )
+
+
+def _group_alike(predictors: Sequence[AnyPredictor]) -> list[list[int]]:
+    """The places of predictors that read the same of each sample, in batches of one size, together."""
+    groups: dict[Any, list[int]] = {}
+    for place, predictor in enumerate(predictors):
+        settings = predictor.settings
+        groups.setdefault((predictor.needs, settings.batch, settings.network.points), []).append(place)
+    return list(groups.values())
 
 
 def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
@@ -219,7 +239,6 @@ def _check_same_scene(runs: Sequence[TrainedRun]) -> None:
 class _Test:
     """The samples, references and metrics that all predictors are measured with."""
 
-    store: str | Path
     samples: HeldOutSamples
     references: Mapping[int, Reference]  # by row
     inception: Inception | None
@@ -227,45 +246,59 @@ class _Test:
     on_progress: MeasureProgress
     known: dict[tuple[int, ...], Features] = field(default_factory=dict)  # features of references, by their rows
 
-    def load(self, predictor: TrainedRun | ReadyPredictor) -> tuple[DevicePredictor, Inputs]:
+    def load(self, predictor: AnyPredictor) -> tuple[DevicePredictor, Inputs]:
         """Load a predictor, and the inputs of the first sample, on which it is timed."""
-        with self._feed(predictor, batch=1) as feed:
-            predict = predictor.predictor(feed.spec, feed.base, self.device)
-            for batch in read_batches(feed, self.samples.rows, 1):
-                return predict, predict.of_its_own(batch.inputs)
-        raise IncompleteError(NONE_COMPLETE)
+        source = self.samples.source
+        predict = predictor.predictor(source.spec, source.base(), self.device)
+        return predict, predict.of_its_own(next(self._read(predictor, 1)).inputs)
 
     def measure(
-        self, predictor: TrainedRun | ReadyPredictor, predict: Predictor, kept: set[int]
-    ) -> tuple[HeldOutErrors, ImageMetrics | None, dict[int, F32]]:
-        """Measure a predictor on all samples; also returns its images of the `kept` rows."""
-        rows, size = self.samples.rows, predictor.settings.batch
-        images: dict[int, F32] = {}
+        self,
+        alike: Sequence[tuple[AnyPredictor, Predictor]],
+        beside: Sequence[Predictor],
+        keep: set[int],
+    ) -> tuple[list[HeldOutErrors], list[dict[int, F32]], dict[int, Key]]:
+        """Measure predictors that read the same of each sample, and further ones `beside` them, on all samples.
+
+        Also returns the images of the `keep` rows by each of the first ones, and what each row is held out by.
+        """
+        (first, _), names = alike[0], ", ".join(predictor.name for predictor, _ in alike)
+        images: list[dict[int, F32]] = [{} for _ in alike]
         units: dict[int, Key] = {}
-        done = 0
 
-        def watch(batch: TrainingBatch) -> F32:
-            nonlocal done
-            predicted = predict(batch)
-            for row, unit, image in zip(batch.rows, batch.units, predicted, strict=True):
-                if row in kept:
-                    images[row], units[row] = image.copy(), unit
-            done += len(batch.rows)
-            self.on_progress(predictor.name, done, len(rows))
-            return predicted
+        def read() -> Iterator[TrainingBatch]:
+            self.on_progress(names, 0, len(self.samples.rows))
+            for batch in self._read(first, first.settings.batch):
+                units.update(zip(batch.rows, batch.units, strict=True))
+                yield batch
+                self.on_progress(names, len(units), len(self.samples.rows))
 
-        with self._feed(predictor, batch=size) as feed:
-            held_out = measure(watch, read_batches(feed, rows, size))
-        if self.references:
-            self.on_progress(f"{predictor.name} is compared with the references", 0, 0)
+        def keeping(predict: Predictor, kept: dict[int, F32]) -> Predictor:
+            def predict_and_keep(batch: TrainingBatch) -> F32:
+                predicted = predict(batch)
+                for row, image in zip(batch.rows, predicted, strict=True):
+                    if row in keep:
+                        kept[row] = image.copy()
+                return predicted
+
+            return predict_and_keep
+
+        predicts = [keeping(predict, kept) for (_, predict), kept in zip(alike, images, strict=True)]
+        return measure_together([*predicts, *beside], read()), images, units
+
+    def compare_images(
+        self, predictor: AnyPredictor, images: Mapping[int, F32], units: Mapping[int, Key]
+    ) -> ImageMetrics | None:
+        """Compare a predictor's images with the references; None where there are none of these rows."""
         compared = [row for row in images if row in self.references]
         if not compared:
-            return held_out, None, images
+            return None
+        self.on_progress(f"{predictor.name} is compared with the references", 0, 0)
         a, b, mean = (
             np.stack([getattr(self.references[row], image) for row in compared])
             for image in ("half_a", "half_b", "mean")
         )
-        metrics = measure_images(
+        return measure_images(
             np.stack([images[row] for row in compared]),
             mean,
             self.inception,
@@ -274,13 +307,11 @@ class _Test:
             having_seen_a=predictor.needs.kept is not None,
             wanted_features=self._features(tuple(compared), mean),
         )
-        return held_out, metrics, images
 
-    def _feed(self, predictor: TrainedRun | ReadyPredictor, *, batch: int) -> Feed:
-        settings = predictor.settings.model_copy(update={"device": self.device, "batch": batch})
-        spec = self.samples.source.spec
-        source = SceneReader(self.store, spec.scene_id, exposure=spec.exposure)
-        return Feed(source, settings, needs=predictor.needs)
+    def _read(self, predictor: AnyPredictor, size: int) -> Iterator[TrainingBatch]:
+        return read_in_turn(
+            self.samples.source, self.samples.rows, size, predictor.needs, predictor.settings.network.points
+        )
 
     def _features(self, rows: tuple[int, ...], references: F32) -> Features | None:
         """The features of the references of some rows, which are the same for almost all predictors."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,10 +17,12 @@ from photonfarm.core.errors import IncompleteError
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, clean_error, clean_error_having_seen_a, group_means, noise_floor
-from photonfarm.trainer.data.batch import TrainingBatch
-from photonfarm.trainer.data.feed import Feed
+from photonfarm.data.torch_dataset import SceneDataset
+from photonfarm.store import SceneReader
+from photonfarm.trainer.data.batch import TrainingBatch, allocate_memory
+from photonfarm.trainer.data.feed import Feed, read_batch
 from photonfarm.trainer.networks import predict_image
-from photonfarm.trainer.networks.inputs import Inputs
+from photonfarm.trainer.networks.inputs import Inputs, Needs
 from photonfarm.trainer.networks.network import Network
 
 Predictor = Callable[[TrainingBatch], F32]
@@ -97,21 +99,31 @@ def read_batches(feed: Feed, rows: Sequence[int], size: int) -> Iterator[Trainin
         yield feed.take()
 
 
+def read_in_turn(
+    source: SceneReader, rows: Sequence[int], size: int, needs: Needs, points: int | None = None
+) -> Iterator[TrainingBatch]:
+    """Complete rows of a source as batches in their order, each valid until the next; of the points the first ones."""
+    dataset = SceneDataset(source, needs.fields, exposure=source.spec.exposure, points=points)
+    memory = allocate_memory(dataset.tensors, min(size, len(rows)))
+    for start in range(0, len(rows), size):
+        yield read_batch(source, dataset, rows[start : start + size], needs, memory)
+
+
 def make_network_predictor(network: Network) -> DevicePredictor:
     """The network as a predictor, on the device of its parameters."""
     return DevicePredictor(partial(predict_image, network), next(network.parameters()).device)
 
 
-def average_colours(samples: Iterator[TrainingBatch]) -> tuple[F32, F32]:
-    """The mean exposed colours over samples and pixels, (3,) each: the best predictions without any input.
+def average_colours(samples: Iterable[F32]) -> tuple[F32, F32]:
+    """The mean colours over samples (2, H, W, 3) and their pixels, (3,) each: the best predictions without any input.
 
     The first is for `error`, the second for `shown`, with light above white cut to white.
     """
     means, shown = [], []
-    for batch in samples:
-        for image in batch.target.double().mean(dim=1).numpy():
-            means.append(image.mean(axis=(0, 1)))
-            shown.append(np.minimum(average_blocks(image), WHITE).mean(axis=(0, 1)))
+    for halves in samples:
+        image = halves.mean(axis=0, dtype=np.float64)
+        means.append(image.mean(axis=(0, 1)))
+        shown.append(np.minimum(average_blocks(image), WHITE).mean(axis=(0, 1)))
     return np.mean(means, axis=0).astype(np.float32), np.mean(shown, axis=0).astype(np.float32)
 
 
@@ -125,15 +137,14 @@ def choose_error(batch: TrainingBatch) -> Callable[[F32, F32, F32], float]:
     return clean_error if batch.inputs.noisy is None else clean_error_having_seen_a
 
 
-def _measure_shown(error: Callable[[F32, F32, F32], float], *images: F32) -> float:
-    """The error of means over blocks of `BLOCK` × `BLOCK` pixels, with light above white cut to white.
+def _cut_blocks(image: F32) -> F32:
+    """Means over blocks of `BLOCK` × `BLOCK` pixels, with light above white cut to white.
 
     Without the cut a lamp in view, hundreds of times brighter than the surfaces it lights, makes up most of the error.
     Means come before the cut, as noise above white would be cut as well: of single noisy pixels the cut makes the
     targets so much darker that a network that is too dark looks better than the right one.
     """
-    prediction, half_a, half_b = (np.minimum(average_blocks(image), WHITE) for image in images)
-    return error(prediction, half_a, half_b)
+    return np.minimum(average_blocks(image), WHITE)
 
 
 def average_blocks(image: F32) -> F32:
@@ -145,24 +156,35 @@ def average_blocks(image: F32) -> F32:
     return (sums / counts).astype(np.float32)
 
 
-def measure(predict: Predictor, samples: Iterator[TrainingBatch]) -> HeldOutErrors:
-    """The predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
+def measure(predict: Predictor, samples: Iterable[TrainingBatch]) -> HeldOutErrors:
+    """The error of one predictor, as `measure_together` has it."""
+    return measure_together([predict], samples)[0]
 
-    For a predictor whose inputs include noisy colour, which is A's, it is mean f² − 2fB + AB.
+
+def measure_together(predictors: Sequence[Predictor], samples: Iterable[TrainingBatch]) -> list[HeldOutErrors]:
+    """Each predictor's error over samples: mean (f − A)(f − B), and the noise floor mean (A − B)²/4 [estimate].
+
+    For predictors whose inputs include noisy colour, which is A's, it is mean f² − 2fB + AB. Each batch is taken once.
 
     Raises IncompleteError if there is no sample.
     """
-    errors, shown, floors = [], [], []
+    errors: list[list[list[float]]] = [[] for _ in predictors]  # by predictor, of each sample: of all light, and shown
+    floors: list[float] = []
     units: list[Key] = []
     for batch in samples:
         units.extend(batch.units)
-        error = choose_error(batch)
-        for image, (half_a, half_b) in zip(predict(batch), batch.target.cpu().numpy(), strict=True):
-            errors.append(error(image, half_a, half_b))
-            shown.append(_measure_shown(error, image, half_a, half_b))
-            floors.append(noise_floor(half_a, half_b))
-    if not errors:
+        error, halves = choose_error(batch), batch.target.cpu().numpy()
+        cut = [[_cut_blocks(half) for half in of_sample] for of_sample in halves]
+        floors.extend(noise_floor(*of_sample) for of_sample in halves)
+        for predict, found in zip(predictors, errors, strict=True):
+            for image, both, shown in zip(predict(batch), halves, cut, strict=True):
+                found.append([error(image, *both), error(_cut_blocks(image), *shown)])
+    if not units:
         raise IncompleteError(NONE_COMPLETE)
-    per_sample = np.array(errors)
     floor = float(np.mean(group_means(np.array(floors), units)))
-    return HeldOutErrors(Estimate.of(group_means(per_sample, units)), floor, per_sample, np.array(shown), tuple(units))
+
+    def summarise(found: list[list[float]]) -> HeldOutErrors:
+        per_sample, shown = np.array(found).T
+        return HeldOutErrors(Estimate.of(group_means(per_sample, units)), floor, per_sample, shown, tuple(units))
+
+    return [summarise(found) for found in errors]

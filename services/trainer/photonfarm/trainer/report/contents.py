@@ -17,10 +17,12 @@ from photonfarm.core.errors import BackendError
 from photonfarm.core.records import F32, Guides, ViewBuffers
 from photonfarm.core.statistics import Estimate
 from photonfarm.scene.spec import SceneSpec
+from photonfarm.store import SceneReader
 from photonfarm.trainer.compare.evaluate import Evaluation, MeasureOptions, PredictorRow, compare
 from photonfarm.trainer.compare.evaluation_samples import Reference
+from photonfarm.trainer.predictors.evaluation import Predictor
 from photonfarm.trainer.predictors.trained import TrainedRun, list_predictors
-from photonfarm.trainer.report.data_and_runs import Baselines, DatasetCard, RunStory, shorten_names
+from photonfarm.trainer.report.data_and_runs import Baselines, DatasetCard, RunStory, make_baselines, shorten_names
 from photonfarm.trainer.report.frame_times import (
     FrameTime,
     Machine,
@@ -145,7 +147,7 @@ def gather_contents(
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
     first, predictors = runs[0], list_predictors(runs, how.get("denoisers", ()))
     card = DatasetCard.of(store, first.scene_id, first.exposure)
-    kept = [k for k in (1, *(predictor.needs.kept for predictor in predictors)) if k]
+    kept = [k for k in (predictor.needs.kept for predictor in predictors) if k]
     tell = how.get("on_progress") or (lambda *_: None)
     costs: FrameCosts | None = None
     untimed, worst, machine = "it was not asked for", [], Machine.here()
@@ -173,8 +175,10 @@ def gather_contents(
         )
         return [case.row for case in worst]
 
-    evaluation = compare(store, runs, choose=look_closely, **how)
-    tell("the mean colour and the untrained network are measured", 0, 0)
+    def make_beside(source: SceneReader) -> list[Predictor]:
+        return make_baselines(source, first, how.get("device", "auto"), tell)
+
+    evaluation = compare(store, runs, choose=look_closely, beside=make_beside, **how)
     title, table = find_published_table(card.spec)
     names = shorten_names(list(runs))
     entries = []
@@ -186,7 +190,7 @@ def gather_contents(
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
-        baselines=Baselines.of(first.source(store), first, evaluation.measured),
+        baselines=Baselines(*evaluation.beside),
         evaluation=evaluation,
         entries=tuple(entries),
         costs=costs,

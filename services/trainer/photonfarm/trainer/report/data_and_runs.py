@@ -7,7 +7,7 @@ before its first step.
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core.errors import IncompleteError
+from photonfarm.core.records import F32
+from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import UNUSED
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, SceneStatus, Store
 from photonfarm.store.model.store import scene_status
-from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.predictors.evaluation import (
     HeldOutErrors,
+    Predictor,
     average_colours,
     make_constant_predictor,
-    measure,
-    read_batches,
 )
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
@@ -240,6 +240,8 @@ def shorten_names(runs: list[TrainedRun]) -> list[str]:
 
 MOST_TRAINING = 1024  # samples to take the mean colour of
 
+COLOUR = "the mean colour of the training samples"
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Baselines:
@@ -249,20 +251,26 @@ class Baselines:
     mean_shown_colour: HeldOutErrors  # the same of these samples with light above white cut, for `shown` alone
     untrained: HeldOutErrors  # the first run's network before its first step
 
-    @classmethod
-    def of(cls, source: SceneReader, run: TrainedRun, rows: Sequence[int]) -> Baselines:
-        """Measure them on some held-out samples of a run; raises IncompleteError without samples for the colour."""
-        settings = run.settings.model_copy(update={"device": "cpu"})
-        with Feed(source, settings, needs=run.needs) as feed:
-            arrived, _ = feed.arrivals()
-            training = [row for row, held in arrived if not held]
-            if not training:
-                raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
-            some = training[:: -(-len(training) // MOST_TRAINING)]
-            colour, shown_colour = average_colours(read_batches(feed, some, settings.batch))
-            untrained = TrainedRun.load(run.folder, INITIAL).predictor(feed.spec, feed.base, "cpu")
-            return cls(
-                measure(make_constant_predictor(colour), read_batches(feed, rows, settings.batch)),
-                measure(make_constant_predictor(shown_colour), read_batches(feed, rows, settings.batch)),
-                measure(untrained, read_batches(feed, rows, settings.batch)),
-            )
+
+def make_baselines(
+    source: SceneReader, run: TrainedRun, device: str, tell: Callable[[str, int, int], object] = lambda *_: None
+) -> list[Predictor]:
+    """The predictors of `Baselines`, in its order, from what is complete of a run's scene.
+
+    Of the samples the radiance alone is read. Raises IncompleteError without training samples for the colour.
+    """
+    complete = source.rows.tolist()
+    held_out = rows_held_out(source, complete, run.settings.hold_out)
+    training = [row for row, held in zip(complete, held_out, strict=True) if not held]
+    if not training:
+        raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
+    some = training[:: -(-len(training) // MOST_TRAINING)]
+
+    def read() -> Iterator[F32]:
+        for done, row in enumerate(some, start=1):
+            yield source.read_radiance(row) * np.float32(source.spec.exposure)
+            tell(COLOUR, done, len(some))
+
+    colours = average_colours(read())
+    untrained = TrainedRun.load(run.folder, INITIAL).predictor(source.spec, source.base(), device)
+    return [*map(make_constant_predictor, colours), untrained]

@@ -52,6 +52,7 @@ class Machine:
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames
+LONGEST_S = 10.0  # for all of them
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +92,8 @@ def measure_frame_costs(
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
-        asked += ["--timed", str(TIMED), *([] if points is None else ["--points", str(points)])]
+        asked += ["--timed", str(TIMED), "--seconds", str(LONGEST_S)]
+        asked += [] if points is None else ["--points", str(points)]
         asked += [argument for row in rows for argument in ("--row", str(row))]
         asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
         verb, environment = command(VERB, *asked), make_environment(run.folder)

@@ -80,7 +80,7 @@ def _has_references(contents: ReportContents) -> bool:
 def _describe_time(contents: ReportContents) -> str:
     if contents.costs is None:
         return f"time per frame: n/a, as {contents.untimed}"
-    frames, edit = contents.costs.render_s.shape[1], contents.costs.parts()["edit_s"]
+    frames, edit = len(contents.costs.edit_s), contents.costs.parts()["edit_s"]
     return (
         f"time per frame: medians of {frames} frames for rendering, buffers, points and photons, on one core by LLVM's "
         f"code; of {TIMED_ROUNDS} calls, taken by turns, for networks, on {describe_device(contents.evaluation)}; "

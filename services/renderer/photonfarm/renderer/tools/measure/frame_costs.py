@@ -16,6 +16,7 @@ light pass unchanged, and does not count as a coat.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -112,7 +113,14 @@ class TimedFrame:
 
 
 def write_frame_costs(
-    store: str | Path, scene: str, rows: Sequence[int], kept: Sequence[int], timed: int, points: int | None, out: Path
+    store: str | Path,
+    scene: str,
+    rows: Sequence[int],
+    kept: Sequence[int],
+    timed: int,
+    points: int | None,
+    out: Path,
+    seconds: float = math.inf,
 ) -> FrameCosts:
     """Measure some rows of a scene into a file, with the first `points` of its base cloud, or all of them.
 
@@ -127,7 +135,7 @@ def write_frame_costs(
     frames = [TimedFrame(row, *reader.inputs(row)[:2], reader.modification_key(row)) for row in rows]
     used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
     spec = locate(reader.spec)
-    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed)
+    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed, seconds)
     costs.write(out)
     return costs
 
@@ -146,18 +154,24 @@ def _check_complete(reader: SceneReader, rows: Sequence[int]) -> None:
 
 
 def frame_costs(
-    scene: LoadedScene, cloud: BasePointCloud, frames: Sequence[TimedFrame], kept: Sequence[int], timed: int
+    scene: LoadedScene,
+    cloud: BasePointCloud,
+    frames: Sequence[TimedFrame],
+    kept: Sequence[int],
+    timed: int,
+    seconds: float = math.inf,
 ) -> FrameCosts:
     """The surfaces of all frames, and the times of `timed` of them and of images of 1/k of the pixels, k of `kept`.
 
-    If there are fewer frames than are timed, they are repeated.
+    If there are fewer frames than are timed, they are repeated. After so many `seconds` no further one is begun, but
+    one is timed.
     """
     films = [PartialFilm(scene.spec, k) for k in kept]
     surface = []
     for frame in frames:
         scene.apply(frame.modification)
         surface.append(surface_kinds(scene.scene, frame.view, scene.spec))
-    parts, render_s = np.split(_seconds(scene, cloud, films, frames, timed), [len(PARTS)])
+    parts, render_s = np.split(_seconds(scene, cloud, films, frames, timed, seconds), [len(PARTS)])
     return FrameCosts(
         scene.spec.scene_id,
         np.array([frame.row for frame in frames], np.int64),
@@ -178,12 +192,20 @@ def take_turns(frames: Sequence[TimedFrame]) -> Iterator[TimedFrame]:
 
 
 def _seconds(
-    scene: LoadedScene, cloud: BasePointCloud, films: Sequence[PartialFilm], frames: Sequence[TimedFrame], timed: int
+    scene: LoadedScene,
+    cloud: BasePointCloud,
+    films: Sequence[PartialFilm],
+    frames: Sequence[TimedFrame],
+    timed: int,
+    seconds: float,
 ) -> NDArray[np.float64]:
     """The times of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
+    until = time.perf_counter() + seconds
     stays = len({frame.key for frame in frames}) == 1
-    measured = []
+    measured: list[list[float]] = []
     for seed, frame in enumerate(islice(take_turns(frames), WARM_UPS + timed)):
+        if len(measured) > WARM_UPS and time.perf_counter() > until:
+            break
         if stays:  # else there would be nothing to edit
             scene.apply(rest(scene.spec))
         parts = time_parts(scene, cloud, frame.modification, frame.key, frame.view, time.perf_counter)

@@ -102,7 +102,7 @@ def list_lines(farm: FarmProgress, store: str | Path) -> Iterator[str]:
     """What cannot be read, the queue, what workers and trainers do, and what waits for what."""
     for scene in farm.scenes:
         yield from (f"{scene.status.name} {scene.status.scene_id}: {fault}" for fault in scene.faults)
-        if poor := describe_counts(scene.status.views):
+        if poor := describe_counts(scene.status.counts):
             yield f"{scene.status.name} {scene.status.scene_id}: {poor}"
     yield f"queue: {farm.describe_queue()}"
     yield from (f"  worker {name} {activity}" for name, activity in farm.queue.activities.items())

@@ -102,7 +102,7 @@ def _print_scene(scene: SceneReport) -> None:
     click.echo(f"{scene.name or 'unreadable'} {scene.scene_id}: {read}")
     if scene.halves is not None:
         click.echo(f"  A against B: {scene.halves.in_words}")
-    if poor := describe_counts(scene.views):
+    if poor := describe_counts(scene.counts):
         click.echo(f"  {poor}")
     for group in scene.groups:
         click.echo(f"  {group.count} × {group.cause.label}: {group.cause.sentence} ({group.cause.remedy.value})")

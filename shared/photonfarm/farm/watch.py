@@ -45,14 +45,14 @@ class _Seen:
     core_s: dict[int, float] = field(default_factory=dict)  # that committed jobs took, by their numbers
     size_bytes: int = 0
     redrawn: int = 0
-    views: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
     history: deque[tuple[float, int]] = field(default_factory=deque)  # when so many samples were rendered
 
     def add(self, job: int, marker: dict[str, Any]) -> None:
         """Add a job's marker."""
         self.core_s[job] = marker["figures"]["core_s"]
         self.redrawn += marker["figures"]["redrawn"]
-        self.views.update(marker["figures"].get("views", {}))
+        self.counts.update(marker["figures"].get("counts", {}))
         self.size_bytes += sum(file["size"] for file in marker["files"].values())
 
     def pace(self, now: float, rendered: int) -> float | None:
@@ -154,7 +154,7 @@ class FarmWatch:
                 len(unread),
                 str(unread[0]) if unread else None,
                 sum(job >= jobs or job in withdrawn for job in committed),
-                views=dict(seen.views),
+                counts=dict(seen.counts),
             ),
             (progress.committed_passes, progress.planned_passes),
             in_hand,

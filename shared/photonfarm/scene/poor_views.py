@@ -1,30 +1,29 @@
-"""Views that are hardly worth a sample: nothing that they show is lit, or they show little but a surface close by.
+"""Views that are hardly worth a sample: no light reaches what they show, or that is little but a surface close by.
 
-Both are told by a view's inputs, whose noise is independent of that of its halves. So to leave such views out of
-training changes which views are learned, and biases none that stays. Whether both halves are black would not do: of a
-dim view that would leave out the passes that are black by chance, and the others are too bright.
+What is stored is counted by its halves: a sample is black if both are. But who chooses what to train on may not look at
+halves: of a dim view that would leave out the passes that are black by chance, and the others are too bright. So a view
+is unlit by its inputs, whose noise is independent of that of halves: to leave it out changes which views are learned,
+and biases none that stays.
 
-Shape letters: H W image.
+Shape letters: H W image, K photon slots.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Literal
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
+    from photonfarm.core.records import F32, Photons
     from photonfarm.scene.spec import SceneSpec
 
 PoorKind = Literal["unlit", "near"]
-"""No lamp, no direct light and no photon is seen in the view; half of it or more shows surfaces within a hand."""
-
-POOR_KINDS: tuple[PoorKind, ...] = get_args(PoorKind)
 
 LIGHT = ("emission", "direct", "gloss")
-"""The guides that show light; so do photons, of which the store's `photon_seen` says which a view sees."""
+"""The guides that show light."""
 
 HAND = 1 / 64
 """A hand, as a share of the diagonal of the box around all cameras and look-at points: 10 cm of 6.4 m."""
@@ -37,24 +36,37 @@ def hand_of(spec: SceneSpec) -> float:
     return HAND * math.dist(low, high)
 
 
-def are_near(hand: float, depth: NDArray[Any]) -> NDArray[Any]:
+def are_near(spec: SceneSpec, depth: NDArray[Any]) -> NDArray[Any]:
     """Whether views with these depths (…, H, W) show surfaces within a hand in half of the image or more, (…)."""
-    share: NDArray[Any] = ((depth > 0) & (depth < hand)).mean(axis=(-2, -1)) >= 0.5
+    share: NDArray[Any] = ((depth > 0) & (depth < hand_of(spec))).mean(axis=(-2, -1)) >= 0.5
     return share
 
 
-def find_poor(spec: SceneSpec, of_view: Mapping[str, NDArray[Any]]) -> list[PoorKind]:
-    """In what ways a view is poor, by what is stored of it, by name: `depth`, `LIGHT`, perhaps `photon_seen`."""
-    unlit = not any(of_view[name].any() for name in ("photon_seen", *LIGHT) if name in of_view)
-    near = bool(are_near(hand_of(spec), of_view["depth"]))
-    return [kind for kind, holds in zip(POOR_KINDS, (unlit, near), strict=True) if holds]
+def is_unlit(
+    images: Mapping[str, NDArray[Any]], eye: F32, seen: NDArray[Any], read_photons: Callable[[], Photons]
+) -> bool:
+    """Whether a view from a point (3,) shows no lamp, no direct light, and of photons (K,) only the side behind.
+
+    `seen` (K,) says which photons nothing hides. From within a piece of furniture these are those that landed on it,
+    outside; so their sides are looked at, and they are read for that only where nothing else is lit. Of a scene without
+    photons nothing is unlit.
+    """
+    if not len(seen) or any(images[name].any() for name in LIGHT):
+        return False
+    photons = read_photons()
+    towards_eye = ((eye - photons.position) * photons.normal).sum(axis=1)
+    towards_light = -(photons.direction * photons.normal).sum(axis=1)
+    return not (seen & (towards_eye * towards_light > 0)).any()
 
 
 def describe_counts(counts: Mapping[str, int]) -> str:
-    """The numbers of `all` views, and of those of each kind, in words; "" if no view is poor."""
-    number = counts.get("all", 0)
-    words = {"unlit": "show nothing that is lit", "near": "show little but a surface within a hand of the camera"}
+    """What share of `samples` is `black`, and of `views` is `near`, in words; "" if none is."""
     parts = [
-        f"{counts[kind]} ({100 * counts[kind] / number:.2g} %) {words[kind]}" for kind in POOR_KINDS if counts.get(kind)
+        f"{counts[poor]} of {counts[of]} {of} ({100 * counts[poor] / counts[of]:.2g} %) {words}"
+        for poor, of, words in (
+            ("black", "samples", "are black"),
+            ("near", "views", "show little but a surface within a hand of the camera"),
+        )
+        if counts.get(poor)
     ]
-    return f"of {number} views {' and '.join(parts)}" if parts else ""
+    return "; ".join(parts)

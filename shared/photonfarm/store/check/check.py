@@ -54,7 +54,7 @@ class SceneReport:
     samples: int
     size_bytes: int
     halves: HalvesResult | None
-    views: Mapping[str, int]  # `all` that could be read, and poor ones by their kinds
+    counts: Mapping[str, int]  # as `Figures` has them, of what could be read
     groups: tuple[FindingGroup, ...]
     set_aside: tuple[str, ...]  # "job 12", "base", "spec"
 
@@ -206,7 +206,7 @@ class _SceneCheck:
         return self._markers[job]
 
     def _report(self, name: str | None, totals: CheckTotals, set_aside: list[str]) -> SceneReport:
-        read = totals.jobs, totals.samples, totals.size_bytes, totals.halves.result(), dict(totals.views)
+        read = totals.jobs, totals.samples, totals.size_bytes, totals.halves.result(), dict(totals.counts)
         return SceneReport(self._scene_id, name, *read, self._findings.groups(), tuple(set_aside))
 
     # ----------------------------------------------------------------------------------------------------------- repair

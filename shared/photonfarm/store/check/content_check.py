@@ -152,7 +152,7 @@ class CheckTotals:
 
     halves: HalvesTest
     fingerprints: Fingerprints = field(default_factory=Fingerprints)
-    views: Counter[str] = field(default_factory=Counter)  # `all`, and poor ones by their kinds
+    counts: Counter[str] = field(default_factory=Counter)  # as `Figures` has them, of what could be read
     jobs: int = 0
     samples: int = 0
     size_bytes: int = 0
@@ -161,7 +161,7 @@ class CheckTotals:
         """Add the totals of other jobs of the scene."""
         self.halves.merge(other.halves)
         self.fingerprints.merge(other.fingerprints)
-        self.views.update(other.views)
+        self.counts.update(other.counts)
         for name in ("jobs", "samples", "size_bytes"):
             setattr(self, name, getattr(self, name) + getattr(other, name))
 
@@ -171,6 +171,7 @@ def check_radiance(row: int, halves: NDArray[Any], totals: CheckTotals) -> Itera
     totals.samples += 1
     totals.halves.add(halves)
     black = [half for half, values in zip("AB", halves, strict=True) if not largest(values)]
+    totals.counts.update(samples=1, black=int(len(black) == 2))
     prints = [totals.fingerprints.add(row, values) for values in halves if largest(values)]
     if not prints:
         yield Cause.BLACK, "all zero"

@@ -52,7 +52,7 @@ class Figures(_Stored):
     driver: str = ""  # the version of the card's driver
     strategy: dict[str, Any] = {}  # how light was sampled, as `SceneSpec.strategy`
     taken_over: Annotated[int, Field(ge=0)] = 0  # samples whose halves were copied from another scene
-    views: dict[str, Annotated[int, Field(ge=0)]] = {}  # stored by the job: `all`, and those of each `PoorKind`
+    counts: dict[str, Annotated[int, Field(ge=0)]] = {}  # of what the job stored: `samples`, `black`, `views`, `near`
 
 
 class _Marker(_Stored):

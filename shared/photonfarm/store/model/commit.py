@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, IncompleteError, store_errors
 from photonfarm.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.scene.poor_views import find_poor
+from photonfarm.scene.poor_views import are_near
 from photonfarm.store.format import markers, schema
 from photonfarm.store.format.markers import Figures
 from photonfarm.store.format.shards import (
@@ -76,7 +76,7 @@ class JobWriter:
         self._wanted: dict[schema.RowKind, set[int]] = rows.wanted(photons=bool(scene.spec.photons.paths))
         self._missing = {kind: set(wanted) for kind, wanted in self._wanted.items()}
         self._shards: dict[str, ShardWriter] = {}
-        self._views: Counter[str] = Counter()  # all, and poor ones by their kinds
+        self._counts: Counter[str] = Counter()  # as a marker has them
         self._waiting: queue.Queue[tuple[str, int, NDArray[Any]] | None] = queue.Queue(WAITING_ROWS)
         self._error: Exception | None = None
         self._thread = threading.Thread(target=self._write, daemon=True, name=f"writer of job {rows.job}")
@@ -101,6 +101,7 @@ class JobWriter:
     def radiance(self, row: int, halves: F32) -> None:
         """Add the half-estimates A and B of a sample row, (2, H, W, 3) linear, unscaled."""
         self._claim("sample", row)
+        self._counts.update(samples=1, black=int(not halves.any()))
         self._put(row, *scale_to_array(halves, self._scene.spec.radiance_exponent))
 
     def view(self, row: int, buffers: ViewBuffers, guides: Guides, visibility: Visibility) -> None:
@@ -110,8 +111,7 @@ class JobWriter:
             self._put(row, name, values)
         for name, values in arrays_of(guides).items():
             self._put(row, name, round_to_8_bits(values) if name in NOISY_GUIDES else values)
-        of_view = arrays_of(buffers) | arrays_of(guides) | {"photon_seen": visibility.photons}
-        self._views.update(("all", *find_poor(self._scene.spec, of_view)))
+        self._counts.update(views=1, near=int(are_near(self._scene.spec, buffers.depth)))
         self._put_bits(row, "point_seen", visibility.points)
         self._put_bits(row, "photon_seen", visibility.photons)
 
@@ -189,7 +189,7 @@ class JobWriter:
                 raise IncompleteError(f"{kind} {min(missing)} of job {self._rows.job}: is missing")
         self._join()
         self._raise_error()
-        figures = figures.model_copy(update={"views": dict(self._views)})
+        figures = figures.model_copy(update={"counts": dict(self._counts)})
         with self._errors():
             ours = {name: shard.finish() for name, shard in self._shards.items()}
             for _ in range(ATTEMPTS):

@@ -211,7 +211,7 @@ class SceneStatus:
     marker_error: str | None  # why the first of these cannot be read
     markers_without_plan: int = 0  # of committed jobs that no plan has: the last plan is missing
     error: str | None = None  # why the scene cannot be read; all numbers are 0 then
-    views: Mapping[str, int] = field(default_factory=dict)  # `all` that jobs counted, and poor ones by `PoorKind`
+    counts: Mapping[str, int] = field(default_factory=dict)  # by markers: `samples`, `black` ones, `views`, `near` ones
 
 
 READERS = 8
@@ -248,14 +248,14 @@ def scene_status(scene: SceneStore) -> SceneStatus:
         sum(unreadable for *_, unreadable, _ in sums),
         str(errors[0]) if errors else None,
         sum(job >= jobs or job in withdrawn for job in committed),
-        views=dict(sum((views for *_, views, _, _ in sums), Counter())),
+        counts=dict(sum((counts for *_, counts, _, _ in sums), Counter())),
     )
 
 
 def _sum_markers(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int, Counter[str], int, StoreError | None]:
-    """Bytes, core seconds, redrawn renders and views by some jobs' markers; unreadable markers, and the first error."""
+    """Bytes, core seconds, redrawn renders, counts by some jobs' markers; unreadable markers, and the first error."""
     size_bytes, core_s, redrawn, errors = 0, 0.0, 0, []
-    views = Counter[str]()
+    counts = Counter[str]()
     for job in jobs:
         try:
             marker = scene.marker(job)
@@ -266,5 +266,5 @@ def _sum_markers(scene: SceneStore, jobs: list[int]) -> tuple[int, float, int, C
         size_bytes += sum(file["size"] for file in marker["files"].values())
         core_s += marker["figures"]["core_s"]
         redrawn += marker["figures"]["redrawn"]
-        views.update(marker["figures"].get("views", {}))  # without them in jobs of older versions
-    return size_bytes, core_s, redrawn, views, len(errors), errors[0] if errors else None
+        counts.update(marker["figures"].get("counts", {}))  # which jobs of older versions have not
+    return size_bytes, core_s, redrawn, counts, len(errors), errors[0] if errors else None

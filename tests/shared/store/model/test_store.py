@@ -169,7 +169,7 @@ def test_a_marker_tells_the_files_and_the_figures(scene: SceneStore) -> None:
     samples.commit(scene, 0, samples.outputs(scene, 0))
     marker = scene.marker(0)
     assert marker["figures"]["core_s"] == 2.0
-    about_rendering = {"versions", "device", "driver", "strategy", "taken_over", "views"}
+    about_rendering = {"versions", "device", "driver", "strategy", "taken_over", "counts"}
     assert set(marker["figures"]) == {"core_s", "wall_s", "redrawn", "worker", *about_rendering}
     for name, about in marker["files"].items():
         assert (scene.folder / name).stat().st_size == about["size"]

@@ -18,7 +18,7 @@ from photonfarm.core.keys import Key, Stream
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import SceneDataset
 from photonfarm.plan.hold_out import are_held_out, enough, units_of
-from photonfarm.scene.poor_views import find_poor
+from photonfarm.scene.poor_views import are_near, is_unlit
 from photonfarm.store import SceneReader
 from photonfarm.store.read.batch import Batch
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, allocate_memory, choose_kept_pixels
@@ -172,13 +172,13 @@ class Feed:
 
     def is_skipped(self, row: int) -> bool:
         """Whether a row is never trained on, by `skip_views`; its sample is read for that, once."""
-        if not self._settings.skip_views:
-            return False
-        if row not in self._skipped:
+        kinds = self._settings.skip_views
+        if kinds and row not in self._skipped:
             (sample,) = self._source.read_samples([row], Batch.empty(self.spec, 1, guides=True))
-            kinds = find_poor(self.spec, {**sample.images, "photon_seen": sample.seen_photons})
-            self._skipped[row] = not set(self._settings.skip_views).isdisjoint(kinds)
-        return self._skipped[row]
+            lit_by = sample.images, sample.view.origin, sample.seen_photons, lambda: sample.photons
+            is_near = "near" in kinds and bool(are_near(self.spec, sample.images["depth"]))
+            self._skipped[row] = is_near or ("unlit" in kinds and is_unlit(*lit_by))
+        return bool(kinds) and self._skipped[row]
 
     def _raise(self) -> None:
         if self._error is not None:

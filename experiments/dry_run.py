@@ -58,6 +58,9 @@ class Need:
 
 def measure_need(experiment: Experiment) -> Need:
     """What an experiment needs, its scene's costs measured here. Raises SpecError."""
+    from photonfarm.renderer.scene import backend
+
+    backend.load(threads=1)
     from photonfarm.renderer.tools.measure.sample_costs import measure_costs
 
     return Need.of(experiment, measure_costs(experiment.spec(), frames=FRAMES))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+import subprocess
 import sys
 import time
 from itertools import product
@@ -228,6 +230,22 @@ def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> Non
     assert need.pass_hours == pytest.approx(2 * (3 + 2 * 0.5) / 3600)
     longer = Need.of(with_size(tiny, train={**tiny.size.train, "max_steps": 6}), SampleCosts("0" * 32, 1, 1, 1, 1, 0))
     assert longer.operations == pytest.approx(2 * need.operations)
+
+
+DRY_RUN = """
+import sys
+from pathlib import Path
+from experiments import experiment, run
+experiment.HERE = Path(sys.argv.pop(1))
+sys.exit(run.main())
+"""
+
+
+@pytest.mark.slow
+def test_a_dry_run_measures_the_scene_in_a_process_that_has_loaded_nothing(tiny: Experiment) -> None:
+    command = [sys.executable, "-c", DRY_RUN, str(experiment.HERE), "tiny", "--dry-run"]
+    said = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert re.fullmatch(r"tiny: 12 samples \S+ core-h; 2 further passes .*; 3 runs \S+ operations\n", said)
 
 
 def reports(stages: Stages) -> list[int]:

@@ -1,7 +1,8 @@
 """Error against the time of a frame, everything charged: ours beside denoisers that take as long.
 
-Time is that of editing the scene, buffers, guides, photons, what is rendered, and the network. A family of denoisers is
-the same denoiser, given more or fewer pixels: between two of it the error is taken to follow a power of the time.
+Time is that of editing the scene, buffers, guides, photons, what is rendered, and the network. A family is one way to
+make an image of more or fewer samples, such as a denoiser in its qualities: of it count those that nothing quicker has
+less error than, and between two of these the error is taken to follow a power of the time.
 """
 
 from __future__ import annotations
@@ -25,17 +26,17 @@ F64 = NDArray[np.float64]
 
 OURS = ("guided_transport", "guided_transport_photons")
 NETWORKS = ("cnn", "feature_projection", "light_transport", "light_transport_photons", "guided", *OURS)
-FAMILIES = {"denoise_": "denoisers trained on the room", "oidn ": "OIDN"}
-"""How the names of a family's rows begin, and what it is called."""
-
-BESIDE = {
-    "denoise_": (5, 2, "left"),
-    "denoise_32": (0, 6, "center"),
-    "denoise_64": (-6, -3, "right"),
-    "oidn ": (-6, -5, "right"),
+FAMILIES = {
+    r"denoise_\d+": "denoisers trained on the room",
+    r"oidn\S*(?<!reflectance) .*": "OIDN by albedo",
+    r"oidn\S*reflectance .*": "OIDN by reflectance",
+    r"none .*": "bdpt",
+    r"path .*": "path",
 }
-"""Where a denoiser's k stands beside its point, in points, and how it is aligned: of each family, and of those of it
-that lie close together."""
+"""The names of a family's rows, as a regular expression, and what it is called."""
+
+LOOKS = {"s": "-", "o": "--", "^": "-", "x": ":", "+": "-."}
+"""How each family is drawn: its markers and its line."""
 
 COLUMNS = 2
 GREY = "#777777"  # of denoisers; no network has it
@@ -49,11 +50,6 @@ class Placed:
     name: str
     milliseconds: float
     errors: F64  # (views,) MSE of each image, the mean of all seeds
-
-    @property
-    def kept(self) -> str:
-        """A denoiser's k: it is given 1/k of the pixels."""
-        return re.findall(r"\d+", self.name)[-1]
 
     @property
     def mse(self) -> float:
@@ -86,9 +82,13 @@ def place_rows(room: Room, names: Sequence[str]) -> list[Placed]:
     return sorted(entries, key=lambda each: each.milliseconds)
 
 
-def order_family(room: Room, begins: str) -> list[Placed]:
-    """The members of a family, by ascending time."""
-    return place_rows(room, [name for name in room.rows if name.startswith(begins)])
+def order_family(room: Room, names: str) -> list[Placed]:
+    """Those members of a family that nothing quicker has less error than, by ascending time."""
+    best: list[Placed] = []
+    for each in place_rows(room, [name for name in room.rows if re.fullmatch(names, name)]):
+        if not best or each.mse < best[-1].mse:
+            best.append(each)
+    return best
 
 
 def interpolate(members: Sequence[Placed], milliseconds: float) -> AtTime | None:
@@ -126,7 +126,7 @@ def format_table(rooms: Sequence[Room]) -> str:
     for room in rooms:
         for ours in place_rows(room, OURS):
             line = [room.name, ours.name, f"{ours.milliseconds:.0f}", f"{ours.mse:.5f}"]
-            lines.append([*line, *(_format_ratio(ours, order_family(room, begins)) for begins in FAMILIES)])
+            lines.append([*line, *(_format_ratio(ours, order_family(room, names)) for names in FAMILIES)])
     return format_markdown_table(head, lines)
 
 
@@ -165,19 +165,15 @@ def draw_picture(rooms: Sequence[Room]) -> bytes:
 
 
 def _draw(axes: Axes, room: Room) -> None:
-    """Draw a room's plot: families as lines with each denoiser's k, and networks."""
+    """Draw a room's plot: families as lines, and networks."""
     from photonfarm.trainer.report.plots import COLOURS
 
     colours = [colour for colour in COLOURS if colour != GREY]
-    for begins, marker, line in zip(FAMILIES, "os", ("-", "--"), strict=True):
-        members = order_family(room, begins)
+    for (names, called), (marker, line) in zip(FAMILIES.items(), LOOKS.items(), strict=True):
+        members = order_family(room, names)
         places = [each.milliseconds for each in members], [each.mse for each in members]
-        axes.plot(*places, marker=marker, linestyle=line, color=GREY, label=FAMILIES[begins])
-        for each in members:
-            x, y, side = BESIDE.get(each.name, BESIDE[begins])
-            place = each.milliseconds, each.mse
-            axes.annotate(each.kept, place, (x, y), textcoords="offset points", ha=side, fontsize=7.5, color=GREY)
+        axes.plot(*places, marker=marker, markersize=4, linestyle=line, color=GREY, label=called)
     for each in place_rows(room, NETWORKS):
         axes.plot(each.milliseconds, each.mse, "D", color=colours[NETWORKS.index(each.name)], label=each.name)
     axes.margins(0.09, 0.1)
-    axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", yscale="log")
+    axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", xscale="log", yscale="log")

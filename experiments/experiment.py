@@ -54,6 +54,8 @@ class Size(Frozen):
     architectures: tuple[str, ...]
     untrained: tuple[str, ...]
     kept: tuple[int, ...]
+    halves: tuple[int, ...]
+    runs: tuple[Run, ...] = ()  # beside one of each architecture
     train: Mapping[str, Any]
     train_denoisers: Mapping[str, Any]
 
@@ -67,7 +69,7 @@ class Experiment(Frozen):
     about: str  # what was made movable, and why
     scene: str  # the spec, beside the file
     changes: Mapping[str, Any] = Field(default_factory=dict)  # of the spec, for every size
-    runs: tuple[Run, ...] = ()  # beside one of each architecture
+    runs: tuple[Run, ...] = ()  # beside those of the size
     size: Size
 
     @classmethod
@@ -102,9 +104,9 @@ class Experiment(Frozen):
         return parse_spec(described, where=str(HERE / f"{self.name}.toml"), beside=file.parent)
 
     def trained(self) -> list[Run]:
-        """Every network from the first seed: one of each architecture, then the experiment's own."""
+        """Every network from the first seed: one of each architecture, then the size's and the experiment's own."""
         alike = [Run(name=name, train={"architecture": name}) for name in self.size.architectures]
-        return [Run(name=run.name, train=self._settings(run)) for run in (*alike, *self.runs)]
+        return [Run(name=run.name, train=self._settings(run)) for run in (*alike, *self.size.runs, *self.runs)]
 
     def again(self) -> list[Run]:
         """The same networks from each further seed, but for denoisers."""

@@ -68,7 +68,7 @@ class Report:
             raise IncompleteError(f"{folder}: holds no report; `make experiments-small` makes it")
         document = json.loads((folder / "report.json").read_text(encoding="utf-8"))
         shown = document["evaluation"]["shown"]
-        names = [REFERENCE, *(row["name"] for row in document["evaluation"]["rows"])]
+        names = [REFERENCE, *(row["name"] for row in document["evaluation"]["rows"] if row.get("halves", 1) == 1)]
         sheet = np.asarray(Image.open(folder / COMPARISON))
         width = (sheet.shape[1] + GAP) // len(names) - GAP
         step = width + LINE + GAP

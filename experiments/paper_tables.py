@@ -165,7 +165,9 @@ def describe_lacking(rooms: Sequence[Room]) -> str:
 
 
 def _list_row_names(rooms: Sequence[Room]) -> list[str]:
-    return list(dict.fromkeys(name for room in rooms for name in room.rows))
+    """Those of the tables: of what comes ready, only where it is given one half of all pixels."""
+    names = dict.fromkeys(name for room in rooms for name in room.rows)
+    return [name for name in names if " " not in name or name.endswith(" 1/1")]
 
 
 # -------------------------------------------------------------------------------------------------------------- pairs

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from experiments.experiment import Experiment, name_seeded
-from experiments.stages import EVALUATION
+from experiments.stages import EVALUATION, PATHS
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
@@ -32,6 +32,8 @@ class Room:
     def read(cls, experiment: Experiment, file: Path, commit: str) -> Self:
         """Read a room from its report.json, at a commit. Raises IncompleteError if further seeds were not measured."""
         room = cls.of(experiment, json.loads(file.read_text(encoding="utf-8")), commit)
+        if (paths := file.parents[1] / PATHS).is_file():
+            room.rows.update(json.loads(paths.read_text(encoding="utf-8")))
         if again := experiment.again():
             evaluated = file.parents[1] / "runs" / again[0].name / EVALUATION
             room.document["further_seeds"] = _read_further_seeds(experiment, evaluated)

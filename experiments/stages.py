@@ -28,6 +28,7 @@ from photonfarm.store.format.markers import COMMITTED
 
 EVALUATION = "evaluation.json"  # what `evaluate` leaves in each run's folder
 COMMITS = "commits.json"  # in each run's folder: at which commits it was trained
+PATHS = "path.json"  # in an experiment's folder: rows of `path`
 PREVIEW = "preview.html"  # what `up` makes last
 
 REFERENCE = re.compile(r"([0-9a-f]{32})(\.partial)?\.npz")
@@ -192,13 +193,24 @@ class Stages:
         """
         size, out = self.experiment.size, self.folder / "report"
         denoisers = [argument for name in size.untrained for argument in ("--denoiser", name)]
-        if size.untrained:  # `--kept` is for these
+        if size.untrained:  # these two options are for them
             denoisers += [argument for kept in size.kept for argument in ("--kept", str(kept))]
+            denoisers += [argument for halves in size.halves for argument in ("--halves", str(halves))]
         self._measure("report", self.experiment.trained(), [*denoisers, "--out", out], out / "report.json")
         self._tell_commits(out / "report.json")
+        if size.untrained:
+            self._trace_paths()
         if again := self.experiment.again():
             self._measure("evaluate", again, ["--without-inception"], self._folder(again[0]) / EVALUATION)
         return out
+
+    def _trace_paths(self) -> None:
+        """What Mitsuba's `path` does in the time of a frame."""
+        references, out = self.folder / "references", self.folder / PATHS
+        asked = ["--store", self.folder / "store", "--scene", self._scene_id, "--references", references]
+        asked += ["--hold-out", self.experiment.size.hold_out, "--out", out]
+        program = [sys.executable, str(Path(__file__).parent / "path_tracing.py")]
+        self._verb("path", asked, made=[out], of=[references], program=program)
 
     def _tell_commits(self, report: Path) -> None:
         """Write into report.json at which commits each run was trained, those of further seeds among them."""
@@ -219,9 +231,15 @@ class Stages:
     # --------------------------------------------------------------------------------------------------------- verbs
 
     def _verb(
-        self, stage: str, arguments: Sequence[Any], *, made: Sequence[Path] = (), of: Iterable[Path] = ()
+        self,
+        stage: str,
+        arguments: Sequence[Any],
+        *,
+        made: Sequence[Path] = (),
+        of: Iterable[Path] = (),
+        program: Sequence[str] = (),
     ) -> None:
-        """Run a verb to its end; what it says goes to a log. Raises StageError.
+        """Run a verb, or another program, to its end; what it says goes to a log. Raises StageError.
 
         One that leaves the files `made` is not run again while they are there, its arguments are the same and none of
         the files `of` is newer than its last end.
@@ -234,7 +252,8 @@ class Stages:
         self._check_time(stage)
         began = time.monotonic()
         with log.open("ab") as output:
-            process = subprocess.Popen(tie(command(*map(str, arguments))), stdout=output, stderr=subprocess.STDOUT)
+            line = [*program, *map(str, arguments)] if program else command(*map(str, arguments))
+            process = subprocess.Popen(tie(line), stdout=output, stderr=subprocess.STDOUT)
         try:
             code = process.wait(None if math.isinf(self.until) else max(self.until - began, 0.0))
         except subprocess.TimeoutExpired:

@@ -62,6 +62,8 @@ def format_page(rooms: Sequence[Room], size: SizeName) -> str:
         if of_part := [room for room in rooms if room.experiment.part == part]:
             parts += _format_part(of_part, title, published)
     parts.append(OF_TIME.format(picture=f"{name_page(size)}.png", table=equal_time.format_table(rooms)))
+    if old := [room.name for room in rooms if "oidn 1/1" in room.rows and "oidn-reflectance 1/1" not in room.rows]:
+        parts.append(wrap(OF_OLD_ROWS.format(rooms=", ".join(old))))
     made = (
         f"Timed on {summarise(rooms, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
         f"`{name_command(size)}`."
@@ -108,7 +110,8 @@ def introduce(rooms: Sequence[Room], size: SizeName) -> str:
     return (
         f"The size `{size}`: {sizes}. {_describe_resolution(rooms)} All networks "
         f"and denoisers but OIDN are trained on one room's images alone: {', '.join(trained)}. denoise_k and oidn 1/k "
-        f"are denoisers, which are given 1/k of the pixels of one noisy half-estimate.{_describe_cameras(rooms)}"
+        f"are denoisers, which are given 1/k of the pixels of one noisy half-estimate; none 1/1 is that half itself."
+        f"{_describe_cameras(rooms)}"
     )
 
 
@@ -182,15 +185,23 @@ OF_TIME = """\
 ![MSE over the time of a frame, room by room]({picture})
 
 Everything is charged: editing the scene, buffers, guides, photons, samples that a denoiser is given, and the network,
-on one core. A denoiser is given one half-estimate of each pixel, or of one of k; its k stands beside its point. Between
-two of a family the error is taken to follow a power of the time. Below 1 ours is ahead of the best that the family
-reaches in the same time. Intervals are a bootstrap over configurations.
+on one core. OIDN is given one half-estimate of each pixel, or of one of 4, or the mean of 2 to 16: halves A of further
+passes, while errors are by the halves B of the references. Its three qualities are one family, by diffuse albedo or by
+reflectance, whose guides take no shadow rays and are charged so. What is timed there is one image
+of all their samples. `bdpt` and Mitsuba's `path` are not
+denoised. Of a family count those rows that no quicker one has less error than; between two of these the error is taken
+to follow a power of the time. Below 1 ours is ahead of the best that the family reaches in the same time. Intervals are
+a bootstrap over configurations.
 
-A family ends with one half-estimate of all pixels (k = 1). In longer frames it is credited with the least error that it
-has reached by then, although it could use more samples in that time. Such ratios are marked ≥: our advantage is at most
-what they say.
+In frames longer than its slowest row, a family is credited with the least error that it has reached by then. Such
+ratios are marked ≥: our advantage is at most what they say.
 
 {table}"""
+
+
+OF_OLD_ROWS = """\
+Of {rooms} these rows were made with OIDN in its best quality alone, fed diffuse albedo, and one half at most: nothing
+is claimed of them until they are measured again."""
 
 
 def make_parser() -> argparse.ArgumentParser:

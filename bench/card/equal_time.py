@@ -12,8 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +22,7 @@ from bench.harness import results
 from photonfarm.core.pictures import display_values
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import clean_error
+from photonfarm.scene.spec import WITHOUT_SHADOWS
 
 if TYPE_CHECKING:
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
@@ -147,15 +147,12 @@ def guide_by_reflectance(scene: LoadedScene, view: View) -> Guide:
     """The reflectance of all lobes, also in mirrors, 1 on lamps; from guides that are rendered without shadow rays."""
     import torch
 
-    from photonfarm.trainer.networks.guided import reflectance
+    from photonfarm.trainer.networks.inputs import SURFACE, SurfaceInputs, replace_albedo
 
     none = np.zeros((1, 3), np.float32)
-    wanted = scene.spec.guides.model_copy(update={"light_samples": 0})
-    ((buffers, guides),) = scene.inputs([view], [bytes(16)], wanted, (none, none + 1))
-    names = ("specular", "throughput", "beyond_albedo")
-    known = SimpleNamespace(**{name: torch.from_numpy(np.asarray(getattr(guides, name), np.float32)) for name in names})
-    reflects = reflectance(torch.from_numpy(buffers.albedo), cast(Any, known)).clamp(0, 1).numpy()
-    return np.where(guides.emission.max(axis=-1, keepdims=True) > 0, np.float32(1), reflects), buffers.normal
+    ((buffers, guides),) = scene.inputs([view], [bytes(16)], WITHOUT_SHADOWS, (none, none + 1))
+    surface = SurfaceInputs(**{name: torch.from_numpy(getattr(guides, name)) for name in SURFACE})
+    return replace_albedo(torch.from_numpy(buffers.albedo), surface).numpy(), buffers.normal
 
 
 def load_oidn() -> list[tuple[str, Denoiser, Callable[[LoadedScene, View], Guide]]]:
@@ -169,9 +166,11 @@ def load_oidn() -> list[tuple[str, Denoiser, Callable[[LoadedScene, View], Guide
     def with_quality(oidn: Oidn) -> Denoiser:
         return lambda *images: oidn.denoise(*(torch.from_numpy(image).to(device) for image in images)).cpu().numpy()
 
-    ways = [(label, with_quality(Oidn(1, device, quality))) for label, quality in OIDN.items()]
-    fed = {"albedo": guide_by_albedo, "reflectance": guide_by_reflectance}
-    return [(f"{label}, {what}", denoise, guide) for what, guide in fed.items() for label, denoise in ways]
+    fed = {True: guide_by_reflectance, False: guide_by_albedo}
+    return [
+        (label, with_quality(Oidn(1, device, quality)), fed[label.endswith("reflectance")])
+        for label, quality in OIDN.items()
+    ]
 
 
 def describe(found: Mapping[str, Mapping[str, Any]]) -> str:

@@ -18,8 +18,10 @@ import pytest
 
 from experiments import experiment, run
 from experiments.dry_run import Need
+from experiments.equal_time import place_rows
 from experiments.experiment import FREE_SPACE, Experiment, Size, SizeName, keep_free_space, list_names, merge
 from experiments.paper_tables import format_errors
+from experiments.path_tracing import SPP
 from experiments.rooms import Room
 from experiments.stages import COMMITS, PREVIEW, StageError, Stages, _is_done
 from experiments.tables import format_page
@@ -85,6 +87,7 @@ references = { views = 2, spp = 4 }
 architectures = ["light_transport", "denoise_4"]
 untrained = ["fill-in"]
 kept = [4]
+halves = [2]
 
 [small.train]
 preset = "small"
@@ -150,7 +153,7 @@ about = "as the size card, but for its numbers"
 changes = { film = { width = 32, height = 32 }, transport = { half_spp = 1 }, points = 256, photons = { paths = 64 } }
 modifications = 16
 hold_out = 0.4
-references = { views = 2, spp = 4 }
+references = { views = 2, spp = 32 }  # as many passes as denoisers are given halves of
 
 [card.train]
 max_steps = 3
@@ -183,7 +186,7 @@ def test_the_size_card_runs_to_its_end_and_goes_on_where_its_minutes_were_over(
     assert call_run(monkeypatch, work, "--minutes", "0.2") == IncompleteError.exit_code
     names = [run.name for run in found.trained()]
     begun = [(stages.folder / "logs" / f"train-{name}.log").is_file() for name in names]
-    assert len(names) == 12
+    assert len(names) == 15
     assert begun == sorted(begun, reverse=True), "the most telling come first"
     assert not begun[-1]
     ended = [stages._checkpoint(run) for run in found.trained() if stages._is_trained(run)]
@@ -192,7 +195,9 @@ def test_the_size_card_runs_to_its_end_and_goes_on_where_its_minutes_were_over(
     assert before == [file.stat().st_mtime_ns for file in ended]
 
     report = json.loads((stages.folder / "report/report.json").read_text())
-    assert [row["name"] for row in report["evaluation"]["rows"]] == [*names, *(f"oidn 1/{kept}" for kept in (1, 4, 16))]
+    amounts = ("1/1", "1/4", "2/1", "4/1", "8/1", "16/1")
+    ready = [f"{denoiser} {amount}" for denoiser in found.size.untrained for amount in amounts]
+    assert [row["name"] for row in report["evaluation"]["rows"]] == [*names, *ready]
     assert all(run["steps"] == 3 and run["settings"]["batch"] == 8 for run in report["runs"])
     assert all(run["settings"]["network"]["precision"] == "bfloat16" for run in report["runs"])
     page = " ".join(format_page([Room.read(found, stages.folder / "report/report.json", "1234567")], "card").split())
@@ -264,7 +269,7 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     out = stages.report()
     report = json.loads((out / "report.json").read_text())
     rows = report["evaluation"]["rows"]
-    assert [row["name"] for row in rows] == ["light_transport", "denoise_4", "fill-in 1/4"]
+    assert [row["name"] for row in rows] == ["light_transport", "denoise_4", "fill-in 1/4", "fill-in 2/1"]
     references = report["evaluation"]["references"]
     assert (references["views"], references["spp"]) == (2, 4)
     assert rows[1]["frame_seconds"]["render"] > 0
@@ -276,7 +281,10 @@ def test_all_stages_lead_to_a_report_and_are_not_done_twice(tiny: Experiment, tm
     assert room.commits() == report["trained_at"]["light_transport"]
     assert (room.spent("samples")["rows"], room.spent("top-up")["rows"]) == (12, 2)
     assert "| denoise_4 |" in format_errors([room], MOVABLE_LIGHTS)
-    assert [len(room.errors(name)) for name in room.rows] == [2, 1, 1]
+    paths = [f"path {spp} spp" for spp in SPP]
+    assert [len(room.errors(name)) for name in room.rows] == [2, 1, 1, 1, *[1] * len(paths)]
+    assert place_rows(room, paths)[-1].name == paths[-1], "which takes longest"
+    assert room.mse(paths[-1]).mean < room.mse(paths[0]).mean
 
     before = reports(stages)
     assert stages.run() == out
@@ -334,7 +342,7 @@ def test_kept_pixels_are_asked_for_with_denoisers_that_come_ready_alone(
         asked: list[str] = []
         monkeypatch.setattr(Stages, "_verb", lambda _, __, given, asked=asked, **___: asked.extend(map(str, given)))
         Stages(with_size(tiny, untrained=untrained), tmp_path / "work", workers=1).report()
-        assert ("--kept" in asked) is ("--denoiser" in asked) is bool(untrained)
+        assert ("--kept" in asked) is ("--halves" in asked) is ("--denoiser" in asked) is bool(untrained)
 
 
 def test_training_that_ends_early_without_an_error_is_not_taken_for_done(

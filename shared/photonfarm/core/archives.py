@@ -51,7 +51,7 @@ def read_arrays(file: Path, what: str, verb: str) -> Iterator[Mapping[str, NDArr
         raise StoreError(f"{file}: holds no {what} that `photonfarm {verb}` wrote") from error
 
 
-PARTS = ("edit_s", "buffers_s", "guides_s", "points_s", "photons_s", "photons_seen_s")
+PARTS = ("edit_s", "buffers_s", "surface_s", "guides_s", "points_s", "photons_s", "photons_seen_s")
 """What a network's frame needs besides samples, in the order in which it is made."""
 
 
@@ -91,20 +91,23 @@ class FrameCosts:
     surface: NDArray[np.uint8]  # (N, H, W) a `Surface` at each pixel's centre
     edit_s: NDArray[np.float64]  # (T,) bringing the scene into the frame's configuration, from another one
     buffers_s: NDArray[np.float64]  # (T,) depth, albedo, normal, where no guides are wanted
+    surface_s: NDArray[np.float64]  # (T,) the guides that take no shadow ray, and the view's buffers
     guides_s: NDArray[np.float64]  # (T,) the view's guides and its buffers, which share their rays
     points_s: NDArray[np.float64]  # (T,) which points of the base cloud, or of its first ones, the view sees
     photons_s: NDArray[np.float64]  # (T,) tracing photons; 0 in a scene without photons
     photons_seen_s: NDArray[np.float64]  # (T,) which photons the view sees; 0 likewise
     kept: NDArray[np.int64]  # (K,) k: an image of about 1/k of the pixels
-    render_s: NDArray[np.float64]  # (K, T) one half-estimate of it: `half_spp` samples of each of these pixels
+    halves: NDArray[np.int64]  # (K,) so many times `half_spp` samples of each of these pixels
+    render_s: NDArray[np.float64]  # (K, T) such an image
 
     def parts(self) -> dict[str, Seconds]:
         """The times of each part of a frame, by its name in `PARTS`, over the timed frames."""
         return {name: Seconds.of(getattr(self, name)) for name in PARTS}
 
-    def renders(self) -> dict[int, Seconds]:
-        """The times of a half-estimate of 1/k of the pixels, by k, over the timed frames."""
-        return {k: Seconds.of(times) for k, times in zip(self.kept.tolist(), self.render_s, strict=True)}
+    def renders(self) -> dict[tuple[int, int], Seconds]:
+        """The times of n half-estimates of 1/k of the pixels, by (k, n), over the timed frames."""
+        amounts = zip(self.kept.tolist(), self.halves.tolist(), strict=True)
+        return {amount: Seconds.of(times) for amount, times in zip(amounts, self.render_s, strict=True)}
 
     def write(self, file: Path) -> None:
         """Store them as a NumPy archive, whole or not at all; raises StoreError if the disk refuses."""

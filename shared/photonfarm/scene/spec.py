@@ -193,6 +193,10 @@ class GuideSpec(Frozen):
     light_samples: Annotated[int, Field(ge=0, le=64)] = 3  # shadow rays of each of a pixel's 16 sub-pixels; 0: none
 
 
+WITHOUT_SHADOWS = GuideSpec(light_samples=0)
+"""Guides without direct light: emission, and what says how much a surface reflects."""
+
+
 class Emitters(Frozen):
     """Factors on the radiance of the scene's own lights: those of its file or built-in room that no `Light` moves."""
 

@@ -130,9 +130,12 @@ def test_a_sixteenth_of_the_pixels_takes_less_than_half_the_time_of_all() -> Non
     transport = {"light_ratio": 0, "connections": 0, "half_spp": 16}
     spec = plain(film=128, transport=transport)
     scene = LoadedScene.load(spec)
-    costs = frame_costs(scene, scene.base()[1], [frame(INTO_THE_BOX, rest(spec))], kept=[16, 1], timed=5)
-    times = {k: render.median for k, render in costs.renders().items()}
-    assert 0 < times[16] < 0.5 * times[1]
+    costs = frame_costs(
+        scene, scene.base()[1], [frame(INTO_THE_BOX, rest(spec))], amounts=[(16, 1), (1, 1), (1, 4)], timed=5
+    )
+    times = {amount: render.median for amount, render in costs.renders().items()}
+    assert 0 < times[16, 1] < 0.5 * times[1, 1]
+    assert times[1, 1] < times[1, 4] < 5 * times[1, 1]
     for name in PARTS:
         assert (getattr(costs, name) > 0).all() == ("photons" not in name), name
     assert costs.parts()["photons_s"].median == costs.parts()["photons_seen_s"].median == 0  # a scene without
@@ -155,7 +158,7 @@ def test_every_timed_frame_comes_from_another_configuration(
     frames = [frame(somewhere, each, str(place), place) for place, each in enumerate(shifted)]
     applied: list[float] = []
     monkeypatch.setattr(room, "apply", lambda modification: applied.append(float(modification.translation[0, 0])))
-    frame_costs(room, room.base()[1], frames, kept=[1], timed=2)
+    frame_costs(room, room.base()[1], frames, amounts=[(1, 1)], timed=2)
     timed = applied[-(WARM_UPS + 2) * (3 - configurations) :]  # a single one is left for the scene at rest in between
     assert timed == pytest.approx([0, 0.1] * 4 if configurations == 1 else [0.1, 0.2] * 2)
 
@@ -177,24 +180,33 @@ def test_each_part_is_charged_with_its_own_seconds(
     )
     monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
-    monkeypatch.setattr(room, "inputs", takes(lambda *_: 1000, lambda *_: None))
+    monkeypatch.setattr(
+        room, "inputs", takes(lambda _, __, wanted, ___: 500 * (1 + (wanted.light_samples > 0)), lambda *_: None)
+    )
     monkeypatch.setattr(room, "photons", takes(lambda _: 100, lambda _: photons))
     monkeypatch.setattr(
         room, "sees", takes(lambda _, points: len(points), lambda _, points: np.ones((1, len(points)), bool))
     )
-    monkeypatch.setattr(PartialFilm, "render", takes(lambda film, *_: film.spec.film.width, lambda *_: None))
-    costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[4, 1], timed=2)
+    monkeypatch.setattr(
+        PartialFilm,
+        "render",
+        takes(lambda film, *_: film.spec.film.width * film.spec.transport.half_spp, lambda *_: None),
+    )
+    costs = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], amounts=[(4, 1), (1, 1), (1, 3)], timed=2)
     assert {name: part.median for name, part in costs.parts().items()} == {
         "edit_s": 1,
         "buffers_s": 10,
+        "surface_s": 500,
         "guides_s": 1000,
         "points_s": 4096,
         "photons_s": 100,
         "photons_seen_s": 8192,
     }
-    assert {k: render.median for k, render in costs.renders().items()} == {4: 12, 1: 24}
+    half_spp = room.spec.transport.half_spp
+    times = {amount: render.median / half_spp for amount, render in costs.renders().items()}
+    assert times == {(4, 1): 12, (1, 1): 24, (1, 3): 72}
     for seconds, timed in ((1, 1), (3.5 * sum(part.median for part in costs.parts().values()), 2)):
-        few = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], kept=[], timed=5, seconds=seconds)
+        few = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], amounts=[], timed=5, seconds=seconds)
         assert (len(few.edit_s), few.renders()) == (timed, {}), "in limited time, warm-ups included; without images"
 
 
@@ -217,7 +229,22 @@ def verb(store: Store, out: Path, *more: str, scene: str = "room") -> list[str]:
 
 def test_the_verb_measures_rows_and_leaves_the_store_as_it_is(tmp_path: Path, store: Store, room: LoadedScene) -> None:
     before = sorted(Path(store.root).rglob("*"))
-    options = ["--row", "3", "--row", "0", "--kept", "1", "--kept", "4", "--timed", "3", "--points", "100"]
+    options = [
+        "--row",
+        "3",
+        "--row",
+        "0",
+        "--kept",
+        "1",
+        "--kept",
+        "4",
+        "--halves",
+        "2",
+        "--timed",
+        "3",
+        "--points",
+        "100",
+    ]
     result = CliRunner().invoke(measure_frames, verb(store, tmp_path, *options), catch_exceptions=False)
     assert result.exit_code == 0
     parts, last = result.stdout.splitlines()
@@ -225,9 +252,9 @@ def test_the_verb_measures_rows_and_leaves_the_store_as_it_is(tmp_path: Path, st
     assert last == f"{tmp_path / 'costs.npz'}: 2 rows, 3 timed frames"
     costs = FrameCosts.read(tmp_path / "costs.npz")
     assert costs.scene_id == room.spec.scene_id
-    assert (costs.rows.tolist(), costs.kept.tolist()) == ([3, 0], [1, 4])
+    assert (costs.rows.tolist(), [*costs.renders()]) == ([3, 0], [(1, 1), (4, 1), (1, 2)])
     assert all((getattr(costs, name) > 0).all() and getattr(costs, name).shape == (3,) for name in PARTS)
-    assert costs.render_s.shape == (2, 3)
+    assert costs.render_s.shape == (3, 3)
     assert (costs.render_s > 0).all()
     reader = SceneReader(store.root, room.spec.scene_id)
     reader.refresh()

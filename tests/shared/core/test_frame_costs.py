@@ -15,7 +15,15 @@ def made() -> FrameCosts:
     rng = np.random.default_rng(0)
     surface = rng.integers(0, len(Surface), (2, 3, 4)).astype(np.uint8)
     parts = dict(zip(PARTS, rng.random((len(PARTS), 3)), strict=True))
-    return FrameCosts("abc", np.array([7, 3]), surface, **parts, kept=np.array([1, 4]), render_s=rng.random((2, 3)))
+    return FrameCosts(
+        "abc",
+        np.array([7, 3]),
+        surface,
+        **parts,
+        kept=np.array([1, 4]),
+        halves=np.array([8, 1]),
+        render_s=rng.random((2, 3)),
+    )
 
 
 def test_costs_come_back_as_they_were_written(tmp_path: Path) -> None:
@@ -34,8 +42,8 @@ def test_medians_are_over_the_timed_frames() -> None:
     times = np.array([3.0, 1.0, 100.0])
     parts = {name: times * 10**place for place, name in enumerate(PARTS)}
     costs = replace(made(), **parts, render_s=np.array([[5.0, 4.0, 6.0], [0.2, 0.1, 9.0]]))
-    assert [part.median for part in costs.parts().values()] == [3, 30, 300, 3000, 30000, 300000]
-    assert {k: render.median for k, render in costs.renders().items()} == {1: 5, 4: 0.2}
+    assert [part.median for part in costs.parts().values()] == [3 * 10**place for place in range(len(PARTS))]
+    assert {amount: render.median for amount, render in costs.renders().items()} == {(1, 8): 5, (4, 1): 0.2}
 
 
 def test_the_range_of_a_time_leaves_a_tenth_out_at_either_end() -> None:

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import combinations
 from typing import get_args
 
@@ -12,7 +13,7 @@ import torch
 
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer.data.feed import Feed
-from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.networks.inputs import Inputs, Needs, NoisyColour, SurfaceInputs
 from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
 from photonfarm.trainer.predictors.evaluation import measure, read_batches
 from photonfarm.trainer.predictors.trained import ReadyPredictor
@@ -63,17 +64,42 @@ def test_bright_light_stays_as_bright_as_it_is(quality: OidnQuality) -> None:
     assert np.mean((denoised - 20) ** 2) < 0.05 * np.mean((colour - 20) ** 2)
 
 
-def test_each_quality_has_a_name_and_makes_images_of_its_own(make_source, tiny) -> None:
+def test_each_quality_and_what_it_is_fed_have_a_name_and_make_images_of_their_own(make_source, tiny) -> None:
     made = {}
-    with Feed(make_source(1, size=32, noise=1.0), tiny(), needs=Needs(points=False, kept=1)) as feed:
-        (batch,) = read_batches(feed, [0], 1)
-        for denoiser in OIDN:
-            ready = ReadyPredictor(denoiser, 1, tiny())
+    for denoiser in OIDN:
+        ready = ReadyPredictor(denoiser, 1, tiny())
+        with Feed(make_source(1, size=32, noise=1.0), tiny(), needs=ready.needs) as feed:
+            (batch,) = read_batches(feed, [0], 1)
+            if batch.inputs.surface is not None:
+                batch.inputs.surface.specular[:, :16] += 0.5
             made[ready.name] = ready.predictor(feed.spec, feed.base, "cpu")(batch)
-    assert list(made) == ["oidn 1/1", "oidn-balanced 1/1", "oidn-fast 1/1"]
+    fed = ("", "-balanced", "-fast", "-reflectance", "-balanced-reflectance", "-fast-reflectance")
+    assert list(made) == [f"oidn{how} 1/1" for how in fed]
     for one, other in combinations(made.values(), 2):
         difference = np.abs(one - other).max()
         assert 1e-4 < difference < 0.5
+
+
+def test_the_pattern_of_a_metal_stays_where_reflectance_is_given() -> None:
+    """A chequered metal, whose diffuse albedo is 0, under noise of twice its light, beside a lamp."""
+    rng, shape = np.random.default_rng(0), (1, 64, 64, 3)
+    pattern = np.where((np.indices((64, 64)) // 4).sum(axis=0) % 2, 0.9, 0.3).astype(np.float32)[None, ..., None]
+    colour = torch.from_numpy((pattern * rng.gamma(0.25, 4, shape)).astype(np.float32))
+    black, normal = torch.zeros(shape), torch.tensor([0.0, 0.0, 1.0]).expand(shape)
+    metal = torch.from_numpy(np.broadcast_to(pattern, shape).copy())
+    inputs = Inputs(
+        torch.zeros(1, 3, 4), torch.ones(shape[:3]), black, normal, noisy=NoisyColour(colour, black[..., 0] == 0)
+    )
+    surface = SurfaceInputs(emission=black, specular=metal, throughput=black, beyond_albedo=black)
+    before, after = (
+        float((Oidn()(each) - metal).square().mean()) for each in (inputs, replace(inputs, surface=surface))
+    )
+    assert after < 0.2 * before
+    lamp, mirror = black.clone(), black.clone()
+    lamp[:, :8], mirror[:, 8:] = 20, 0.5
+    seen = SurfaceInputs(emission=lamp, specular=mirror, throughput=mirror, beyond_albedo=metal)
+    assert torch.equal(replace(inputs, surface=seen).reflects[:, :8], black[:, :8] + 1)
+    assert torch.equal(replace(inputs, surface=seen).reflects[:, 8:], 0.5 * metal[:, 8:])
 
 
 def test_without_its_package_it_says_what_to_install(monkeypatch) -> None:

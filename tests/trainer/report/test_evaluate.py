@@ -75,6 +75,26 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(measured, 
     assert found.rows[1].metrics.fid is found.rows[1].metrics.feature_l1 is None, "without Inception"
 
 
+def test_what_is_given_several_halves_has_the_mean_of_a_over_as_many_passes_and_an_error_by_b_alone(
+    measured, trained
+) -> None:
+    amounts = [("none", 1), ("none", 1, 2), ("none", 4)]
+    found = compare(measured.store, [trained()], amounts, references=measured.references, **QUICK)
+    one, two = found.rows[1:3]
+    assert (two.name, two.halves, two.shown) == ("none 2/1", 2, {})
+    assert draw_comparison(found).shape[1] == 4 * 256 + 3 * 8
+    with Feed(measured.reader(), trained().settings, needs=Needs(points=False, kept=1, halves=2)) as feed:
+        (batch,) = read_batches(feed, found.measured[:1], 1)
+    reader = measured.reader()
+    passes = [reader.read(row).radiance[0] for row in (found.measured[0], found.measured[0] + 1)]
+    np.testing.assert_allclose(batch.inputs.noisy.colour[0], np.mean(passes, axis=0), rtol=1e-6)
+    ratio = two.metrics.mse.estimate.mean / one.metrics.mse.estimate.mean
+    assert 0.4 < ratio < 0.7, "half of the noise, up to the display's curve"
+    assert "denoisers: up to 50.0% of a reference" in format_evaluation(found)
+    with pytest.raises(IncompleteError, match="none 3/1: no held-out view has 3 passes"):
+        compare(measured.store, [trained()], [("none", 1, 3)], **QUICK)
+
+
 def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured, trained, tmp_path: Path) -> None:
     pytest.importorskip("mitsuba_oidn", reason="the extra `oidn` is not installed")
     runs = [TrainedRun.load(measured.runs[1]), trained(seed=1)]
@@ -130,7 +150,7 @@ def test_the_foot_says_what_the_figures_cannot(measured) -> None:
     assert f"references: of {found.references.views} views, of {found.references.spp} samples per pixel" in foot
     assert f"or more; intervals over their {found.units} configurations; of so few they are wide" in foot
     assert "not converged, which takes 4096" in foot
-    assert "denoisers: up to 25.0% of a reference is the half A that they were given" in foot
+    assert "denoisers: up to 25.0% of a reference is the half A, or the halves, that they were given" in foot
     assert "nor is rendering the 1/k of the pixels that denoisers are given" in foot
     if find_weights() is not None:
         assert f"FID of {found.references.views} images: below 2048" in foot

@@ -20,19 +20,24 @@ def test_frames_are_timed_where_the_renderer_can_and_else_it_is_said_why(measure
 
 def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measured) -> None:
     transport, denoiser = measured.runs
-    parts = {name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 1.6, 0.2, 0.4, 0.8), strict=True)}
+    parts = {
+        name: np.array([seconds]) for name, seconds in zip(PARTS, (9.0, 0.1, 0.7, 1.6, 0.2, 0.4, 0.8), strict=True)
+    }
     surface = np.zeros((1, 8, 8), np.uint8)
-    kept = np.array([1, 4])
-    costs = FrameCosts("0" * 32, np.array([3]), surface, **parts, kept=kept, render_s=np.array([[5.0], [2.0]]))
+    amounts = {"kept": np.array([1, 4, 1]), "halves": np.array([1, 1, 8]), "render_s": np.array([[5.0], [2.0], [30.0]])}
+    costs = FrameCosts("0" * 32, np.array([3]), surface, **parts, **amounts)
     network = Seconds(1.0, 0.9, 1.1)
     assert assemble_frame_time(TrainedRun.load(transport), network, costs).total == pytest.approx(1.0 + 0.1 + 0.2)
     of_denoiser = assemble_frame_time(TrainedRun.load(denoiser), network, costs)
     assert of_denoiser.total == pytest.approx(1.0 + 0.1 + 2.0)
     assert of_denoiser.document()["ranges"] == {"render": [2.0, 2.0], "buffers": [0.1, 0.1], "network": [0.9, 1.1]}
     settings = TrainedRun.load(transport).settings
-    assert assemble_frame_time(ReadyPredictor("none", 1, settings), network, costs).total == pytest.approx(
-        1.0 + 0.1 + 5.0
-    )
+    for ready, seconds in (
+        (ReadyPredictor("none", 1, settings), 1.0 + 5.0),  # which reads no buffers
+        (ReadyPredictor("oidn", 1, settings, halves=8), 1.0 + 0.1 + 30.0),
+        (ReadyPredictor("oidn-reflectance", 4, settings), 1.0 + 0.7 + 2.0),
+    ):
+        assert assemble_frame_time(ready, network, costs).total == pytest.approx(seconds)
     with_photons = replace(
         TrainedRun.load(transport),
         settings=settings.model_copy(

@@ -24,10 +24,19 @@ from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
 from photonfarm.farm.devices import AUTO, CPU
 from photonfarm.scene.modification import Modification, rebuild, rest
+from photonfarm.scene.spec import WITHOUT_SHADOWS
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import Store
 from photonfarm.trainer.data.batch import choose_kept_pixels
-from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, NoisyColour, PhotonInputs, PointInputs
+from photonfarm.trainer.networks.inputs import (
+    SURFACE,
+    GuideInputs,
+    Inputs,
+    NoisyColour,
+    PhotonInputs,
+    PointInputs,
+    SurfaceInputs,
+)
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs.run_folder import make_environment
 
@@ -99,10 +108,13 @@ class OpenRun:
     def _inputs(self, view: View) -> Inputs:
         """What the network reads of the present configuration from a view, a batch of one."""
         key = view_key(self._key, view.vector)
-        if self._needs.guides:
-            ((buffers, guides),) = self._scene.inputs([view], [key], self.spec.guides, self._lit, take=take_torch)
+        given: dict[str, Tensor] = {}
+        if self._needs.guides or self._needs.surface:
+            wanted = self.spec.guides if self._needs.guides else WITHOUT_SHADOWS
+            ((buffers, guides),) = self._scene.inputs([view], [key], wanted, self._lit, take=take_torch)
+            given = self._guide_tensors(arrays_of(guides))
         else:
-            buffers, guides = self._scene.buffers(view, take=take_torch), None
+            buffers = self._scene.buffers(view, take=take_torch)
         images = {name: self._tensor(image) for name, image in arrays_of(buffers).items()}
         return Inputs(
             world_to_camera=self._tensor(Camera.of(view, self.spec).world_to_camera.astype(np.float32)),
@@ -111,16 +123,17 @@ class OpenRun:
             normal=images["normal"],
             points=self._point_inputs(view) if self._needs.points else None,
             photons=None if self._photons is None else self._photon_inputs(view, self._photons),
-            guides=None if guides is None else self._guide_inputs(arrays_of(guides)),
+            guides=GuideInputs(**given) if self._needs.guides else None,
+            surface=SurfaceInputs(**{name: given[name] for name in SURFACE}) if self._needs.surface else None,
         )
 
     def _tensor(self, values: Any) -> Tensor:
         tensor: Tensor = values if isinstance(values, Tensor) else torch.from_numpy(np.ascontiguousarray(values))
         return tensor[None].to(self._device)
 
-    def _guide_inputs(self, guides: dict[str, Any]) -> GuideInputs:
+    def _guide_tensors(self, guides: dict[str, Any]) -> dict[str, Tensor]:
         factors = {name: self._exposure if name in OF_LIGHT else 1.0 for name in guides}
-        return GuideInputs(**{name: self._tensor(image) * factors[name] for name, image in guides.items()})
+        return {name: self._tensor(image) * factors[name] for name, image in guides.items()}
 
     def _point_inputs(self, view: View) -> PointInputs:
         position, present = self._points

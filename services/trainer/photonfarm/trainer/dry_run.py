@@ -26,7 +26,7 @@ from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 from photonfarm.trainer.data.batch import TrainingBatch, allocate_memory, count_bytes
-from photonfarm.trainer.networks import build, find_kind
+from photonfarm.trainer.networks import build, find_needs
 from photonfarm.trainer.networks.inputs import SceneFrame, require
 from photonfarm.trainer.predictors.half_filter import settle_filter
 from photonfarm.trainer.runs.devices import Ranks, describe_device, usable_device
@@ -70,7 +70,7 @@ class MadeUpScene:
 
         But cameras are within the cube, points and photons on its walls, normals unit vectors, METALS of pixels metal.
         """
-        spec, needs = self.spec, find_kind(settings.architecture).needs
+        spec, needs = self.spec, find_needs(settings)
         tensors = allocate_memory(SampleTensors(spec, needs.fields, points=settings.points), size)
         generator = torch.Generator().manual_seed(0)
         for tensor in tensors.values():

@@ -91,6 +91,13 @@ def buffers(
     help="Time a half-estimate with one pixel in K kept, too; may be repeated.",
 )
 @click.option(
+    "--halves",
+    type=click.IntRange(2),
+    multiple=True,
+    metavar="N",
+    help="Time an image of all pixels with the samples of N half-estimates; may be repeated.",
+)
+@click.option(
     "--timed",
     type=click.IntRange(1),
     default=9,
@@ -118,6 +125,7 @@ def measure_frames(
     scene: str,
     rows: tuple[int, ...],
     kept: tuple[int, ...],
+    halves: tuple[int, ...],
     timed: int,
     seconds: float,
     points: int | None,
@@ -134,8 +142,9 @@ def measure_frames(
     from photonfarm.renderer.tools.measure.frame_costs import write_frame_costs
 
     with tell_waiting(partial(click.echo, err=True), f"timing {timed} frames"):
-        costs = write_frame_costs(store, scene, rows, kept, timed, points, out, seconds)
-    parts = {**costs.parts(), **{f"render_s 1/{k}": render for k, render in costs.renders().items()}}
+        amounts = [*((k, 1) for k in kept), *((1, n) for n in halves)]
+        costs = write_frame_costs(store, scene, rows, amounts, timed, points, out, seconds)
+    parts = {**costs.parts(), **{f"render_s {n}/{k}": render for (k, n), render in costs.renders().items()}}
     click.echo(", ".join(f"{name} {seconds.median:.4f}" for name, seconds in parts.items()))
     click.echo(f"{out}: {len(rows)} rows, {len(costs.edit_s)} timed frames")
 

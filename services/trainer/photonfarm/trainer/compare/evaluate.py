@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from photonfarm.core.archives import Seconds
-from photonfarm.core.errors import SpecError
+from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
@@ -33,9 +33,9 @@ from photonfarm.trainer.predictors.evaluation import (
     read_in_turn,
     time_by_turns,
 )
-from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun, list_predictors
+from photonfarm.trainer.predictors.trained import ReadyChoice, ReadyPredictor, TrainedRun, list_predictors
 from photonfarm.trainer.runs.devices import describe_device, usable_device
-from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
+from photonfarm.trainer.runs.settings import MOST_HELD_OUT
 
 Choose = Callable[[Mapping[int, F32], Mapping[int, Reference]], Sequence[int]]
 """A function that names rows to show beside the first ones.
@@ -59,6 +59,7 @@ class PredictorRow:
 
     name: str
     kept: int | None  # it gets one of so many pixels of half A; None: no colour
+    halves: int  # or of the mean of so many; of more than one, no image is shown
     held_out: HeldOutErrors  # linear radiance × exposure, noise removed
     seconds: Seconds  # of its network alone, for one image
     metrics: ImageMetrics | None  # in the metric space; None if no view has a reference
@@ -76,6 +77,7 @@ class PredictorRow:
         error, behind = self.held_out.error, self.behind(first)
         return {
             "predictor": self.name,
+            "halves": self.halves,
             "network_seconds": self.seconds.median,
             "network_seconds_range": [self.seconds.low, self.seconds.high],
             "linear_mse": {
@@ -141,7 +143,7 @@ class Evaluation:
 class MeasureOptions(TypedDict, total=False):
     """The options of `compare` that reports have too."""
 
-    denoisers: Sequence[tuple[ReadyDenoiser, int]]
+    denoisers: Sequence[ReadyChoice]
     references: Path | None
     inception: Path | None
     most: int
@@ -152,7 +154,7 @@ class MeasureOptions(TypedDict, total=False):
 def compare(
     store: str | Path,
     runs: Sequence[TrainedRun],
-    denoisers: Sequence[tuple[ReadyDenoiser, int]] = (),
+    denoisers: Sequence[ReadyChoice] = (),
     *,
     references: Path | None = None,
     inception: Path | None = None,
@@ -163,9 +165,10 @@ def compare(
     choose: Choose | None = None,
     beside: Callable[[SceneReader], Sequence[Predictor]] | None = None,
 ) -> Evaluation:
-    """Compare runs, and denoisers given one of so many pixels, on the first `most` views that no run was trained on.
+    """Compare runs, and ready denoisers, on the first `most` views that no run was trained on.
 
-    Each view is measured once, by its first sample, however many passes of it there are. References are files
+    Each view is measured once, by its first sample, however many passes of it there are; denoisers that are given the
+    halves of several passes on the views that have so many, in errors alone. References are files
     `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space.
     FID, KID and Feature L1 take most of the time; `without_inception` leaves them out. What `beside` makes with the
     samples' reader is measured on what the first run reads. Raises SpecError for runs of
@@ -177,7 +180,7 @@ def compare(
     torch.set_num_threads(first.settings.threads)
     samples = HeldOutSamples.of(first.source(store), min(run.settings.hold_out for run in runs), most)
     spec = samples.source.spec
-    for _, kept in denoisers:
+    for _, kept, *_ in denoisers:
         count_kept(spec, kept)
     references_by_row = {} if references is None else read_references(references, samples)
     shown = samples.to_show(references_by_row)
@@ -197,10 +200,13 @@ def compare(
         errors_beside += errors[len(alike) :]
         if choose and not rows:
             shown += [row for row in dict.fromkeys(choose(images[0], references_by_row)) if row not in shown]
+        needs = predictors[alike[0]].needs
         for number, held_out, own in zip(alike, errors, images, strict=False):
-            predictor, seen = predictors[number], {row: own[row] for row in shown if row in own}
+            predictor = predictors[number]
+            seen = {row: own[row] for row in shown if row in own and needs.halves == 1}
             metrics = test.compare_images(predictor, own, units)
-            rows[number] = PredictorRow(predictor.name, predictor.needs.kept, held_out, times[number], metrics, seen)
+            how = (needs.kept, needs.halves, held_out, times[number], metrics, seen)
+            rows[number] = PredictorRow(predictor.name, *how)
     return Evaluation(
         scene=spec.name,
         scene_id=first.scene_id,
@@ -301,7 +307,7 @@ class _Test:
         return measure_images(
             np.stack([images[row] for row in compared]),
             mean,
-            self.inception,
+            self.inception if predictor.needs.halves == 1 else None,
             [units[row] for row in compared],
             (a, b),
             having_seen_a=predictor.needs.kept is not None,
@@ -309,9 +315,13 @@ class _Test:
         )
 
     def _read(self, predictor: AnyPredictor, size: int) -> Iterator[TrainingBatch]:
-        return read_in_turn(
-            self.samples.source, self.samples.rows, size, predictor.needs, predictor.settings.network.points
-        )
+        """The samples whose views have as many passes as a predictor is given. Raises IncompleteError if none has."""
+        source, needs = self.samples.source, predictor.needs
+        rows = [row for row in self.samples.rows if len(source.rows_of_view(source.view_row(row))) >= needs.halves]
+        if not rows:
+            few = f"no held-out view has {needs.halves} passes; `photonfarm top-up` adds more"
+            raise IncompleteError(f"{predictor.name}: {few}")
+        return read_in_turn(source, rows, size, needs, predictor.settings.network.points)
 
     def _features(self, rows: tuple[int, ...], references: F32) -> Features | None:
         """The features of the references of some rows, which are the same for almost all predictors."""

@@ -110,10 +110,10 @@ def list_notes(evaluation: Evaluation) -> list[str]:
         f"references: of {format_count(references.views, 'view')}, of {references.spp} samples per pixel or more; "
         f"intervals over their {_count_units(metrics.mse.estimate.count, evaluation.unit)}; {converged}"
     )
-    if any(row.kept is not None for row in evaluation.rows):
+    if given := max((row.halves for row in evaluation.rows if row.kept is not None), default=0):
         notes.append(
-            f"denoisers: up to {references.half_a_share:.1%} of a reference is the half A that they were given, "
-            "which flatters them in the columns from MSSIM on; out of both MSE it is taken"
+            f"denoisers: up to {given * references.half_a_share:.1%} of a reference is the half A, or the halves, that "
+            "they were given, which flatters them in the columns from MSSIM on; out of both MSE it is taken"
         )
     return [*notes, *_describe_inception(metrics)]
 
@@ -151,17 +151,16 @@ def draw_comparison(evaluation: Evaluation) -> Picture:
     All are shown as clip(exposure · I, 0, 1)^(1/2.2) with the scene's own exposure; black where a predictor could not
     be measured, after a repair.
     """
-    shown = evaluation.shown
+    shown, rows = evaluation.shown, [row for row in evaluation.rows if row.shown]
     fewest = min(target.spp for target in shown)
     head = f"target: mean of A and B, {fewest} samples per pixel, noisy"
     if all(target.is_reference for target in shown):
         head = f"reference, {fewest} samples per pixel or more"
     images = [
-        [target.image, *(row.shown.get(target.row, np.zeros_like(target.image)) for row in evaluation.rows)]
-        for target in shown
+        [target.image, *(row.shown.get(target.row, np.zeros_like(target.image)) for row in rows)] for target in shown
     ]
     return draw_sheet(
-        [head, *(row.name for row in evaluation.rows)],
+        [head, *(row.name for row in rows)],
         [[enlarge(image) for image in row] for row in images],
         [f"row {target.row} of the store" for target in shown],
     )

@@ -14,7 +14,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from photonfarm.core.errors import IncompleteError
 from photonfarm.core.keys import Key, Stream
+from photonfarm.core.records import F32
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import SceneDataset
 from photonfarm.plan.hold_out import are_held_out, enough, units_of
@@ -22,7 +24,7 @@ from photonfarm.scene.poor_views import are_near, is_unlit
 from photonfarm.store import SceneReader
 from photonfarm.store.read.batch import Batch
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, allocate_memory, choose_kept_pixels
-from photonfarm.trainer.networks import find_kind
+from photonfarm.trainer.networks import find_needs
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -60,7 +62,7 @@ class Feed:
         """
         self._finish = finish
         self._source, self._settings, self._clock = source, settings, clock
-        self._needs = needs or find_kind(settings.network.architecture).needs
+        self._needs = needs or find_needs(settings.network)
         self._resident = resident if resident is not None and resident.makes_batches else None
         self.spec, self.base = source.spec, source.base()
         points = settings.network.points
@@ -251,9 +253,12 @@ def read_batch(
     needs: Needs,
     memory: dict[str, Tensor] | None = None,
 ) -> TrainingBatch:
-    """Read complete samples of a source by its dataset, with the noisy colour of A that is needed."""
+    """Read complete samples of a source by its dataset, with the noisy colour of A that is needed.
+
+    Raises IncompleteError if a view has fewer passes than there are to be halves.
+    """
     film = dataset.spec.film.height, dataset.spec.film.width
-    pixels = variance = None
+    pixels = variance = colour = None
     tensors = dataset.read(rows, memory)
     if needs.kept:
         chosen = [choose_kept_pixels(key, dataset.spec, needs.kept) for key in source.sample_keys(rows)]
@@ -261,7 +266,18 @@ def read_batch(
     if needs.passes:
         samples = zip(rows, tensors["radiance"], strict=True)
         variance = torch.stack([_average_passes(source, dataset, row, halves) for row, halves in samples])
-    return TrainingBatch.of(rows, units_of(source, rows), tensors, pixels, variance)
+    if needs.halves > 1:
+        colour = torch.from_numpy(np.stack([_average_halves(source, row, needs.halves) for row in rows]))
+    return TrainingBatch.of(rows, units_of(source, rows), tensors, pixels, variance, colour)
+
+
+def _average_halves(source: SceneReader, row: int, count: int) -> F32:
+    """The mean of the halves A of the first passes of a sample's view, (H, W, 3), linear radiance × exposure."""
+    passes = source.rows_of_view(source.view_row(row))[:count].tolist()
+    if len(passes) < count:
+        raise IncompleteError(f"row {row}: its view has {len(passes)} complete passes, and {count} halves are wanted")
+    total = sum(source.read_radiance(each)[0].astype(np.float64) for each in passes)
+    return np.asarray(source.spec.exposure * total / count, np.float32)
 
 
 def _average_passes(source: SceneReader, dataset: SceneDataset, row: int, halves: Tensor) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -64,6 +64,13 @@ def find_kind(architecture: str) -> NetworkKind:
     if not (isinstance(make, type) and issubclass(make, nn.Module)):
         raise SpecError(f"architecture = {architecture!r}: is {make!r}; a subclass of torch.nn.Module is required")
     return NetworkKind(make, getattr(make, "needs", Needs(points=False)))
+
+
+def find_needs(settings: NetworkSettings) -> Needs:
+    """The inputs of a network with these settings. Raises SpecError as `find_kind` does."""
+    needs = find_kind(settings.architecture).needs
+    is_denoiser = needs.kept and not needs.guides
+    return replace(needs, surface=True) if is_denoiser and settings.reflectance else needs
 
 
 def build(settings: NetworkSettings, frame: SceneFrame, seed: int) -> Network:

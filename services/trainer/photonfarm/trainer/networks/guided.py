@@ -14,7 +14,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, SceneFrame, require
+from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, SceneFrame, reflectance, require
 from photonfarm.trainer.networks.lit_points import CHANNELS, DIFFUSE, LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
@@ -32,12 +32,6 @@ REFLECTANCE_FLOOR = 0.2
 
 BLACK = 0.05
 """The reflectance below which that floor falls, to 0 for what reflects nothing, such as lamps, and windows at night."""
-
-
-def reflectance(albedo: Tensor, guides: GuideInputs) -> Tensor:
-    """The reflectance of a pixel, (B, H, W, 3): of its surface, or of the one seen in mirrors and through glass."""
-    own = albedo + (guides.specular - guides.throughput).clamp(min=0)
-    return own + guides.throughput * guides.beyond_albedo
 
 
 def floor(albedo: Tensor, guides: GuideInputs) -> Tensor:

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from photonfarm.trainer.networks.guided import REFLECTANCE_FLOOR, Guided, floor, reflectance
-from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, SceneFrame, require
+from photonfarm.trainer.networks.guided import REFLECTANCE_FLOOR, Guided, floor
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, SceneFrame, reflectance, require
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.runs.settings import NetworkSettings
 

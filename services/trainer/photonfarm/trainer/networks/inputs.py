@@ -88,13 +88,16 @@ class Needs:
     guides: bool = False
     kept: int | None = None  # one of so many pixels of half A is an input, in noisy colour; None: no colour
     passes: bool = False  # with `kept`: half A is the mean over passes, where a view has several, and is filtered
+    halves: int = 1  # of which noisy colour is the mean: the halves A of so many passes of the view
+    surface: bool = False  # the guides that take no shadow ray
 
     @property
     def fields(self) -> tuple[str, ...]:
         """The fields of a `SceneDataset` that training needs: those of these inputs, and the radiance as target."""
         points = POINTS if self.points else ()
         photons = (*PHOTONS, "photon_seen") if self.photons else ()
-        return (*IMAGES, "world_to_camera", *points, *photons, *(GUIDES if self.guides else ()))
+        guides = GUIDES if self.guides else SURFACE if self.surface else ()
+        return (*IMAGES, "world_to_camera", *points, *photons, *guides)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,18 +141,39 @@ grazing angles. Summing all lobes of plastics and varnish took a third of a trai
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class GuideInputs:
+class SurfaceInputs:
+    """The guides that say how much a pixel reflects, as in `records.Guides`; they take no shadow ray."""
+
+    emission: Tensor  # (B, H, W, 3) radiance × exposure
+    specular: Tensor  # (B, H, W, 3)
+    throughput: Tensor  # (B, H, W, 3)
+    beyond_albedo: Tensor  # (B, H, W, 3)
+
+
+SURFACE = tuple(field.name for field in fields(SurfaceInputs))
+
+
+def reflectance(albedo: Tensor, surface: SurfaceInputs) -> Tensor:
+    """The reflectance of a pixel, (B, H, W, 3): of its surface, or of the one seen in mirrors and through glass."""
+    own = albedo + (surface.specular - surface.throughput).clamp(min=0)
+    return own + surface.throughput * surface.beyond_albedo
+
+
+def replace_albedo(albedo: Tensor, surface: SurfaceInputs) -> Tensor:
+    """What a denoiser had better take for albedo, (B, H, W, 3): reflectance, at most 1, and 1 where lamps are seen."""
+    lamp = surface.emission.amax(dim=-1, keepdim=True) > 0
+    return torch.where(lamp, 1, reflectance(albedo, surface).clamp(max=1))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class GuideInputs(SurfaceInputs):
     """The guides of each view, as in `records.Guides`; radiance × exposure."""
 
-    emission: Tensor  # (B, H, W, 3)
     direct: Tensor  # (B, H, W, 3)
     gloss: Tensor  # (B, H, W, 3)
-    specular: Tensor  # (B, H, W, 3)
     roughness: Tensor  # (B, H, W)
     mean_depth: Tensor  # (B, H, W) scene units, along the forward axis
     mean_normal: Tensor  # (B, H, W, 3)
-    throughput: Tensor  # (B, H, W, 3)
-    beyond_albedo: Tensor  # (B, H, W, 3)
     beyond_normal: Tensor  # (B, H, W, 3)
     beyond_depth: Tensor  # (B, H, W) scene units, along the path
     point_light: Tensor  # (B, L, 3) irradiance × exposure of the first points
@@ -177,6 +201,12 @@ class Inputs:
     photons: PhotonInputs | None = None
     noisy: NoisyColour | None = None
     guides: GuideInputs | None = None
+    surface: SurfaceInputs | None = None
+
+    @property
+    def reflects(self) -> Tensor:
+        """What denoisers take for albedo, (B, H, W, 3): where `surface` is given, by `replace_albedo`."""
+        return self.albedo if self.surface is None else replace_albedo(self.albedo, self.surface)
 
     @classmethod
     def of(cls, tensors: Mapping[str, Tensor], noisy: NoisyColour | None = None) -> Inputs:
@@ -187,8 +217,10 @@ class Inputs:
         if PHOTONS[0] in tensors:
             arrays = {name.removeprefix("photon_"): tensors[name] for name in (*PHOTONS, "photon_seen")}
             inputs = replace(inputs, photons=PhotonInputs(**arrays, present=arrays["bounce"] >= 0))
-        if GUIDES[0] in tensors:
+        if tensors.keys() >= {*GUIDES}:
             inputs = replace(inputs, guides=GuideInputs(**{name: tensors[name] for name in GUIDES}))
+        elif tensors.keys() >= {*SURFACE}:
+            inputs = replace(inputs, surface=SurfaceInputs(**{name: tensors[name] for name in SURFACE}))
         return inputs
 
     def to(self, device: torch.device, *, copy: bool = False) -> Inputs:

@@ -14,6 +14,8 @@ cloud, H W image.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -62,6 +64,10 @@ class Denoiser(Network):
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
         super().__init__(settings, frame, further=3 + 1, narrower=NARROWER)
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        """The image, (B, H, W, 3), linear radiance × exposure; with reflectance for albedo, where it is given."""
+        return super().forward(replace(inputs, albedo=inputs.reflects))
 
     def further(self, inputs: Inputs) -> list[Tensor]:
         """The noisy colour, zero where not kept, and the mask, (B, H, W, 3) and (B, H, W, 1)."""

@@ -83,7 +83,14 @@ def _blur(image: Tensor, sigma: float) -> Tensor:
     return planes.reshape(len(image), 3, *image.shape[1:3]).movedim(1, -1)
 
 
-OIDN: Mapping[str, OidnQuality] = {"oidn": "high", "oidn-balanced": "balanced", "oidn-fast": "fast"}
+OIDN: Mapping[str, OidnQuality] = {
+    "oidn": "high",
+    "oidn-balanced": "balanced",
+    "oidn-fast": "fast",
+    "oidn-reflectance": "high",
+    "oidn-balanced-reflectance": "balanced",
+    "oidn-fast-reflectance": "fast",
+}
 """The qualities by the names of the denoisers."""
 
 PACKAGE = "mitsuba_oidn"
@@ -119,8 +126,8 @@ class Oidn:
 
     def __call__(self, inputs: Inputs) -> Tensor:
         """A batch's images, (B, H, W, 3), linear radiance × exposure."""
-        whole = fill_in(require(inputs.noisy), inputs.albedo)
-        images = zip(whole, inputs.albedo, inputs.normal, strict=True)
+        albedo = inputs.reflects
+        images = zip(fill_in(require(inputs.noisy), albedo), albedo, inputs.normal, strict=True)
         return torch.stack([self.denoise(*image) for image in images])
 
     def denoise(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:

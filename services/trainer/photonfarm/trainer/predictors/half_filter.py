@@ -21,8 +21,7 @@ from photonfarm.core.files import whole_file
 from photonfarm.core.keys import Key
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import find_kind
-from photonfarm.trainer.networks.guided import reflectance
-from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, require
+from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, replace_albedo, require
 from photonfarm.trainer.predictors.denoisers import OIDN, PACKAGE, Oidn
 from photonfarm.trainer.runs.settings import TrainSettings
 
@@ -81,10 +80,8 @@ class HalfFilter:
         return replace(batch, inputs=replace(batch.inputs, noisy=a), other=b)
 
     def _denoise(self, inputs: Inputs, halves: Sequence[NoisyColour]) -> Tensor:
-        """The images of some halves of each sample, (B, n, H, W, 3); a lamp counts as white."""
-        guides = require(inputs.guides)
-        lamps = guides.emission.amax(dim=-1, keepdim=True) > 0
-        albedo = torch.where(lamps, 1.0, reflectance(inputs.albedo, guides))
+        """The images of some halves of each sample, (B, n, H, W, 3)."""
+        albedo = replace_albedo(inputs.albedo, require(inputs.guides))
         return torch.stack(
             [
                 torch.stack([self._oidn.denoise(half.colour[place], *surfaces) for half in halves])

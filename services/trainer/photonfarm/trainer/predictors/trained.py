@@ -14,7 +14,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader
-from photonfarm.trainer.networks import build, find_kind
+from photonfarm.trainer.networks import build, find_needs
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
@@ -80,7 +80,7 @@ class TrainedRun:
     @property
     def needs(self) -> Needs:
         """The inputs of its network."""
-        return find_kind(self.settings.network.architecture).needs
+        return find_needs(self.settings.network)
 
     @property
     def sees_points(self) -> bool:
@@ -101,23 +101,29 @@ class TrainedRun:
         return replace(predict, images=lambda inputs: predict.images(filtered(inputs)))
 
 
+ReadyChoice = tuple[ReadyDenoiser, int] | tuple[ReadyDenoiser, int, int]
+"""A ready denoiser; it is given one of so many pixels, of one half or of the mean of so many."""
+
+
 @dataclass(frozen=True, slots=True)
 class ReadyPredictor:
-    """A denoiser that is given one of `kept` pixels of half A."""
+    """A denoiser that is given one of `kept` pixels of half A, or of the mean of A over several passes of the view."""
 
     denoiser: ReadyDenoiser
     kept: int
     settings: TrainSettings  # for reading samples
+    halves: int = 1
 
     @property
     def name(self) -> str:
-        """A name such as "oidn 1/4", or "oidn-fast 1/4"."""
-        return f"{self.denoiser} 1/{self.kept}"
+        """A name such as "oidn 1/4", or "oidn-fast 8/1": by the halves that a pixel is given."""
+        return f"{self.denoiser} {self.halves}/{self.kept}"
 
     @property
     def needs(self) -> Needs:
         """The noisy colour, beside the buffers."""
-        return Needs(points=False, kept=self.kept)
+        fed = self.denoiser.endswith("reflectance")
+        return Needs(points=False, kept=self.kept, halves=self.halves, surface=fed)
 
     @property
     def sees_points(self) -> bool:
@@ -137,8 +143,6 @@ class ReadyPredictor:
         return Oidn(self.settings.threads, device, OIDN[self.denoiser])
 
 
-def list_predictors(
-    runs: Sequence[TrainedRun], denoisers: Iterable[tuple[ReadyDenoiser, int]]
-) -> list[TrainedRun | ReadyPredictor]:
-    """The runs, then denoisers given one of so many pixels, which read samples as the first run does."""
-    return [*runs, *(ReadyPredictor(denoiser, kept, runs[0].settings) for denoiser, kept in denoisers)]
+def list_predictors(runs: Sequence[TrainedRun], denoisers: Iterable[ReadyChoice]) -> list[TrainedRun | ReadyPredictor]:
+    """The runs, then ready denoisers, which read samples as the first run does."""
+    return [*runs, *(ReadyPredictor(name, kept, runs[0].settings, *halves) for name, kept, *halves in denoisers)]

@@ -147,7 +147,7 @@ def gather_contents(
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
     first, predictors = runs[0], list_predictors(runs, how.get("denoisers", ()))
     card = DatasetCard.of(store, first.scene_id, first.exposure)
-    kept = [k for k in (predictor.needs.kept for predictor in predictors) if k]
+    needs = [predictor.needs for predictor in predictors]
     tell = how.get("on_progress") or (lambda *_: None)
     costs: FrameCosts | None = None
     untimed, worst, machine = "it was not asked for", [], Machine.here()
@@ -158,7 +158,7 @@ def gather_contents(
         if timed:
             tell("the renderer times frames", 0, 0)
             try:
-                costs = measure_frame_costs(store, first, list(references or images), kept, count_points(runs))
+                costs = measure_frame_costs(store, first, list(references or images), needs, count_points(runs))
             except BackendError as error:
                 untimed = str(error)
         machine = Machine.here()

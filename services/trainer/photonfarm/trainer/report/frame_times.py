@@ -18,6 +18,7 @@ from typing import Any
 from photonfarm.core.archives import FrameCosts, Seconds
 from photonfarm.core.errors import BackendError
 from photonfarm.core.processes import can_render, command
+from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
 from photonfarm.trainer.runs.run_folder import make_environment
 
@@ -52,16 +53,16 @@ class Machine:
 
 VERB = "measure-frames"  # of the renderer
 TIMED = 15  # frames
-LONGEST_S = 10.0  # for all of them
+LONGEST_S = 10.0  # for all of them, and for each half that the longest is of
 
 
 @dataclass(frozen=True, slots=True)
 class FrameTime:
     """Wall seconds of one frame, by parts in the order in which they are made; None for parts that are not needed.
 
-    These are half A at 1/k of the pixels, depth with albedo and normal, the view's guides together with these, which
-    points of the cloud it sees, photons traced and seen, and the network. Editing the scene is left out, as it costs
-    all the same.
+    These are halves A at 1/k of the pixels, depth with albedo and normal, the view's guides together with these (for
+    denoisers that are given reflectance, without their shadow rays), which points of the cloud it sees, photons traced
+    and seen, and the network. Editing the scene is left out, as it costs all the same.
     """
 
     parts: dict[str, Seconds | None]  # render, buffers, guides, points, photons, network
@@ -79,11 +80,12 @@ class FrameTime:
 
 
 def measure_frame_costs(
-    store: str | Path, run: TrainedRun, rows: Sequence[int], kept: Sequence[int], points: int | None
+    store: str | Path, run: TrainedRun, rows: Sequence[int], needs: Sequence[Needs], points: int | None
 ) -> FrameCosts:
     """The renderer's measurement of the frames in some rows of a run's scene, with so many points or all of the cloud.
 
-    The renderer's own messages go to stderr. Raises BackendError with the reason if there is no measurement.
+    It renders the images that predictors with these needs are given. The renderer's own messages go
+    to stderr. Raises BackendError with the reason if there is no measurement.
     """
     if not can_render():
         raise BackendError(
@@ -92,10 +94,12 @@ def measure_frame_costs(
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"
         asked = ["--store", str(store), "--scene", run.scene_id, "--out", str(file)]
-        asked += ["--timed", str(TIMED), "--seconds", str(LONGEST_S)]
+        kept, halves = {each.kept for each in needs if each.kept}, {each.halves for each in needs}
+        asked += ["--timed", str(TIMED), "--seconds", str(LONGEST_S * max(halves))]
         asked += [] if points is None else ["--points", str(points)]
         asked += [argument for row in rows for argument in ("--row", str(row))]
-        asked += [argument for k in sorted(set(kept)) for argument in ("--kept", str(k))]
+        asked += [argument for k in sorted(kept) for argument in ("--kept", str(k))]
+        asked += [argument for n in sorted(halves - {1}) for argument in ("--halves", str(n))]
         verb, environment = command(VERB, *asked), make_environment(run.folder)
         if code := subprocess.run(verb, env=environment, stdout=subprocess.DEVNULL, check=False).returncode:
             raise BackendError(f"`photonfarm {VERB}` ended with exit code {code} here")
@@ -111,11 +115,13 @@ def count_points(runs: Sequence[TrainedRun]) -> int | None:
 def assemble_frame_time(predictor: TrainedRun | ReadyPredictor, network: Seconds, costs: FrameCosts) -> FrameTime:
     """The parts that a predictor needs, with its network's seconds."""
     needs, parts = predictor.needs, costs.parts()
+    guides = parts["guides_s"] if needs.guides else parts["surface_s"] if needs.surface else None
+    is_plain = isinstance(predictor, ReadyPredictor) and predictor.denoiser == "none"
     return FrameTime(
         {
-            "render": costs.renders()[needs.kept] if needs.kept else None,
-            "buffers": None if needs.guides else parts["buffers_s"],
-            "guides": parts["guides_s"] if needs.guides else None,
+            "render": costs.renders()[needs.kept, needs.halves] if needs.kept else None,
+            "buffers": None if guides or is_plain else parts["buffers_s"],
+            "guides": guides,
             "points": parts["points_s"] if predictor.sees_points else None,
             "photons": Seconds.of(costs.photons_s + costs.photons_seen_s) if needs.photons else None,
             "network": network,

@@ -95,9 +95,18 @@ Optimiser = Literal["adam", "rmsprop"]
 Compilation = Literal["off", "on", "graphs"]
 Schedule = Literal["epochs", "cosine"]
 LayerRates = Literal["equal", "scaled"]
-ReadyDenoiser = Literal["none", "fill-in", "oidn", "oidn-balanced", "oidn-fast"]
+ReadyDenoiser = Literal[
+    "none",
+    "fill-in",
+    "oidn",
+    "oidn-balanced",
+    "oidn-fast",
+    "oidn-reflectance",
+    "oidn-balanced-reflectance",
+    "oidn-fast-reflectance",
+]
 """Kept pixels as they are; the rest filled in; then denoised by Open Image Denoise: in its best quality, a quicker one,
-or its quickest."""
+or its quickest; by diffuse albedo, or by the reflectance of all lobes and of what mirrors show, 1 on lamps."""
 
 OidnQuality = Literal["high", "balanced", "fast"]  # as the package names them
 
@@ -145,6 +154,8 @@ class NetworkSettings(Frozen):
     lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
     filter: HalfFilterName = "auto"  # of the half that guided_denoise is given: "own", or Open Image Denoise; "auto":
     # its fast quality where it is installed, and "own" elsewhere, as is settled once a run begins
+    reflectance: bool = False  # of denoise_K (ours): it is given the reflectance of all lobes, and of what mirrors
+    # show, for diffuse albedo, so that patterns of metals and mirrored ones are not smoothed away
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it
 

@@ -41,7 +41,7 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
 from photonfarm.renderer.scene.view_rays import ViewCameras
 from photonfarm.scene.modification import Modification, rebuild, rest
-from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec import WITHOUT_SHADOWS, GuideSpec, SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.read.find import scene_named
@@ -70,10 +70,14 @@ MOST_LIGHT_PATHS = 64.0
 
 
 class PartialFilm:
-    """About 1/k of the pixels of a spec's film, and their integrator; k = 1 gives the spec's own images."""
+    """About 1/k of the pixels of a spec's film, and their integrator; k = 1 gives the spec's own images.
 
-    def __init__(self, spec: SceneSpec, k: int) -> None:
-        self.spec = part_of(spec, k)
+    Each pixel has `halves` times the samples of a half-estimate.
+    """
+
+    def __init__(self, spec: SceneSpec, k: int, halves: int = 1) -> None:
+        transport = spec.transport.model_copy(update={"half_spp": halves * spec.transport.half_spp})
+        self.spec = part_of(spec.model_copy(update={"transport": transport}), k)
         self._sensor = AimedSensor(self.spec)
         self._integrator = integrator_of(self.spec.transport)
 
@@ -98,6 +102,9 @@ def part_of(spec: SceneSpec, k: int) -> SceneSpec:
 WARM_UPS = 2
 """The untimed first frames: the first compiles kernels, the second is the first to replay recorded launches."""
 
+Amount = tuple[int, int]
+"""k and n: of one in k pixels, n times the samples of a half-estimate."""
+
 T = TypeVar("T")
 Clock = Callable[[], float]
 
@@ -116,7 +123,7 @@ def write_frame_costs(
     store: str | Path,
     scene: str,
     rows: Sequence[int],
-    kept: Sequence[int],
+    amounts: Sequence[Amount],
     timed: int,
     points: int | None,
     out: Path,
@@ -135,7 +142,7 @@ def write_frame_costs(
     frames = [TimedFrame(row, *reader.inputs(row)[:2], reader.modification_key(row)) for row in rows]
     used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
     spec = locate(reader.spec)
-    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, kept, timed, seconds)
+    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, amounts, timed, seconds)
     costs.write(out)
     return costs
 
@@ -157,16 +164,16 @@ def frame_costs(
     scene: LoadedScene,
     cloud: BasePointCloud,
     frames: Sequence[TimedFrame],
-    kept: Sequence[int],
+    amounts: Sequence[Amount],
     timed: int,
     seconds: float = math.inf,
 ) -> FrameCosts:
-    """The surfaces of all frames, and the times of `timed` of them and of images of 1/k of the pixels, k of `kept`.
+    """The surfaces of all frames, and the times of `timed` of them and of images of so many pixels and samples.
 
     If there are fewer frames than are timed, they are repeated. After so many `seconds` no further one is begun, but
     one is timed.
     """
-    films = [PartialFilm(scene.spec, k) for k in kept]
+    films = [PartialFilm(scene.spec, *amount) for amount in amounts]
     surface = []
     for frame in frames:
         scene.apply(frame.modification)
@@ -177,7 +184,8 @@ def frame_costs(
         np.array([frame.row for frame in frames], np.int64),
         np.stack(surface),
         **dict(zip(PARTS, parts, strict=True)),
-        kept=np.array(kept, np.int64),
+        kept=np.array([k for k, _ in amounts], np.int64),
+        halves=np.array([halves for _, halves in amounts], np.int64),
         render_s=render_s,
     )
 
@@ -228,7 +236,12 @@ def time_parts(
     timed("edit_s", partial(_edit, scene, modification))
     timed("buffers_s", partial(scene.buffers, view))
     guided = view_key(key, view.vector)
-    timed("guides_s", lambda: scene.inputs([view], [guided], scene.spec.guides, lit_points(cloud, modification)))
+
+    def inputs(wanted: GuideSpec) -> object:
+        return scene.inputs([view], [guided], wanted, lit_points(cloud, modification))
+
+    timed("surface_s", partial(inputs, WITHOUT_SHADOWS))
+    timed("guides_s", partial(inputs, scene.spec.guides))
     timed("points_s", lambda: scene.sees([view], rebuild(cloud, modification)[0]))
     photons = timed("photons_s", lambda: photons_of(scene, key)[0])
     if photons is None:

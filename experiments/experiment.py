@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -102,6 +102,15 @@ class Experiment(Frozen):
         described = merge(merge(_read_toml(file), self.changes), self.size.changes)
         described["name"] = self.name
         return parse_spec(described, where=str(HERE / f"{self.name}.toml"), beside=file.parent)
+
+    def only(self, names: Sequence[str]) -> Self:
+        """The same with these networks alone, from the first seed. Raises SpecError for one that it does not have."""
+        size, runs = self.size, [run for run in (*self.size.runs, *self.runs) if run.name in names]
+        architectures = [name for name in size.architectures if name in names]
+        if unknown := {*names} - {*architectures, *(run.name for run in runs)}:
+            raise SpecError(f"{self.name}: no network of it is named {', '.join(sorted(unknown))}")
+        less = {"architectures": tuple(architectures), "runs": (), "seeds": size.seeds[:1]}
+        return self.model_copy(update={"size": size.model_copy(update=less), "runs": tuple(runs)})
 
     def trained(self) -> list[Run]:
         """Every network from the first seed: one of each architecture, then the size's and the experiment's own."""

@@ -2,11 +2,12 @@
 """Runs experiments from nothing to their reports, and goes on where it was interrupted.
 
     python experiments/run.py [NAME ...] [--size small] [--minutes N] [--workers 2] [--work build/experiments]
-                              [--dry-run]
+                              [--networks NETWORK ...] [--dry-run]
 
 Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered
 and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. With `--minutes` what is at work then is
-stopped, and the same command goes on later; in each room the most telling networks come first. `--dry-run` says what
+stopped, and the same command goes on later; in each room the most telling networks come first. With `--networks` these
+alone are trained, from the first seed, and reported: a look, of which tables.py makes no page. `--dry-run` says what
 that would take: what a sample costs is measured on this machine, training is counted in operations. Exit code 0, 2 for
 wrong usage, 3 for a name that no experiment has or a file that is wrong, 7 where an experiment did not come to its end:
 the others are run all the same.
@@ -36,6 +37,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("names", nargs="*", metavar="NAME", help="experiments (all)")
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
     parser.add_argument("--minutes", type=float, default=math.inf, help="stop after so long (never)")
+    parser.add_argument("--networks", nargs="+", default=(), metavar="NETWORK", help="(all)")
     parser.add_argument("--workers", type=_parse_count, default=2, help="processes at a time, a core each (2)")
     parser.add_argument("--work", type=Path, default=ROOT / "build/experiments", help="(build/experiments)")
     parser.add_argument("--dry-run", action="store_true", help="say what it would take, and do none of it")
@@ -54,6 +56,8 @@ def main() -> int:
     arguments = make_parser().parse_args()
     try:
         experiments = [Experiment.load(name, arguments.size) for name in arguments.names or list_names()]
+        if arguments.networks:
+            experiments = [experiment.only(arguments.networks) for experiment in experiments]
         for experiment in experiments:
             experiment.spec()  # what is wrong should be said before hours go by
     except SpecError as error:

@@ -16,7 +16,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 
-from experiments import experiment, run
+from experiments import experiment, free_space, run
 from experiments.dry_run import Need
 from experiments.equal_time import place_rows
 from experiments.experiment import FREE_SPACE, Experiment, Size, SizeName, keep_free_space, list_names, merge
@@ -130,6 +130,20 @@ def test_an_experiment_without_free_space_of_its_scene_is_refused(tiny: Experime
     ):
         with pytest.raises(SpecError, match=rf"free_space\.py {other.name}`"):
             other.spec()
+
+
+@pytest.mark.slow
+def test_free_space_is_measured_for_an_experiment_s_own_groups(
+    tiny: Experiment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    open_everywhere = tiny.spec()
+    monkeypatch.setattr(sys, "argv", ["free_space.py", "tiny"])
+    assert free_space.main() == 0
+    measured = tiny.spec()
+    assert measured.view.free_space.of == open_everywhere.view.free_space.of
+    assert list(measured.view.free_space.groups) == [group.name for group in measured.groups]
+    monkeypatch.setattr(sys, "argv", ["free_space.py", "other"])
+    assert free_space.main() == SpecError.exit_code
 
 
 def with_size(tiny: Experiment, **changes: Any) -> Experiment:

@@ -205,9 +205,9 @@ def test_each_part_is_charged_with_its_own_seconds(
     half_spp = room.spec.transport.half_spp
     times = {amount: render.median / half_spp for amount, render in costs.renders().items()}
     assert times == {(4, 1): 12, (1, 1): 24, (1, 3): 72}
-    for seconds, timed in ((1, 1), (3.5 * sum(part.median for part in costs.parts().values()), 2)):
+    for seconds, timed in ((1, 1), (1.5 * sum(part.median for part in costs.parts().values()), 2)):
         few = frame_costs(room, cloud, [frame(somewhere, rest(room.spec))], amounts=[], timed=5, seconds=seconds)
-        assert (len(few.edit_s), few.renders()) == (timed, {}), "in limited time, warm-ups included; without images"
+        assert (len(few.edit_s), few.renders()) == (timed, {}), "in limited time after the warm-ups; without images"
 
 
 # ------------------------------------------------------------------------------------------------------------- the verb

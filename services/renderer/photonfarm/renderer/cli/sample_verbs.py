@@ -109,7 +109,7 @@ def buffers(
     "--seconds",
     type=click.FloatRange(0, min_open=True),
     default=math.inf,
-    help="Begin no further frame after so much time; one is timed at least.  [default: no limit]",
+    help="Begin no further frame after so much time, from the first that counts.  [default: no limit]",
 )
 @click.option(
     "--points",

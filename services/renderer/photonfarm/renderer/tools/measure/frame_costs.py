@@ -170,8 +170,8 @@ def frame_costs(
 ) -> FrameCosts:
     """The surfaces of all frames, and the times of `timed` of them and of images of so many pixels and samples.
 
-    If there are fewer frames than are timed, they are repeated. After so many `seconds` no further one is begun, but
-    one is timed.
+    If there are fewer frames than are timed, they are repeated. After so many `seconds`, from the first one that
+    counts, no further one is begun.
     """
     films = [PartialFilm(scene.spec, *amount) for amount in amounts]
     surface = []
@@ -208,11 +208,13 @@ def _seconds(
     seconds: float,
 ) -> NDArray[np.float64]:
     """The times of each of `PARTS` and of a half-estimate on each film, (parts and films, timed frames)."""
-    until = time.perf_counter() + seconds
+    until = math.inf
     stays = len({frame.key for frame in frames}) == 1
     measured: list[list[float]] = []
     for seed, frame in enumerate(islice(take_turns(frames), WARM_UPS + timed)):
-        if len(measured) > WARM_UPS and time.perf_counter() > until:
+        if seed == WARM_UPS:
+            until = time.perf_counter() + seconds
+        elif seed > WARM_UPS and time.perf_counter() > until:
             break
         if stays:  # else there would be nothing to edit
             scene.apply(rest(scene.spec))

@@ -1,4 +1,9 @@
+#!/usr/bin/env python3
 """Error against the time of a frame, everything charged: ours beside denoisers that take as long.
+
+    python experiments/equal_time.py NAME [--size small] [--work build/experiments]
+
+prints every row of an experiment that has run, or of a look at it (run.py, `--networks`).
 
 Time is that of editing the scene, buffers, guides, photons, what is rendered, and the network. A family is one way to
 make an image of more or fewer samples, such as a denoiser in its qualities: of it count those that nothing quicker has
@@ -7,27 +12,37 @@ less error than, and between two of these the error is taken to follow a power o
 
 from __future__ import annotations
 
+import argparse
 import io
+import json
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its own folder alone
+
+from bench.harness import results
+from experiments.experiment import Experiment, SizeName
 from experiments.rooms import Room
 from photonfarm.core.formatting import format_markdown_table
+from photonfarm.core.statistics import Estimate
+from photonfarm.trainer.metrics.image_metrics import format_with_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 F64 = NDArray[np.float64]
 
-OURS = ("guided_transport", "guided_transport_photons")
+OURS = ("guided_transport", "guided_transport_photons", "guided_denoise")
 NETWORKS = ("cnn", "feature_projection", "light_transport", "light_transport_photons", "guided", *OURS)
 FAMILIES = {
-    r"denoise_\d+": "denoisers trained on the room",
+    r"denoise_\d+(_reflectance)?": "denoisers trained on the room",
     r"oidn\S*(?<!reflectance) .*": "OIDN by albedo",
     r"oidn\S*reflectance .*": "OIDN by reflectance",
     r"none .*": "bdpt",
@@ -118,6 +133,15 @@ def measure_ratio(ours: Placed, theirs: AtTime) -> tuple[float, float, float]:
     return float(ratios[0]), float(low), float(high)
 
 
+def format_rows(room: Room) -> str:
+    """Every row of a room that was timed and has errors: its time and its error with the 95 % interval."""
+    lines = [
+        [each.name, f"{each.milliseconds:.0f}", format_with_interval(Estimate.of(each.errors), 5)]
+        for each in place_rows(room, list(room.rows))
+    ]
+    return format_markdown_table(["row", "ms a frame", "MSE (95 %)"], lines)
+
+
 def format_table(rooms: Sequence[Room]) -> str:
     """Ours in each room: time, error, and that as a share of each family's after the same time."""
     head = ["room", "network", "ms a frame", "MSE"]
@@ -177,3 +201,21 @@ def _draw(axes: Axes, room: Room) -> None:
         axes.plot(each.milliseconds, each.mse, "D", color=colours[NETWORKS.index(each.name)], label=each.name)
     axes.margins(0.09, 0.1)
     axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", xscale="log", yscale="log")
+
+
+def main() -> int:
+    """Print the rows of an experiment; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name")
+    parser.add_argument("--size", choices=get_args(SizeName), default="small")
+    parser.add_argument("--work", type=Path, default=results.ROOT / "build/experiments", help="(build/experiments)")
+    told = parser.parse_args()
+    report = told.work / told.size / told.name / "report/report.json"
+    runs = [run["name"] for run in json.loads(report.read_text(encoding="utf-8"))["runs"]]
+    room = Room.read(Experiment.load(told.name, told.size).only(runs), report, results.commit())
+    print(f"{format_rows(room)}\n\n{format_table([room])}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -7,6 +7,8 @@ import pytest
 
 from experiments import equal_time
 from experiments.equal_time import Placed, interpolate, measure_ratio
+from experiments.experiment import Experiment
+from experiments.rooms import Room
 
 
 def placed(milliseconds: float, mse: float) -> Placed:
@@ -45,3 +47,35 @@ def test_what_views_share_is_not_in_the_interval() -> None:
     differing = Placed("other", 100, np.array([0.06, 0.01, 0.02, 0.03]))
     value, low, high = measure_ratio(differing, interpolate(FAMILY, 100))  # type: ignore[arg-type]
     assert low < value < high
+
+
+def test_a_family_is_all_ways_to_feed_it_less_those_that_something_quicker_is_better_than() -> None:
+    of_views = [0.04, 0.02]
+    times = {
+        "oidn 1/1": (3, 1),
+        "oidn-fast 1/1": (1, 2),
+        "oidn-fast 2/1": (2, 3),
+        "oidn-fast-reflectance 1/1": (4, 0.5),
+    }
+    times |= {"denoise_1": (5, 1), "denoise_1_reflectance": (6, 0.9), "guided_denoise": (1, 1)}
+    rows = {
+        name: {
+            "frame_seconds": {"total": seconds},
+            "mse": {"mean": 0.03 * error, "standard_error": None, "count": 2},
+            "mse_of_images": [error * each for each in of_views],
+        }
+        for name, (seconds, error) in times.items()
+    }
+    room = Room(Experiment.load("night-living-room", "small"), {"edit_seconds": 0.5, "rows": rows})
+    found = {
+        called: [each.name for each in equal_time.order_family(room, names)]
+        for names, called in equal_time.FAMILIES.items()
+    }
+    assert found == {
+        "denoisers trained on the room": ["denoise_1", "denoise_1_reflectance"],
+        "OIDN by albedo": ["oidn-fast 1/1", "oidn 1/1"],
+        "OIDN by reflectance": ["oidn-fast-reflectance 1/1"],
+        "bdpt": [],
+        "path": [],
+    }
+    assert equal_time.format_rows(room).splitlines()[2].startswith("| oidn-fast 1/1 | 1500 | 0.06")

@@ -32,11 +32,11 @@ START = 2.0
 TRUSTED = -4.0
 """What β starts from, before softplus: 0.02, an error of 13 %."""
 
-WINDOWS = (1, 5, 13)
-"""The windows, in pixels, in which the half's light over reflectance is given to the U-Net, as ratios of sums."""
+WINDOWS = (5, 13)
+"""The windows, in pixels, in which the half's light over reflectance is given to the U-Net, beside each pixel's."""
 
-HALF_CHANNELS = 3 + 3 * len(WINDOWS) + 3 + 3 + 1
-"""The half, its light in `WINDOWS`, the filtered half, its light, and the noise."""
+HALF_CHANNELS = 3 + 3 * (1 + len(WINDOWS)) + 3 + 3 + 1
+"""The half, its light of each pixel and in `WINDOWS`, the filtered half, its light, and the noise."""
 
 DARK = 0.1
 """The brightness, in exposed radiance, that noise is relative to in darker places."""
@@ -98,7 +98,7 @@ def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor) -> Half:
         filtered = direct + filter_light(light, reflects, spread, inputs.normal, places)
     brightness = filtered.mean(dim=-1, keepdim=True)
     noise = spread / (brightness**2 + DARK**2)
-    averages = [light / reflects if size == 1 else _mean(light, size) / _mean(reflects, size) for size in WINDOWS]
+    averages = [light / reflects, *(_smooth(light, reflects, size) for size in WINDOWS)]
     images = [noisy.colour / reflects, *averages, filtered / reflects, (filtered - direct) / reflects, noise]
     return Half(filtered, noise, shows, [shows * image.sign() * torch.log1p(image.abs()) for image in images])
 
@@ -108,16 +108,22 @@ def _estimate_variance(light: Tensor, reflects: Tensor) -> Tensor:
 
     The square of a pixel less the mean over 3 × 3 is 8/9 of it, where nothing but noise differs.
     """
-    smooth = _mean(light, 3) / _mean(reflects, 3)
-    rest = (light - reflects * smooth).mean(dim=-1, keepdim=True)
+    rest = (light - reflects * _smooth(light, reflects, 3)).mean(dim=-1, keepdim=True)
     return 9 / 8 * _mean(rest**2, 5)
 
 
 def _mean(image: Tensor, size: int) -> Tensor:
     """The mean over windows of size × size pixels, cut at the border, (B, H, W, C)."""
-    planes = image.permute(0, 3, 1, 2)
-    means = functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False)
-    return means.permute(0, 2, 3, 1)
+    planes, reach = image.permute(0, 3, 1, 2).contiguous(), size // 2
+    for window, padding in (((size, 1), (reach, 0)), ((1, size), (0, reach))):
+        planes = functional.avg_pool2d(planes, window, stride=1, padding=padding, count_include_pad=False)
+    return planes.permute(0, 2, 3, 1)
+
+
+def _smooth(light: Tensor, reflects: Tensor, size: int) -> Tensor:
+    """Light over reflectance in windows, (B, H, W, 3): a ratio of sums, in which dark surfaces count the least."""
+    both = _mean(torch.cat([light, reflects], dim=-1), size)
+    return both[..., :3] / both[..., 3:]
 
 
 def filter_light(light: Tensor, reflects: Tensor, variance: Tensor, normal: Tensor, places: Tensor) -> Tensor:

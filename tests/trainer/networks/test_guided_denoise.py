@@ -64,12 +64,13 @@ def test_it_starts_from_the_filtered_half_and_the_known_light_and_goes_on_to_the
     make_source,
 ) -> None:
     source = make_source(1)
-    made, inputs = network(source), batch_of(source, (0,), NEEDS).inputs
+    made, inputs = network(source, filter="oidn-fast"), batch_of(source, (0,), NEEDS).inputs
     torch.nn.init.zeros_(made.image_synthesis.out.weight)
     torch.nn.init.zeros_(made.image_synthesis.out.bias)
     known, filtered = made.known(inputs, made.further(inputs)), inputs.noisy.colour + 0.5
+    made.shares[:2] = -torch.inf  # what our own filter makes, which depends on the variance
     images = {}
-    for variance in (1e9, 1e-3, 0.0):
+    for variance in (1e9, 1e-4, 0.0):
         told = replace(inputs.noisy, filtered=filtered, variance=torch.full_like(inputs.depth, variance))
         images[variance] = made(replace(inputs, noisy=told))
     torch.testing.assert_close(images[1e9], known + 0.8808 * (filtered - known), rtol=1e-3, atol=1e-3)
@@ -122,14 +123,16 @@ def test_the_filter_keeps_textures_and_edges_and_takes_most_of_the_noise() -> No
     reflects, normal, places, light = images_of()
     clean = reflects * light
     none = torch.full((1, 32, 32, 1), 1e-6)
-    torch.testing.assert_close(filter_light(clean, reflects, none, normal, places), clean, rtol=1e-4, atol=1e-5)
+    for image in filter_light(clean, reflects, none, normal, places):
+        torch.testing.assert_close(image, clean, rtol=1e-4, atol=1e-5)
     torch.manual_seed(1)
     noisy = clean * torch.distributions.Gamma(4.0, 4.0).sample(clean.shape[:3])[..., None]
     spread = ((clean.mean(dim=-1, keepdim=True)) ** 2 / 4).contiguous()
-    filtered = filter_light(noisy, reflects, spread, normal, places)
-    before, after = (float(((image - clean) / clean).square().mean()) for image in (noisy, filtered))
-    assert after < 0.1 * before
-    assert float((filtered / noisy.mean()).mean()) == pytest.approx(1, abs=0.05)
+    images = noisy, *filter_light(noisy, reflects, spread, normal, places)
+    before, fine, coarse = (float(((image - clean) / clean).square().mean()) for image in images)
+    assert coarse < 0.2 * before
+    assert coarse < 0.7 * fine < 0.7 * before
+    assert float(images[2].mean() / clean.mean()) == pytest.approx(1, abs=0.08)  # dark ones agree more often
 
 
 # -------------------------------------------------------------------------------------------------------------- passes
@@ -243,6 +246,6 @@ def test_noise_is_found_from_neighbours_where_there_is_one_pass(make_source) -> 
         image.zero_()
     inputs.albedo.fill_(0.5)
     noise = 1 + 0.5 * torch.randn(1, 32, 32, 1, generator=torch.Generator().manual_seed(0))
-    noisy = replace(inputs.noisy, colour=noise.expand(-1, -1, -1, 3), filtered=torch.ones(1, 32, 32, 3))
+    noisy = replace(inputs.noisy, colour=noise.expand(-1, -1, -1, 3))
     half = look_at_half(inputs, noisy, torch.zeros(1, 32, 32, 3))
-    assert float(half.noise.mean()) == pytest.approx(0.25 / 1.01, rel=0.2)
+    assert float(half.noise.mean()) == pytest.approx(0.25 / 1.01, rel=0.25)

@@ -1,14 +1,16 @@
 """A guided network that is also given one noisy half of the view, and learns from the other one. All ours.
 
-guess = w · filtered half + (1 − w) · known light + reflectance × U-Net
+filtered = Σ shares · filtered halves
+guess = filtered + s / (s + SETTLED) · ((1 − w) · (known light − filtered) + reflectance × U-Net)
 image = guess + v · (half − guess),   v = β / (β + s)
 
-The filtered half is a denoiser's image of half A [predictors.half_filter], or that of the filter below. The weight w
-of each pixel is learned, and starts at `START`. β, the squared relative error of the guess, is learned; s, the squared
-relative noise of the half, is estimated from its passes, or from its neighbourhood where it has one pass. So v is the
-weight by which two independent estimates have the least error: as samples are added, s falls and the image goes on to
-their mean (the weights of Back et al., Deep Combiner, 2020, are learned instead). All inputs depend on half A alone,
-so that half B is an unbiased target; A and B take turns [data.batch].
+The half is filtered by the two scales of a filter of our own, below, and where it is installed by a denoiser
+[predictors.half_filter]: errors of filters that work differently are less in their mean. Shares and w are learned for
+each pixel; w starts at 0.88. s, the squared relative noise of the half, is estimated from its passes, or from its
+neighbourhood where it has one alone. So the more samples there are, the less the network adds to the filtered half.
+β, the squared relative error of the guess, is learned, and v is the weight by which two independent estimates have the
+least error: in the end the image goes on to the mean of the samples (Back et al., Deep Combiner, 2020, learn such
+weights). All inputs depend on half A alone, so half B is an unbiased target; the two take turns [data.batch].
 
 Shape letters: B batch, H W image.
 """
@@ -35,34 +37,48 @@ TRUSTED = -4.0
 WINDOWS = (5, 13)
 """The windows, in pixels, in which the half's light over reflectance is given to the U-Net, beside each pixel's."""
 
-HALF_CHANNELS = 3 + 3 * (1 + len(WINDOWS)) + 3 + 3 + 1
-"""The half, its light of each pixel and in `WINDOWS`, the filtered half, its light, and the noise."""
+HALF_CHANNELS = 3 + 3 * (1 + len(WINDOWS)) + 1
+"""The half, its light of each pixel and in `WINDOWS`, and its noise."""
+
+SHARES = (-3.0, 0.0, 0.0)
+"""The logits of what is filtered before anything is learned: finely, coarsely, by a denoiser."""
+
+SETTLED = 0.04
+"""The noise s at which half of what the network adds is left."""
 
 DARK = 0.1
 """The brightness, in exposed radiance, that noise is relative to in darker places."""
 
-LEVELS = 4
-"""The passes of the filter, with neighbours at 1, 2, 4 and 8 pixels."""
+LEVELS = 3
+"""The passes of the filter, with neighbours at 1, 2 and 4 pixels: it is fine after the first, coarse after the last."""
 
 
 class GuidedDenoise(Guided):
     """Image synthesis from guides, lit points and a noisy half of the view, joined with the half and its filtering."""
 
+    shares: Tensor
+
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        super().__init__(settings, frame, transport=LitPoints, further=HALF_CHANNELS, outputs=3 + 2)
-        self._is_given_filtered = settings.filter.startswith("oidn")
+        has_denoiser = settings.filter.startswith("oidn")
+        filters = 2 + has_denoiser
+        further, outputs = HALF_CHANNELS + 6 * filters, 3 + 2 + filters
+        super().__init__(settings, frame, transport=LitPoints, further=further, outputs=outputs)
+        self._has_denoiser = has_denoiser
+        self.register_buffer("shares", torch.tensor(SHARES[:filters]), persistent=False)
 
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure. What reflects nothing shows what it emits."""
         noisy, lit = require(inputs.noisy), self.further(inputs)
-        if self._is_given_filtered:
-            require(noisy.filtered)
-        half = look_at_half(inputs, noisy, self._measure_places(inputs))
+        denoised = require(noisy.filtered) if self._has_denoiser else None
+        half = look_at_half(inputs, noisy, self._measure_places(inputs), denoised)
         known = self.known(inputs, lit)
         made = self.synthesise(self.channels(inputs, [*half.channels, *lit]))
-        light, weight, trust = made[..., :3], torch.sigmoid(START + made[..., 3:4]), made[..., 4:5]
-        guess = known + half.shows * weight * (half.filtered - known) + self.factor(inputs) * light
-        error = functional.softplus(TRUSTED + trust)
+        light, weight = self.factor(inputs) * made[..., :3], torch.sigmoid(START + made[..., 3:4])
+        error = functional.softplus(TRUSTED + made[..., 4:5])
+        shares = torch.softmax(self.shares + made[..., 5:], dim=-1)
+        filtered = (half.filtered * shares[..., None, :]).sum(dim=-1)
+        added = half.noise / (half.noise + SETTLED) * ((1 - weight) * (known - filtered) + light)
+        guess = torch.lerp(known + light, filtered + added, half.shows)
         return guess + half.shows * (error / (error + half.noise)) * (noisy.colour - guess)
 
     def _measure_places(self, inputs: Inputs) -> Tensor:
@@ -76,15 +92,18 @@ class GuidedDenoise(Guided):
 class Half(NamedTuple):
     """What a network sees of a half, without gradients."""
 
-    filtered: Tensor  # (B, H, W, 3)
+    filtered: Tensor  # (B, H, W, 3, n) by each filter
     noise: Tensor  # (B, H, W, 1) its variance over its squared brightness
     shows: Tensor  # (B, H, W, 1) 0 where nothing reflects, and the known light is all there is; else 1
-    channels: list[Tensor]  # `HALF_CHANNELS` in all
+    channels: list[Tensor]  # `HALF_CHANNELS`, and 6 of each filter
 
 
 @torch.no_grad()
-def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor) -> Half:
-    """Filter a half, unless that is done, and estimate its noise; `places` are those of surfaces, (B, H, W, 3)."""
+def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor, denoised: Tensor | None = None) -> Half:
+    """Filter a half, and estimate its noise; `places` are those of surfaces, (B, H, W, 3).
+
+    The filters are our own, and that of the `denoised` half, (B, H, W, 3), if there is one.
+    """
     guides = require(inputs.guides)
     shows = floor(inputs.albedo, guides) / REFLECTANCE_FLOOR
     reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
@@ -93,14 +112,15 @@ def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor) -> Half:
     spread = _estimate_variance(light, reflects)
     if noisy.variance is not None:
         spread = torch.where(noisy.variance[..., None] < 0, spread, _mean(noisy.variance[..., None], 5))
-    filtered = noisy.filtered
-    if filtered is None:
-        filtered = direct + filter_light(light, reflects, spread, inputs.normal, places)
-    brightness = filtered.mean(dim=-1, keepdim=True)
+    fine, coarse = (direct + image for image in filter_light(light, reflects, spread, inputs.normal, places))
+    brightness = coarse.mean(dim=-1, keepdim=True)
     noise = spread / (brightness**2 + DARK**2)
+    filtered = [fine, coarse] if denoised is None else [fine, coarse, denoised]
     averages = [light / reflects, *(_smooth(light, reflects, size) for size in WINDOWS)]
-    images = [noisy.colour / reflects, *averages, filtered / reflects, (filtered - direct) / reflects, noise]
-    return Half(filtered, noise, shows, [shows * image.sign() * torch.log1p(image.abs()) for image in images])
+    images = [noisy.colour / reflects, *averages, noise]
+    images += [image / reflects for each in filtered for image in (each, each - direct)]
+    channels = [shows * image.sign() * torch.log1p(image.abs()) for image in images]
+    return Half(torch.stack(filtered, dim=-1), noise, shows, channels)
 
 
 def _estimate_variance(light: Tensor, reflects: Tensor) -> Tensor:
@@ -126,17 +146,17 @@ def _smooth(light: Tensor, reflects: Tensor, size: int) -> Tensor:
     return both[..., :3] / both[..., 3:]
 
 
-def filter_light(light: Tensor, reflects: Tensor, variance: Tensor, normal: Tensor, places: Tensor) -> Tensor:
-    """Light, (B, H, W, 3), filtered by its own noise and the surfaces: an à-trous filter as a ratio of sums.
+def filter_light(light: Tensor, reflects: Tensor, variance: Tensor, normal: Tensor, places: Tensor) -> list[Tensor]:
+    """Light filtered by its own noise and the surfaces, finely and coarsely, (B, H, W, 3) each.
 
-    Neighbours count by Σ k w light / Σ k w reflectance, 3 × 3 at growing distances (Dammertz et al., Edge-avoiding
-    À-Trous, 2010). w falls with the angle of normals, the distance from the tangent plane, and the difference of
-    brightness over its standard deviation, which is carried from pass to pass (Schied et al., SVGF, 2017).
+    It is an à-trous filter (Dammertz et al., 2010) as a ratio of sums: neighbours, 3 × 3 at growing distances, count by
+    Σ k w light / Σ k w reflectance. w falls with the angle of normals, the distance from the tangent plane, and the
+    difference of brightness over its standard deviation, which goes from pass to pass (Schied et al., SVGF, 2017).
     """
     height, width = light.shape[1:3]
     weighted, weight = light, reflects.mean(dim=-1, keepdim=True).expand_as(light)
     weighted = weighted / reflects * weight
-    variance = variance / weight[..., :1] ** 2
+    variance, made = variance / weight[..., :1] ** 2, []
     for level in range(LEVELS):
         step = 1 << level
         value = weighted / weight
@@ -156,4 +176,5 @@ def filter_light(light: Tensor, reflects: Tensor, variance: Tensor, normal: Tens
                 sums[..., :4] += counts * there[..., :4]
                 sums[..., 4:] += (counts * there[..., 3:4]) ** 2 * there[..., 4:5]
         weighted, weight, variance = sums[..., :3], sums[..., 3:4].expand_as(light), sums[..., 4:] / sums[..., 3:4] ** 2
-    return reflects * weighted / weight
+        made.append(reflects * weighted / weight)
+    return [made[0], made[-1]]

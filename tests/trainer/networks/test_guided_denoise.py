@@ -216,7 +216,7 @@ def test_a_loss_below_that_of_clean_images_is_told_from_one_above(make_source, m
 def test_oidn_s_images_come_with_the_batch_and_are_kept_beside_the_run(make_source, tmp_path) -> None:
     pytest.importorskip("mitsuba_oidn", reason="the extra `oidn` is not installed")
     source, settings = make_source(2), settle_filter(settings_of())
-    assert settings.network.filter == "oidn-fast"
+    assert settings.network.filter == "oidn"
     batch, keys = batch_of(source, (0, 1), NEEDS), source.sample_keys((0, 1))
     with pytest.raises(ValueError, match="inputs"):
         network(source, filter="oidn-fast")(batch.inputs)
@@ -225,7 +225,7 @@ def test_oidn_s_images_come_with_the_batch_and_are_kept_beside_the_run(make_sour
         return HalfFilter(settings, run=tmp_path).filter_both(given, keys)
 
     one, again = filtered(batch), filtered(batch)
-    assert len(list((tmp_path / FOLDER).glob("oidn-fast-*/*.npy"))) == 2
+    assert len(list((tmp_path / FOLDER).glob("oidn-*/*.npy"))) == 2
     assert torch.equal(one.inputs.noisy.filtered, again.inputs.noisy.filtered)
     assert torch.equal(one.other.filtered, again.other.filtered)
     poked = replace(batch, other=replace(batch.other, colour=batch.other.colour + 1))

@@ -39,7 +39,7 @@ def settle_filter(settings: TrainSettings) -> TrainSettings:
     network = settings.network
     if network.filter != "auto" or not find_kind(network.architecture).needs.passes:
         return settings
-    chosen = "own" if find_spec(PACKAGE) is None else "oidn-fast"
+    chosen = "own" if find_spec(PACKAGE) is None else "oidn"
     return settings.model_copy(update={"network": network.model_copy(update={"filter": chosen})})
 
 

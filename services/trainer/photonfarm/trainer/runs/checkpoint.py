@@ -175,7 +175,6 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     kept = [name for name in ("scene_id", "exposure") if name in state and name in identity]
     then, now = ({**{name: one[name] for name in kept}, **one["settings"]} for one in (state, identity))
     check_version(path, then["network"])
-    then["network"].setdefault("filter", now["network"]["filter"])  # which came with the networks that it matters to
     changed = differing(then, now)
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
@@ -193,10 +192,7 @@ def check_version(path: Path, network: Mapping[str, Any]) -> None:
 
     A missing key would take today's default, and make another network.
     """
-    lacking = [key for key in NetworkSettings.model_fields if key not in network]
-    if network.get("architecture") != "guided_denoise":  # the only one that it matters to
-        lacking = [key for key in lacking if key != "filter"]
-    if missing := ", ".join(lacking):
+    if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
         raise SpecError(
             f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder "
             "(--run)"

@@ -152,8 +152,9 @@ class NetworkSettings(Frozen):
     precision: Precision = "float32"  # of the image synthesis layer; its weights and its image are float32 in any case;
     # "tf32" is of NVIDIA's cards alone (docs/results/train_step.md)
     lit_points: Count = 512  # of guided_transport: points that send light on, at most as many as are lit
-    filter: HalfFilterName = "auto"  # of the half that guided_denoise is given: "own", or Open Image Denoise; "auto":
-    # its fast quality where it is installed, and "own" elsewhere, as is settled once a run begins
+    filter: HalfFilterName = "auto"  # of the half that guided_denoise is given: a filter of our "own", and beside it
+    # Open Image Denoise unless it is "own"; "auto": its best quality where it is installed, else "own", as is settled
+    # when a run begins
     reflectance: bool = False  # of denoise_K (ours): it is given the reflectance of all lobes, and of what mirrors
     # show, for diffuse albedo, so that patterns of metals and mirrored ones are not smoothed away
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;

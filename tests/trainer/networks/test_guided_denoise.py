@@ -202,7 +202,7 @@ def test_a_loss_below_that_of_clean_images_is_told_from_one_above(make_source, m
     target = batch.for_training().target[:, 0]
     for image in (target, torch.cat([clean, clean]), batch.for_training().inputs.noisy.colour):
         learner = Learner(frame, settings, Ranks())
-        learner._note_excess(0, image, batch.for_training(), learner._loss(image, batch.for_training().target))
+        learner._note_excess(0, image, batch.for_training())
         found.append(float(learner.excess))
     floor = float((batch.target[:, 0] - batch.target[:, 1]).square().mean()) / 2
     assert found[0] == pytest.approx(-floor, rel=1e-4)

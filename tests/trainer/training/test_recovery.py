@@ -67,7 +67,7 @@ def spoilt(source: Any, reads: Callable[[int], bool]) -> Any:
 def as_if(monkeypatch: pytest.MonkeyPatch, errors: dict[int, Sequence[float]]) -> None:
     """Have validations find these errors of rows 0, 1, … at each step, whatever the network."""
 
-    def validate(predict: Any, step: int, found: Any, show: Any, loss: str) -> Validation:
+    def validate(predict: Any, step: int, found: Any, show: Any, **how: Any) -> Validation:
         list(found)
         return validation(dict(enumerate(errors[step])), step=step)
 

@@ -34,6 +34,8 @@ def print_record(of: dict[str, Any]) -> None:
         click.echo(f"loss {of['loss']} is unbiased: {of['verdict']}", err=True)
     if of["kind"] == "recovered":
         click.echo(f"step {of['step']}: {_format_recovery(of)}", err=True)
+    if of["kind"] == "end" and of["advice"]:
+        click.echo(of["advice"], err=True)
     if of["kind"] == "validation":
         there = f"on {of['held_out']} of {of['samples']} samples; {_format_rounds(of)}"
         click.echo(
@@ -46,7 +48,7 @@ def print_record(of: dict[str, Any]) -> None:
 
 def _format_rounds(of: dict[str, Any]) -> str:
     """How often a network was given each half, and whether it has learned by heart what it goes with."""
-    if "excess" not in of:
+    if "rounds" not in of:
         return ""
     heart = " and learns their noise by heart, as its loss is below that of clean images" if of["excess"] < 0 else ""
     return f"has seen each half in {of['rounds']:.1f} rounds{heart}; "

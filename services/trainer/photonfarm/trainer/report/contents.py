@@ -189,7 +189,7 @@ def gather_contents(
         entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
     return ReportContents(
         card=card,
-        stories=tuple(RunStory.of(name, run) for name, run in zip(names, runs, strict=True)),
+        stories=tuple(RunStory.of(name, run, card.samples.core_seconds) for name, run in zip(names, runs, strict=True)),
         baselines=Baselines(*evaluation.beside),
         evaluation=evaluation,
         entries=tuple(entries),

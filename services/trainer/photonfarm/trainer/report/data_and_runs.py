@@ -29,6 +29,7 @@ from photonfarm.trainer.predictors.evaluation import (
 )
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
+from photonfarm.trainer.runs.advice import Advice, advise
 from photonfarm.trainer.runs.devices import AUTO, usable_device
 from photonfarm.trainer.runs.progress import divide_by_used, find_bottleneck, share_waits
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS
@@ -166,10 +167,11 @@ class RunStory:
     run: TrainedRun
     state: dict[str, Any]  # of the checkpoint, without weights
     curve: tuple[CurvePoint, ...]
+    advice: Advice | None  # what is worth its seconds next
 
     @classmethod
-    def of(cls, name: str, run: TrainedRun) -> RunStory:
-        """Read the story of a run; raises StoreError for a log that cannot be read."""
+    def of(cls, name: str, run: TrainedRun, images_s: float | None = None) -> RunStory:
+        """Read the story of a run, whose samples took `images_s` core-seconds; StoreError for an unreadable log."""
         records = run_folder.read_log(run.folder / METRICS)
         state = checkpoint.load(run.folder / CHECKPOINT)
         arrived, held_out = (state["following"][rows].numpy() for rows in ("arrived", "held_out"))
@@ -188,7 +190,7 @@ class RunStory:
             if r["kind"] == "validation"
         )
         kept = {key: state[key] for key in ("step", "following", "seconds", "versions")}
-        return cls(name, run, kept, tuple(points))
+        return cls(name, run, kept, tuple(points), advise(records, images_s))
 
     @property
     def trained_on(self) -> int:
@@ -223,6 +225,7 @@ class RunStory:
             "seconds": state["seconds"],
             "waits": shares,
             "bottleneck": find_bottleneck(shares),
+            "advice": self.advice and asdict(self.advice),
             "curve": [asdict(point) for point in self.curve],
             "on_gpu": self.on_gpu,
             "settings": settings.model_dump(mode="json"),

@@ -124,7 +124,8 @@ def _make_run_table(contents: ReportContents) -> Table:
         row += [f"{of['seconds']['train'] / 60:.1f}", f"{of['waits']['samples']:.1%}", f"{of['waits']['reading']:.1%}"]
         rows.append([*row, f"{of['samples_per_used']:.2f}", of["bottleneck"]])
     head = ["run", "parameters", "steps", "draws per sample", "minutes of steps", "waited for samples", "for reading"]
-    return Table("Training", [*head, "samples there for each used (--ahead)", "bottleneck"], rows)
+    notes = [f"{story.name}: {story.advice.sentence}" for story in contents.stories if story.advice]
+    return Table("Training", [*head, "samples there for each used (--ahead)", "bottleneck"], rows, notes)
 
 
 def _make_worst_table(contents: ReportContents) -> Table:

@@ -18,11 +18,11 @@ from torch import Tensor, nn
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import build, find_kind, predict_image
-from photonfarm.trainer.networks.inputs import SceneFrame, require
+from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs.devices import Ranks, compute_deterministically
 from photonfarm.trainer.runs.settings import Compilation, TrainSettings
-from photonfarm.trainer.training.losses import find_loss
+from photonfarm.trainer.training.losses import RELATIVE_EPSILON, find_loss
 
 
 def build_optimiser(
@@ -187,7 +187,7 @@ class Learner:
         self.rate_factor = 1.0  # times the schedule; not part of the state below
         self.last_step: int | None = None  # at which the data end the run; not part of the state either
         self._sees_halves = find_kind(settings.network.architecture).needs.kept == 1  # and all of their pixels
-        self.excess: Tensor | None = None  # (), of the loss over that of the clean image; None if it sees no halves
+        self.excess: Tensor | None = None  # (), of the loss over that of the clean image, in the mean of the last steps
 
     @property
     def predicting(self) -> Network:
@@ -209,8 +209,7 @@ class Learner:
         batch = batch.to(self._device).for_training()
         image = predict_image(self.network, batch.inputs)
         loss = self._loss(image, batch.target)
-        if self._sees_halves and batch.inputs.noisy is not None:
-            self._note_excess(number, image.detach(), batch, loss.detach())
+        self._note_excess(number, image.detach(), batch)
         torch.autograd.backward(loss)
         mean_loss = self._ranks.average_gradients(list(self.network.parameters()), loss, len(batch.rows))
         self.optimiser.step()
@@ -230,23 +229,33 @@ class Learner:
         return self._ranks.average(loss.reshape(1), len(batch.rows))[0]
 
     @torch.no_grad()
-    def _note_excess(self, number: int, image: Tensor, batch: TrainingBatch, loss: Tensor) -> None:
-        """Add a step to the running mean of the loss less its floor, which no network but by heart gets below.
+    def measure_excess(self, image: Tensor, batch: TrainingBatch) -> Tensor | None:
+        """The loss of images less its floor, (), which no network but by heart gets below; None if half A is not whole.
 
         The clean image's loss is noise alone, mean (B − I)². For halves A and B that is mean (A − B)² / 2, with the
-        loss's own weights; A is the input.
+        loss's own weights; A may be the input. Where both are targets, what is left is mean (f − A)(f − B), whose mean
+        is that of (f − I)²; it has the weights of the linear loss, or of the relative one.
         """
-        noisy = require(batch.inputs.noisy)
-        apart = (noisy.colour[:, None] - batch.target) / math.sqrt(2)
-        excess = loss - self._loss(image, image[:, None] + apart)
-        decay = min(MEMORY, (1 + number) / (10 + number))
-        self.excess = excess if self.excess is None else torch.lerp(excess, self.excess, decay)
+        noisy, target = batch.inputs.noisy, batch.target
+        if noisy is None:
+            brightness = image.mean(dim=-1, keepdim=True)
+            weight = 1 if self._settings.loss == "linear" else 1 / (brightness**2 + RELATIVE_EPSILON)
+            return torch.mean(weight * (image - target[:, 0]) * (image - target[:, 1]))
+        if not self._sees_halves:
+            return None
+        apart = (noisy.colour[:, None] - target[:, -1:]) / math.sqrt(2)
+        return self._loss(image, target[:, -1:]) - self._loss(image, image[:, None] + apart)
 
-    def describe_halves(self, steps_of_each: float) -> dict[str, float]:
-        """Of a network of halves: the rounds over them, and the excess; nothing of others."""
-        if self.excess is None:
-            return {}
-        return {"rounds": round(steps_of_each * self._settings.batch, 2), "excess": float(self.excess)}
+    def _note_excess(self, number: int, image: Tensor, batch: TrainingBatch) -> None:
+        """Add a step to the running mean of the excess."""
+        if (excess := self.measure_excess(image, batch)) is not None:
+            decay = min(MEMORY, (1 + number) / (10 + number))
+            self.excess = excess if self.excess is None else torch.lerp(excess, self.excess, decay)
+
+    def describe_excess(self, steps_of_each: float) -> dict[str, float]:
+        """The excess of the last steps, and of a network of halves the rounds over them."""
+        rounds = {"rounds": round(steps_of_each * self._settings.batch, 2)} if self._sees_halves else {}
+        return {} if self.excess is None else {**rounds, "excess": float(self.excess)}
 
     def begin_with(self, weights: dict[str, Tensor]) -> None:
         """Take weights before the first step."""

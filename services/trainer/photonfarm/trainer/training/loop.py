@@ -23,9 +23,10 @@ from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.predictors.evaluation import make_network_predictor, read_batches
 from photonfarm.trainer.predictors.half_filter import choose_filter, settle_filter
 from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.advice import advise
 from photonfarm.trainer.runs.devices import Ranks, usable_device
 from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used, share_waits
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, lock_run
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, lock_run, read_log
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.runs.user_code import name_in_errors
 from photonfarm.trainer.training.good_state import GoodState, Setback, settle_files
@@ -134,7 +135,9 @@ class Session:
         if reason != "stopped" and self._stream.held_out and self._presence.is_there and not self._missing:
             self._end_no_worse()
         self._save()
-        self._log.write("end", step=self._step, reason=reason, **self._counts())
+        advice = advise(read_log(self._run / METRICS))
+        said = None if advice is None else advice.sentence
+        self._log.write("end", step=self._step, reason=reason, advice=said, **self._counts())
         return TrainingOutcome(self._step, reason, self._last_error)
 
     def _begin(self) -> None:
@@ -291,7 +294,10 @@ class Session:
             self._stream.drop()
             held_out_batches = read_batches(self._feed, rows, self._settings.batch)
             predict, loss = make_network_predictor(self._learner.predicting.eval()), self._settings.loss
-            now = validate(predict, self._step, held_out_batches, self._hooks.on_images, loss=loss)
+            measure = self._learner.measure_excess
+            now = validate(
+                predict, self._step, held_out_batches, self._hooks.on_images, loss=loss, measure_excess=measure
+            )
             self._learner.network.train()
             self._stream.ask_again()
         self._validated = self._step
@@ -315,7 +321,8 @@ class Session:
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
             waits=share_waits(seconds := self._watch.seconds, self._seconds_logged),
-            **self._learner.describe_halves(self._step / max(len(self._stream.training_rows), 1)),
+            excess_held_out=now.excess,
+            **self._learner.describe_excess(self._step / max(len(self._stream.training_rows), 1)),
             **self._counts(),
         )
         self._seconds_logged = seconds

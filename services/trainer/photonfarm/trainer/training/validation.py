@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
@@ -42,6 +43,7 @@ class Validation:
     rows: tuple[int, ...]  # (n,) the measured rows, in the order of `held_out.per_sample`
     held_out: HeldOutErrors
     judge: str = ALL_LIGHT  # which error is compared
+    excess: float | None = None  # of the loss over that of the clean images
 
     @property
     def errors(self) -> dict[int, float]:
@@ -66,9 +68,17 @@ class Validation:
 
 
 def validate(
-    predict: Predictor, step: int, samples: Iterator[TrainingBatch], show: Show | None = None, *, loss: str = "linear"
+    predict: Predictor,
+    step: int,
+    samples: Iterator[TrainingBatch],
+    show: Show | None = None,
+    *,
+    loss: str = "linear",
+    measure_excess: Callable[[Tensor, TrainingBatch], Tensor | None] = lambda *_: None,
 ) -> Validation:
     """Measure a network over held-out samples; `show` gets targets and predictions of the first `SHOWN` or more.
+
+    `measure_excess` is a learner's.
 
     The linear loss weights all light alike. A network with another loss is compared by the error of light up to white:
     that loss gives less weight to lamps in view, which make up most of the error of all light.
@@ -77,6 +87,7 @@ def validate(
     """
     rows: list[int] = []
     shown: list[tuple[tuple[int, ...], F32, F32]] = []
+    excesses: list[float] = []  # of each batch, times its samples
 
     def noted() -> Iterator[TrainingBatch]:
         for batch in samples:
@@ -85,6 +96,8 @@ def validate(
 
     def predict_and_keep(batch: TrainingBatch) -> F32:
         images = predict(batch)
+        excess = measure_excess(torch.from_numpy(images).to(batch.target.device), batch)
+        excesses.extend([] if excess is None else [float(excess) * len(batch.rows)])
         if show is not None and len(shown) * len(batch.rows) < SHOWN:
             shown.append((batch.rows, batch.target.mean(dim=1).cpu().numpy(), images.copy()))
         return images
@@ -94,7 +107,8 @@ def validate(
     if show is not None:
         targets, predictions = (np.concatenate(each) for each in list(zip(*shown, strict=True))[1:])
         show(step, tuple(row for each, *_ in shown for row in each), targets, predictions)
-    return Validation(step, tuple(rows), held_out, ALL_LIGHT if loss == "linear" else UP_TO_WHITE)
+    judge = ALL_LIGHT if loss == "linear" else UP_TO_WHITE
+    return Validation(step, tuple(rows), held_out, judge, sum(excesses) / len(rows) if excesses else None)
 
 
 @dataclass(frozen=True, slots=True)

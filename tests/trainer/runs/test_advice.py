@@ -1,11 +1,20 @@
 """What curves of known shapes say is worth its seconds."""
 
 import itertools
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
+from read_batches import batch_of
 
+from photonfarm.trainer.networks.inputs import Needs, SceneFrame
 from photonfarm.trainer.runs.advice import advise
+from photonfarm.trainer.runs.devices import Ranks
+from photonfarm.trainer.runs.run_folder import METRICS, read_log
+from photonfarm.trainer.training.learner import Learner
+from photonfarm.trainer.training.loop import train
 
 
 def curve(slope: float, training: float, *, noise: float = 0.0, steps: int = 4000) -> list[dict[str, Any]]:
@@ -60,3 +69,31 @@ def test_nothing_is_said_of_runs_that_are_too_short_or_were_not_measured() -> No
     assert advise([{**each, "excess_held_out": -1e-4} for each in curve(-1, 1)]) is None
     assert advise([{"kind": "validation", "step": step} for step in range(9)]) is None
     assert advise([{**each, "excess_held_out": None} for each in curve(-1, 1)]) is None
+
+
+@pytest.mark.parametrize("loss", ["linear", "relative"])
+def test_the_excess_of_an_image_is_its_error_whatever_the_noise_and_below_0_by_heart(
+    make_source: Any, tiny: Any, loss: str
+) -> None:
+    source, settings = make_source(24, noise=0.5), tiny(loss=loss)
+    learner = Learner(SceneFrame.of(source.spec, *source.base(), settings.network), settings, Ranks())
+    batch = batch_of(source, range(24), Needs())
+    clean = torch.from_numpy(np.stack([source.clean(row) for row in range(24)]))
+    off, halves = 1.5 * clean, batch.target.mean(dim=1)
+    weight = 1 / (off.mean(dim=-1, keepdim=True) ** 2 + 0.05) if loss == "relative" else 1
+    error = float((weight * (off - clean) ** 2).mean())
+    assert float(learner.measure_excess(off, batch)) == pytest.approx(error, rel=0.1)
+    assert abs(float(learner.measure_excess(clean, batch))) < 0.1 * error
+    assert float(learner.measure_excess(halves, batch)) < -0.4 * error
+
+
+def test_a_run_logs_both_errors_and_says_at_its_end_what_is_worth_its_seconds(
+    make_source: Any, tiny: Any, run: Path
+) -> None:
+    train(make_source(24), tiny(max_steps=12, validate_every=2), run)
+    records = read_log(run / METRICS)
+    validations = [each for each in records if each["kind"] == "validation"]
+    assert all(np.isfinite(each["excess_held_out"]) for each in validations)
+    assert ["excess" in each for each in validations] == [False, *[True] * (len(validations) - 1)]
+    advice = advise(records)
+    assert records[-1]["advice"] == (advice and advice.sentence)

@@ -83,14 +83,14 @@ def _draw(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
         FigureCanvasSVG(figure)
         axes = figure.add_subplot()
         draw(axes)
-        _set_plain_ticks(axes)
+        set_plain_ticks(axes)
         figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=2)
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})
     return Plot(name, about, stream.getvalue())
 
 
-def _set_plain_ticks(axes: Axes) -> None:
+def set_plain_ticks(axes: Axes) -> None:
     """Write round numbers in full on logarithmic axes of a range so small that few powers of ten lie in it."""
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 

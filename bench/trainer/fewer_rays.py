@@ -27,7 +27,6 @@ import torch
 from bench.harness import results
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.plan.hold_out import units_of
-from photonfarm.plan.request import Request
 from photonfarm.predict.opened_run import OpenRun
 from photonfarm.renderer.jobs.render import ShardRenderer, locate
 from photonfarm.renderer.scene import backend
@@ -120,12 +119,11 @@ class Candidate:
 
 def trained_with(store: str, run: TrainedRun, rays: int) -> TrainedRun:
     """A run of the same settings on the same samples, whose inputs have so many rays."""
-    source = run.source(store)
-    (request,) = [Request.model_validate(plan) for plan in source.plan_requests if plan["kind"] == "samples"][:1]
+    stored = Store(store).scene(run.scene_id)
     with through_a_pixel(rays, stored=True):
-        spec = specs.SceneSpec.model_validate(source.spec.model_dump(mode="json"))
+        spec = specs.SceneSpec.model_validate(stored.spec.model_dump(mode="json"))
         opened = Store(store)
-        scene = opened.scene(opened.plan(locate(spec), request).scene_id)
+        scene = opened.scene(opened.plan(locate(spec), stored.plans()[0].request).scene_id)
         renderer = ShardRenderer(opened, worker="bench")
         for job in range(scene.jobs()):
             renderer.render(scene.scene_id, job)

@@ -40,7 +40,7 @@ WINDOWS = (5, 13)
 HALF_CHANNELS = 3 + 3 * (1 + len(WINDOWS)) + 1
 """The half, its light of each pixel and in `WINDOWS`, and its noise."""
 
-SHARES = (-3.0, 0.0, 0.0)
+SHARES = (-3.0, 0.0, 1.0)
 """The logits of what is filtered before anything is learned: finely, coarsely, by a denoiser."""
 
 SETTLED = 0.04
@@ -169,7 +169,7 @@ def filter_light(light: Tensor, reflects: Tensor, variance: Tensor, normal: Tens
             for right in (-1, 0, 1):
                 rows, columns = step * (1 + down), step * (1 + right)
                 there = around[:, rows : rows + height, columns : columns + width]
-                apart = 12 * (there[..., 6:9] - normal).square().sum(-1, keepdim=True)
+                apart = 4 * (there[..., 6:9] - normal).square().sum(-1, keepdim=True)
                 apart += (normal * (there[..., 9:12] - places)).sum(-1, keepdim=True).abs() / (0.01 * step)
                 apart += (there[..., 5:6] - bright).abs() / allowed
                 counts = 0.25 * 0.5 ** (abs(down) + abs(right)) * torch.exp(-apart)

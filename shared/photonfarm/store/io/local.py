@@ -13,12 +13,13 @@ import os
 import shutil
 import time
 from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from photonfarm.core.errors import StoreError
 from photonfarm.core.processes import is_gone, process_space
-from photonfarm.store.io.storage import FOREIGN_AGE_S, STRAY_AGE_S, TMP
+from photonfarm.store.io.storage import AT_ONCE, FOREIGN_AGE_S, STRAY_AGE_S, TMP
 
 if TYPE_CHECKING:
     from zarr.storage import LocalStore
@@ -153,8 +154,8 @@ class LocalStorage:
 
     def settle(self, names: Iterable[str]) -> None:
         """Sync the folders that the names are in."""
-        for folder in sorted({(self.root / name).parent for name in names}):
-            sync(folder)
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            list(pool.map(sync, {(self.root / name).parent for name in names}))
 
     def _make_folder(self, folder: Path) -> None:
         """Make a missing folder durably, with its parents; never the root of a store that is gone."""

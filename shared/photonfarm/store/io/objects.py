@@ -35,7 +35,7 @@ from zarr.storage import ObjectStore
 from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.store.io.object_cache import ObjectCache
 from photonfarm.store.io.object_requests import connect, os_errors, patiently
-from photonfarm.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, discard
+from photonfarm.store.io.storage import AT_ONCE, FORMAT_FILE, STRAY_AGE_S, TMP, discard
 
 if TYPE_CHECKING:
     from obstore import ObjectMeta, PutMode, UpdateVersion
@@ -48,9 +48,6 @@ TIMEOUT_S = 30.0
 
 TRANSFER_TIMEOUT_S = 300.0
 """The time limit of a larger request: enough for a shard of 256 MB at 1 MB/s."""
-
-PUTS_AT_ONCE = 8
-"""The number of puts under way at once for a folder's files, which are many and small; each put waits for an answer."""
 
 TRANSFER_TIMES = 2
 """The attempts at a larger request."""
@@ -202,7 +199,7 @@ class ObjectStorage:
                 names = claim.namelist()
                 if names[-1:] != [ROOT] or any(".." in PurePosixPath(name).parts for name in names):
                     raise CorruptError(f"{self._url}/{claim_of(folder)}: is not a claim")
-                with ThreadPoolExecutor(PUTS_AT_ONCE) as pool:
+                with ThreadPoolExecutor(AT_ONCE) as pool:
                     list(pool.map(lambda name: self._put(claim.read(name), f"{folder}/{name}"), names[:-1]))
                 self._put(claim.read(ROOT), f"{folder}/{ROOT}")
         except zipfile.BadZipFile as error:

@@ -30,6 +30,9 @@ STRAY_AGE_S = 60.0
 FOREIGN_AGE_S = 86400.0
 """The age at which parts from other machines are removed; their processes cannot be checked."""
 
+AT_ONCE = 8
+"""The files that are made durable, or are put, at once: each alone waits for the disk or the bucket."""
+
 
 class Storage(Protocol):
     """Files by name. Any method may raise OSError; none leaves half a file under a name."""

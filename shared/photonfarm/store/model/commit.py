@@ -11,6 +11,7 @@ import queue
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping, Set
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -32,7 +33,7 @@ from photonfarm.store.format.shards import (
     scale_to_array,
     stays_finite,
 )
-from photonfarm.store.io.storage import discard, look_into
+from photonfarm.store.io.storage import AT_ONCE, discard, look_into
 from photonfarm.store.model.findings import Cause, Finding
 from photonfarm.store.model.plans import JobRows
 from photonfarm.store.model.quarantine import Quarantine
@@ -219,7 +220,8 @@ class JobWriter:
         """Give every row of the job its name; returns whether all files are new ones, None if the job is committed."""
         self._storage.require()  # a store that is gone has lost the parts too, which would look like a failed adoption
         left = [name for name, shard in self._shards.items() if shard.part.exists()]
-        kept = [name for name in left if not self._adopt(name)]
+        with ThreadPoolExecutor(AT_ONCE) as pool:
+            kept = [name for name, adopted in zip(left, pool.map(self._adopt, left), strict=True) if not adopted]
         others = [name for name in self._arrays if name not in self._shards and self._storage.exists(self._file(name))]
         if not kept and not others and len(left) == len(self._shards):
             return True

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from threading import Barrier
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,8 @@ from photonfarm.plan.request import Request
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.check.check import check_store
 from photonfarm.store.format import markers
+from photonfarm.store.io import local
+from photonfarm.store.model.commit import JobWriter
 
 
 @pytest.fixture
@@ -111,7 +114,7 @@ def test_a_late_writer_that_has_a_file_more_takes_nothing_back(
     """Its render overflows float16 in one row, and the other's does not; it has looked before that was committed."""
     ours, theirs = samples.outputs(scene, 1), samples.outputs(scene, 1)
     ours.radiance[5][0, 0, 0, 0] = 1e9
-    before(monkeypatch, scene.storage, "adopt", lambda: samples.commit(another, 1, theirs))
+    before(monkeypatch, JobWriter, "_adopt_all", lambda: samples.commit(another, 1, theirs))
     assert not samples.commit(scene, 1, ours)
     assert not (scene.storage.root / "quarantine").exists()
     whole(scene)
@@ -126,8 +129,26 @@ def test_a_late_writer_whose_file_would_be_read_first_announces_it(
     ours, theirs = samples.outputs(scene, 1), samples.outputs(scene, 1)
     for halves in theirs.radiance.values():
         halves[0, 0, 0, 0] = 1e9
-    before(monkeypatch, scene.storage, "adopt", lambda: samples.commit(another, 1, theirs))
+    before(monkeypatch, JobWriter, "_adopt_all", lambda: samples.commit(another, 1, theirs))
     assert samples.commit(scene, 1, ours)
     assert {Path(name).parent.name for name in scene.marker(1)["files"]} >= {"radiance", "radiance_wide"}
     for row, halves in ours.radiance.items():
         np.testing.assert_array_equal(values_of(scene)[row], halves)
+
+
+def test_files_of_a_job_are_made_durable_together(
+    scene: SceneStore, another: SceneStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each waits for the disk: so two are under way at once, or the barrier breaks."""
+    both, first, sync = Barrier(2), iter(range(2)), local.sync
+    met: list[int] = []
+
+    def meet(path: Path, **how: bool) -> None:
+        if how and next(first, None) is not None:
+            met.append(both.wait(10))
+        sync(path, **how)
+
+    monkeypatch.setattr(local, "sync", meet)
+    assert samples.commit(another, 1, samples.outputs(scene, 1))
+    assert sorted(met) == [0, 1]
+    whole(scene)

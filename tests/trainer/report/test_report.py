@@ -182,7 +182,7 @@ def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_th
     monkeypatch.setattr(module, "FEW", 1)
     draw_plots(replace(compared, entries=entries))
     colours = {name: of_axes(axes) for name, axes in drawn.items()}
-    assert list(colours["time-mse"]) == ["light_transport", "denoise_4", "fill-in 1/4"]
+    assert list(colours["time-mse"]) == ["light_transport", "denoise_4", "fill-in"]
     assert len(set(colours["time-mse"].values())) == 3
     assert all(found.items() <= colours["time-mse"].items() for found in colours.values())
     assert set(colours["curve-samples"]) == {"light_transport", "denoise_4"}

@@ -169,9 +169,10 @@ Plotted = tuple[ReportEntry, str]
 
 def _draw_over_time(contents: ReportContents) -> Iterator[Plot]:
     for name, title in TITLES.items():
+        colours = dict(zip(dict.fromkeys(map(_name_series, contents.entries)), cycle(COLOURS), strict=False))
         plotted = [
-            (entry, colour)
-            for entry, colour in zip(contents.entries, cycle(COLOURS), strict=False)
+            (entry, colours[_name_series(entry)])
+            for entry in contents.entries
             if entry.time is not None and name in entry.estimates
         ]
         if len(plotted) > 1:
@@ -185,6 +186,11 @@ def _name_group(entry: ReportEntry) -> str:
     return ready if entry.architecture is None else trained
 
 
+def _name_series(entry: ReportEntry) -> str:
+    """The name of what has one colour: a ready denoiser, however much it is given, or another predictor."""
+    return entry.name if entry.architecture else entry.name.split(" ")[0]
+
+
 def _place(entry: ReportEntry, metric: str) -> tuple[float, float]:
     """The time of a frame in milliseconds, and the metric."""
     return 1e3 * entry.time.total if entry.time else 0.0, entry.estimates[metric].mean
@@ -193,18 +199,23 @@ def _place(entry: ReportEntry, metric: str) -> tuple[float, float]:
 def _scatter(metric: str, plotted: Sequence[Plotted], axes: Axes) -> None:
     for name, (marker, line) in GROUPS.items():
         members = sorted((each for each in plotted if _name_group(each[0]) == name), key=lambda e: _place(e[0], metric))
-        places = [_place(entry, metric) for entry, _ in members]
-        axes.plot([x for x, _ in places], [y for _, y in places], linestyle=line, color="#999999", linewidth=1)
+        joined = dict.fromkeys(_name_series(entry) if entry.architecture is None else "" for entry, _ in members)
+        for series in joined:
+            of_series = (entry for entry, _ in members if series in ("", _name_series(entry)))
+            x, y = zip(*(_place(entry, metric) for entry in of_series), strict=True)
+            axes.plot(x, y, linestyle=line, color="#999999", linewidth=1)
+        named: set[str] = set()
         for entry, colour in members:
             interval = confidence_interval(entry.estimates[metric])
             reach = entry.estimates[metric].mean - interval[0] if interval else 0.0
             look: dict[str, Any] = {
                 "fmt": marker,
                 "color": colour,
-                "label": entry.name,
+                "label": None if _name_series(entry) in named else _name_series(entry),
                 "markersize": 5,
                 "elinewidth": 0.8,
             }
+            named.add(_name_series(entry))
             axes.errorbar(*_place(entry, metric), reach, **look)
     axes.set_xscale("log")
     least = min(_place(entry, metric)[1] for entry, _ in plotted)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -36,10 +36,15 @@ def hand_of(spec: SceneSpec) -> float:
     return HAND * math.dist(low, high)
 
 
-def are_near(spec: SceneSpec, depth: NDArray[Any]) -> NDArray[Any]:
+Depths = TypeVar("Depths")
+"""An array of numpy's or of torch's."""
+
+
+def are_near(hand: float, depth: Depths) -> Depths:
     """Whether views with these depths (…, H, W) show surfaces within a hand in half of the image or more, (…)."""
-    share: NDArray[Any] = ((depth > 0) & (depth < hand_of(spec))).mean(axis=(-2, -1)) >= 0.5
-    return share
+    values: Any = depth
+    near: Depths = 2 * ((values > 0) & (values < hand)).sum((-2, -1)) >= values.shape[-2] * values.shape[-1]
+    return near
 
 
 def is_unlit(

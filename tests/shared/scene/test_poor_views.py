@@ -26,7 +26,7 @@ def test_a_view_is_near_if_half_of_it_is_within_a_hand(depth: float, near_share:
     buffer = np.full((8, 8), depth, np.float16)
     buffer.ravel()[: round(64 * near_share)] = 0.9 * HAND
     assert hand_of(samples.small_spec()) == pytest.approx(HAND)
-    assert are_near(samples.small_spec(), np.stack([buffer, buffer])).tolist() == [is_near] * 2
+    assert are_near(HAND, np.stack([buffer, buffer])).tolist() == [is_near] * 2
 
 
 def photon(*, above: bool) -> Photons:

@@ -97,3 +97,23 @@ def test_a_run_logs_both_errors_and_says_at_its_end_what_is_worth_its_seconds(
     assert ["excess" in each for each in validations] == [False, *[True] * (len(validations) - 1)]
     advice = advise(records)
     assert records[-1]["advice"] == (advice and advice.sentence)
+
+
+def test_views_that_are_black_or_near_are_counted_with_the_squared_gradient_of_their_steps(
+    make_source: Any, tiny: Any
+) -> None:
+    source, settings = make_source(6), tiny()
+    learner = Learner(SceneFrame.of(source.spec, *source.base(), settings.network), settings, Ranks())
+    usual, black, near = (batch_of(source, rows, Needs()) for rows in (range(2), range(2, 4), range(4, 6)))
+    learner.step(0, usual)
+    assert learner.take_poor() == {}
+    black.target[0] = 0
+    learner.step(1, black)
+    assert learner.take_poor() == {"samples": 0.5, "gradient": 1.0}
+    near.inputs.depth[:, :8] = 1e-3
+    learner.step(2, near)
+    learner.step(3, usual)
+    shares = learner.take_poor()
+    assert shares["samples"] == 0.5
+    assert 0 < shares["gradient"] < 1
+    assert learner.take_poor() == {}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError
 from photonfarm.core.keys import seed_of
-from photonfarm.scene.poor_views import are_near
+from photonfarm.scene.poor_views import are_near, hand_of
 from photonfarm.store.check.content_check import (
     CheckTotals,
     HalvesTest,
@@ -191,7 +191,7 @@ class _JobCheck:
         if "depth" in values and "normal" in values:
             view = None if rows is None else rows.views.get(row)
             yield from check_view(values["depth"], values["normal"], view, self._scene.spec)
-            self._totals.counts.update(views=1, near=int(are_near(self._scene.spec, values["depth"])))
+            self._totals.counts.update(views=1, near=int(are_near(hand_of(self._scene.spec), values["depth"])))
         for name in ("point_seen", "photon_seen"):
             if name in values:
                 yield from check_bits(name, values[name], self._scene.spec)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, IncompleteError, store_errors
 from photonfarm.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.scene.poor_views import are_near
+from photonfarm.scene.poor_views import are_near, hand_of
 from photonfarm.store.format import markers, schema
 from photonfarm.store.format.markers import Figures
 from photonfarm.store.format.shards import (
@@ -112,7 +112,7 @@ class JobWriter:
             self._put(row, name, values)
         for name, values in arrays_of(guides).items():
             self._put(row, name, round_to_8_bits(values) if name in NOISY_GUIDES else values)
-        self._counts.update(views=1, near=int(are_near(self._scene.spec, buffers.depth)))
+        self._counts.update(views=1, near=int(are_near(hand_of(self._scene.spec), buffers.depth)))
         self._put_bits(row, "point_seen", visibility.points)
         self._put_bits(row, "photon_seen", visibility.photons)
 

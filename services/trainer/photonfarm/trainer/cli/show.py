@@ -37,7 +37,7 @@ def print_record(of: dict[str, Any]) -> None:
     if of["kind"] == "end" and of["advice"]:
         click.echo(of["advice"], err=True)
     if of["kind"] == "validation":
-        there = f"on {of['held_out']} of {of['samples']} samples; {_format_rounds(of)}"
+        there = f"on {of['held_out']} of {of['samples']} samples; {_format_rounds(of)}{_format_poor(of['poor'])}"
         click.echo(
             f"step {of['step']}: held-out error {format_estimate(of['error'], of['standard_error'])} "
             f"({format_estimate(of['shown_error'], None)} up to white) {there}"
@@ -52,6 +52,13 @@ def _format_rounds(of: dict[str, Any]) -> str:
         return ""
     heart = " and learns their noise by heart, as its loss is below that of clean images" if of["excess"] < 0 else ""
     return f"has seen each half in {of['rounds']:.1f} rounds{heart}; "
+
+
+def _format_poor(shares: dict[str, float]) -> str:
+    """How much of the training views take that are black or near; "" if there are none."""
+    if not shares:
+        return ""
+    return f"black or near views: {shares['samples']:.2g} of samples, {shares['gradient']:.2g} of squared gradient; "
 
 
 def print_dry_run(estimate: DryRun, as_json: bool) -> None:

@@ -20,7 +20,7 @@ from photonfarm.core.records import F32
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import SceneDataset
 from photonfarm.plan.hold_out import are_held_out, enough, units_of
-from photonfarm.scene.poor_views import are_near, is_unlit
+from photonfarm.scene.poor_views import are_near, hand_of, is_unlit
 from photonfarm.store import SceneReader
 from photonfarm.store.read.batch import Batch
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, allocate_memory, choose_kept_pixels
@@ -178,7 +178,7 @@ class Feed:
         if kinds and row not in self._skipped:
             (sample,) = self._source.read_samples([row], Batch.empty(self.spec, 1, guides=True))
             lit_by = sample.images, sample.view.origin, sample.seen_photons, lambda: sample.photons
-            is_near = "near" in kinds and bool(are_near(self.spec, sample.images["depth"]))
+            is_near = "near" in kinds and bool(are_near(hand_of(self.spec), sample.images["depth"]))
             self._skipped[row] = is_near or ("unlit" in kinds and is_unlit(*lit_by))
         return bool(kinds) and self._skipped[row]
 

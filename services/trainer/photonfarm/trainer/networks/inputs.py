@@ -17,6 +17,7 @@ from torch import Tensor
 
 from photonfarm.core.records import F32, BasePointCloud, Geometry
 from photonfarm.data.torch_dataset import GUIDES, IMAGES, PHOTONS, POINTS
+from photonfarm.scene.poor_views import hand_of
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks.projection import Optics
 from photonfarm.trainer.runs.devices import is_asynchronous
@@ -46,6 +47,7 @@ class SceneFrame:
     exposure: float  # the spec's factor on radiance
     max_depth: int  # edges of a path of the images; −1: no limit
     area: float  # of all surfaces, scene units²
+    hand: float = 0.0  # within which a view is near (`poor_views.hand_of`), scene units
 
     @classmethod
     def of(cls, spec: SceneSpec, geometry: Geometry, cloud: BasePointCloud, settings: NetworkSettings) -> SceneFrame:
@@ -67,6 +69,7 @@ class SceneFrame:
             exposure=spec.exposure,
             max_depth=spec.transport.max_depth,
             area=float(geometry.areas().sum()),
+            hand=hand_of(spec),
         )
 
 

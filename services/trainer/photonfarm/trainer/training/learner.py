@@ -16,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.scene.poor_views import are_near
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import build, find_kind, predict_image
 from photonfarm.trainer.networks.inputs import SceneFrame
@@ -187,6 +188,7 @@ class Learner:
         self.rate_factor = 1.0  # times the schedule; not part of the state below
         self.last_step: int | None = None  # at which the data end the run; not part of the state either
         self._sees_halves = find_kind(settings.network.architecture).needs.kept == 1  # and all of their pixels
+        self._poor: Tensor | None = None  # (4,) poor samples, all, squared gradient of steps with such, of all
         self.excess: Tensor | None = None  # (), of the loss over that of the clean image, in the mean of the last steps
 
     @property
@@ -212,6 +214,7 @@ class Learner:
         self._note_excess(number, image.detach(), batch)
         torch.autograd.backward(loss)
         mean_loss = self._ranks.average_gradients(list(self.network.parameters()), loss, len(batch.rows))
+        self._note_gradient(batch)
         self.optimiser.step()
         if self.average is not None:
             self.average.take(self.network)
@@ -251,6 +254,22 @@ class Learner:
         if (excess := self.measure_excess(image, batch)) is not None:
             decay = min(MEMORY, (1 + number) / (10 + number))
             self.excess = excess if self.excess is None else torch.lerp(excess, self.excess, decay)
+
+    @torch.no_grad()
+    def _note_gradient(self, batch: TrainingBatch) -> None:
+        """Count the samples that are black or near, and the squared gradient of the steps that have one."""
+        depth, target = batch.inputs.depth, batch.target
+        poor = are_near(self._frame.hand, depth) | (target == 0).all(-1).all(-1).all(-1).all(-1)
+        gradients = [weight.grad for weight in self.network.parameters() if weight.grad is not None]
+        squared = torch.stack(torch._foreach_norm(gradients)).square().sum()
+        counts = torch.stack([poor.float().sum(), torch.ones_like(squared) * len(poor), squared * poor.any(), squared])
+        self._poor = counts if self._poor is None else self._poor + counts
+
+    def take_poor(self) -> dict[str, float]:
+        """The shares of black or near views among samples, and in the squared gradient, since the last call."""
+        poor, samples, of_poor, squared = [0.0, 1, 0, 1] if self._poor is None else self._poor.tolist()
+        self._poor = None
+        return {"samples": poor / samples, "gradient": of_poor / squared} if poor and squared else {}
 
     def describe_excess(self, steps_of_each: float) -> dict[str, float]:
         """The excess of the last steps, and of a network of halves the rounds over them."""

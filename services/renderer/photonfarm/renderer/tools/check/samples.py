@@ -26,7 +26,7 @@ from photonfarm.renderer.scene.surroundings import LEAVING, NONE
 from photonfarm.renderer.scene.view_rays import ViewCameras
 from photonfarm.renderer.tools.measure import exposure
 from photonfarm.scene.modification import Modification, rebuild, sample_modification
-from photonfarm.scene.poor_views import are_near
+from photonfarm.scene.poor_views import are_near, hand_of
 from photonfarm.scene.spec import Film, SceneSpec
 from photonfarm.scene.view import View, sample_view
 
@@ -117,7 +117,7 @@ def _images(scene: LoadedScene, views: Sequence[View]) -> tuple[F32, F32, NDArra
     dark = hit & ~lit
     dr.eval(hit, dark, depth)
     shares = [np.array(mask).reshape(len(views), -1).mean(axis=1, dtype=np.float32) for mask in (hit, dark)]
-    near = are_near(scene.spec, np.array(depth).reshape(len(views), RAYS_ALONG, RAYS_ALONG))
+    near = are_near(hand_of(scene.spec), np.array(depth).reshape(len(views), RAYS_ALONG, RAYS_ALONG))
     return shares[0], shares[1], near
 
 

@@ -56,8 +56,19 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     settings = tiny(max_steps=40, replay_ratio=1.0, replay_buffer=0)
     outcome = train(SceneReader(store, scene.scene_id), settings, run, Hooks(on_draws=lambda *_: begun.set()))
     worker.join()
-    figures = write_report(store, [run], tmp_path / "out", timed=False)
+    told: dict[str, int] = {}
+    figures = write_report(
+        store, [run], tmp_path / "out", timed=False, on_progress=lambda what, done, _: told.update({what: done})
+    )
 
+    held_out = figures["evaluation"]["samples"]
+    assert told == {
+        "networks are loaded and timed": 0,
+        "the mean colour of the training samples": 40 - 2 * held_out,
+        TrainedRun.load(run).name: held_out,
+        "the worst cases are looked for": 0,
+        "plots and pages are drawn": 0,
+    }
     assert json.loads((tmp_path / "out/report.json").read_text()) == figures
     dataset, (of_run,) = figures["dataset"], figures["runs"]
     assert dataset["samples_complete"] == dataset["samples_planned"] == 40

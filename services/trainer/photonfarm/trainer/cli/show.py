@@ -58,7 +58,8 @@ def _format_poor(shares: dict[str, float]) -> str:
     """How much of the training views take that are black or near; "" if there are none."""
     if not shares:
         return ""
-    return f"black or near views: {shares['samples']:.2g} of samples, {shares['gradient']:.2g} of squared gradient; "
+    samples, gradient = (f"{100 * shares[name]:.2g}%" for name in ("samples", "gradient"))
+    return f"black or near views: {samples} of samples, {gradient} of squared gradient; "
 
 
 def print_dry_run(estimate: DryRun, as_json: bool) -> None:

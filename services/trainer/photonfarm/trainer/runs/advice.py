@@ -37,19 +37,19 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
     """Advice by the records of a run's log; None for fewer than three validations with an error above 0.
 
     Twice the steps multiply the held-out error by 2^slope, if it goes on as a power of the steps as since half of
-    them. Twice the images halve its excess over the training error, which falls as 1 / images. With `images_s`, the
-    core-seconds that the present images took, what takes off more in a second wins; without it, what takes off more.
+    them. Twice the images halve its excess over the training error, which falls as 1 / images; what may be chance, two
+    standard errors of a few held-out views, does not count. With `images_s`, the core-seconds that the present images
+    took, what takes off more in a second wins; without it, what takes off more.
     """
     measured = [each for each in records if each["kind"] == "validation" and "excess" in each]
-    curve = [each for each in measured if (each["excess_held_out"] or 0) > 0]
+    curve = [each for each in measured if each["excess_held_out"] and each["excess_held_out"][0] > 0]
     late = [each for each in curve if 2 * each["step"] >= curve[-1]["step"] > 0]
     if len(late) < LEAST_POINTS:
         return None
-    held_out, training = (float(late[-1][name]) for name in ("excess_held_out", "excess"))
-    steps_s = float(late[-1]["seconds"]["train"])
-    of_steps = 1 - 2 ** _fit_slope([(each["step"], each["excess_held_out"]) for each in late])
-    of_images = (1 - max(training, 0) / held_out) / 2
-    gains = {"more steps": (of_steps, steps_s), "more images": (of_images, images_s)}
+    (held_out, deviation), training = late[-1]["excess_held_out"], late[-1]["excess"]
+    of_steps = 1 - 2 ** _fit_slope([(each["step"], each["excess_held_out"][0]) for each in late])
+    of_images = (held_out - 2 * (deviation or 0) - max(training, 0)) / held_out / 2
+    gains = {"more steps": (of_steps, late[-1]["seconds"]["train"]), "more images": (of_images, images_s)}
     said = "; ".join(
         f"twice the {name.removeprefix('more ')}{'' if cost is None else f' ({format_span(cost)} more)'} should take "
         f"{max(gain, 0):.0%} off the held-out error"

@@ -321,7 +321,7 @@ class Session:
             noise_floor=held_out.floor,
             held_out=len(held_out.per_sample),
             waits=share_waits(seconds := self._watch.seconds, self._seconds_logged),
-            excess_held_out=now.excess,
+            excess_held_out=now.excess and [now.excess.mean, now.excess.standard_error],
             poor=self._learner.take_poor(),
             **self._learner.describe_excess(self._step / max(len(self._stream.training_rows), 1)),
             **self._counts(),

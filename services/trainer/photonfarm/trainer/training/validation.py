@@ -43,7 +43,7 @@ class Validation:
     rows: tuple[int, ...]  # (n,) the measured rows, in the order of `held_out.per_sample`
     held_out: HeldOutErrors
     judge: str = ALL_LIGHT  # which error is compared
-    excess: float | None = None  # of the loss over that of the clean images
+    excess: Estimate | None = None  # of the loss over that of the clean images, over batches
 
     @property
     def errors(self) -> dict[int, float]:
@@ -87,7 +87,7 @@ def validate(
     """
     rows: list[int] = []
     shown: list[tuple[tuple[int, ...], F32, F32]] = []
-    excesses: list[float] = []  # of each batch, times its samples
+    excesses: list[float] = []  # of each batch
 
     def noted() -> Iterator[TrainingBatch]:
         for batch in samples:
@@ -97,7 +97,7 @@ def validate(
     def predict_and_keep(batch: TrainingBatch) -> F32:
         images = predict(batch)
         excess = measure_excess(torch.from_numpy(images).to(batch.target.device), batch)
-        excesses.extend([] if excess is None else [float(excess) * len(batch.rows)])
+        excesses.extend([] if excess is None else [float(excess)])
         if show is not None and len(shown) * len(batch.rows) < SHOWN:
             shown.append((batch.rows, batch.target.mean(dim=1).cpu().numpy(), images.copy()))
         return images
@@ -108,7 +108,7 @@ def validate(
         targets, predictions = (np.concatenate(each) for each in list(zip(*shown, strict=True))[1:])
         show(step, tuple(row for each, *_ in shown for row in each), targets, predictions)
     judge = ALL_LIGHT if loss == "linear" else UP_TO_WHITE
-    return Validation(step, tuple(rows), held_out, judge, sum(excesses) / len(rows) if excesses else None)
+    return Validation(step, tuple(rows), held_out, judge, Estimate.of(np.array(excesses)) if excesses else None)
 
 
 @dataclass(frozen=True, slots=True)

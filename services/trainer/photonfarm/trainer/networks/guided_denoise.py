@@ -43,7 +43,7 @@ HALF_CHANNELS = 3 + 3 * (1 + len(WINDOWS)) + 1
 SHARES = (-3.0, 0.0, 1.0)
 """The logits of what is filtered before anything is learned: finely, coarsely, by a denoiser."""
 
-SETTLED = 0.04
+SETTLED = 0.2
 """The noise s at which half of what the network adds is left."""
 
 DARK = 0.1

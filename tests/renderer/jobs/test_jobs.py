@@ -10,11 +10,12 @@ import pytest
 
 from photonfarm.core.errors import IncompleteError, QueueError, SceneNotHereError
 from photonfarm.core.keys import seed_of
-from photonfarm.core.records import Visibility
+from photonfarm.core.records import Visibility, arrays_of
 from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs import estimates
 from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import sample_view
@@ -165,11 +166,27 @@ def test_samples_rendered_together_are_stored_as_if_each_had_been_rendered_alone
 
         assert ShardRenderer(where, worker="test", load=load).render(scene.scene_id, 0)
         reader = SceneReader(where.root, scene.scene_id)
-        seen.append([reader.read(row) for row in reader.refresh().tolist()])
+        seen.append([reader.read(row, guides=True) for row in reader.refresh().tolist()])
     assert len(seen[0]) == len(seen[1]) == 8
     for alone, with_others in zip(*seen, strict=True):
         np.testing.assert_array_equal(alone.radiance, with_others.radiance)
-        np.testing.assert_array_equal(alone.buffers.depth, with_others.buffers.depth)
+        for part in ("buffers", "guides", "visibility"):
+            there = arrays_of(getattr(with_others, part))
+            for name, values in arrays_of(getattr(alone, part)).items():
+                np.testing.assert_array_equal(values, there[name], err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("side", "light_ratio", "together"), [(32, 1.0, 8), (64, 0.25, 8), (128, 1.0, 2), (256, 1.0, 1), (64, 0.0001, 1)]
+)
+def test_a_processor_renders_a_few_samples_of_small_images_together_if_their_bytes_stay(
+    small: Any, side: int, light_ratio: float, together: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At the last ratio an image has one light path or two, and ends within a vector."""
+    monkeypatch.setattr(backend, "paths_at_once", lambda: None)
+    spec = small(load_spec("cornell"), side, side)
+    transport = spec.transport.model_copy(update={"light_ratio": light_ratio})
+    assert LoadedScene.load(spec.model_copy(update={"transport": transport})).samples_at_once == together
 
 
 def test_of_samples_rendered_together_only_what_is_not_finite_is_drawn_again(

@@ -29,6 +29,15 @@ Lit = tuple[F32, F32]
 GUIDE_VIEWS = 4
 """The views that a path guide is learned from."""
 
+PIXELS_TOGETHER, MOST_TOGETHER = 1 << 15, 8
+"""The most pixels, and the most samples, that are rendered together on a processor.
+
+Some 15 ms of a sample go into launches, however small its image; more samples share them, but wait for each other.
+"""
+
+VECTOR = 16
+"""The most lanes of a processor's vector: an image that ends within one would be rounded otherwise than alone."""
+
 GUIDED_SAMPLES = 16
 """The samples that share the cost of a path guide where nothing moves; else 1, as each configuration learns its own."""
 
@@ -39,8 +48,8 @@ class LoadedScene:
     `scene` is the Mitsuba scene, for tests and comparisons; it belongs to this object. `boxes` (S, 2, 3) are the
     bounding boxes of its shapes at rest, by the scene's order; `still` (S,) says which shapes never move.
 
-    `samples_at_once` is the number of samples, of one configuration, whose images should be rendered together: 1 on a
-    processor, which gains nothing by more, and as many on a card as its memory holds.
+    `samples_at_once` is the number of samples, of one configuration, whose images should be rendered together: as many
+    on a card as its memory holds, and on a processor a few of a small image, if they are to the bit what each is alone.
     """
 
     def __init__(self, spec: SceneSpec, scene: Any, paths_at_once: int | None = None) -> None:
@@ -56,7 +65,7 @@ class LoadedScene:
         self._sensor = AimedSensor(spec)
         paths_at_once = paths_at_once or backend.paths_at_once()
         self._integrator = integrator_of(spec.transport, paths_at_once)
-        self.samples_at_once = 1 if paths_at_once is None else _samples_at_once(spec, paths_at_once)
+        self.samples_at_once = _samples_at_once(spec, paths_at_once)
         self._recorders = Recorders()
         self._materials = Materials.of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
@@ -240,12 +249,17 @@ class LoadedScene:
         return geometry, cloud
 
 
-def _samples_at_once(spec: SceneSpec, paths_at_once: int) -> int:
-    """The samples whose halves share a launch of so many paths; at least one."""
-    from photonfarm.renderer.bdpt.launches import images_at_once
+def _samples_at_once(spec: SceneSpec, paths_at_once: int | None) -> int:
+    """The samples whose halves share a launch of so many paths, at least one; None: as suits a processor."""
+    from photonfarm.renderer.bdpt.launches import images_at_once, launches
 
     pixels, transport = spec.film.width * spec.film.height, spec.transport
-    return max(1, images_at_once(pixels, transport.half_spp, transport.light_ratio, paths_at_once) // 2)
+    how = pixels, transport.half_spp, transport.light_ratio
+    if paths_at_once is not None:
+        return max(1, images_at_once(*how, paths_at_once) // 2)
+    if any(launch.light_paths % VECTOR for launch in launches(1, *how)):  # pixels are a multiple of 64 in any case
+        return 1
+    return max(1, min(MOST_TOGETHER, PIXELS_TOGETHER // pixels))
 
 
 def integrator_of(transport: Transport, paths_at_once: int | None = None) -> Any:

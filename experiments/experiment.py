@@ -56,6 +56,7 @@ class Size(Frozen):
     kept: tuple[int, ...]
     halves: tuple[int, ...]
     runs: tuple[Run, ...] = ()  # beside one of each architecture
+    inception: bool = True  # whether reports have FID, KID and Feature L1
     train: Mapping[str, Any]
     train_denoisers: Mapping[str, Any]
 
@@ -109,7 +110,7 @@ class Experiment(Frozen):
         architectures = [name for name in size.architectures if name in names]
         if unknown := {*names} - {*architectures, *(run.name for run in runs)}:
             raise SpecError(f"{self.name}: no network of it is named {', '.join(sorted(unknown))}")
-        less = {"architectures": tuple(architectures), "runs": (), "seeds": size.seeds[:1]}
+        less = {"architectures": tuple(architectures), "runs": (), "seeds": size.seeds[:1], "inception": False}
         return self.model_copy(update={"size": size.model_copy(update=less), "runs": tuple(runs)})
 
     def trained(self) -> list[Run]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-import time
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -45,9 +44,9 @@ def measure_path(
         modification, view, _ = reader.inputs(row)
         scene.apply(modification)
         seed = seed_of(reader.sample_keys([row])[0], f"path, {spp} spp")
-        began = time.perf_counter()
+        began = backend.work_s()
         image = scene.render(view, seed, integrator, spp)
-        took = time.perf_counter() - began
+        took = backend.work_s() - began
         if place >= WARM_UPS:
             halves = (references[row].half_a, references[row].half_b)
             shown = (metric_space(each[None]) for each in (np.float32(reader.spec.exposure) * image, *halves))

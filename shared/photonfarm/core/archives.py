@@ -84,7 +84,7 @@ class Surface(IntEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameCosts:
-    """Wall-clock seconds on one core for each timed frame, and the first surfaces of some rows."""
+    """Seconds on one core, or on a card, for each timed frame, and the first surfaces of some rows."""
 
     scene_id: str
     rows: NDArray[np.int64]  # (N,) of the store

@@ -178,6 +178,7 @@ def test_each_part_is_charged_with_its_own_seconds(
     monkeypatch.setattr(
         "photonfarm.renderer.tools.measure.frame_costs.time", SimpleNamespace(perf_counter=lambda: clock[0])
     )
+    monkeypatch.setattr("photonfarm.renderer.scene.backend.work_s", lambda: clock[0])
     monkeypatch.setattr(room, "apply", takes(lambda _: 1, lambda _: None))
     monkeypatch.setattr(room, "buffers", takes(lambda _: 10, lambda _: None))
     monkeypatch.setattr(

@@ -83,6 +83,9 @@ MEASURING = (
         metavar="FILE",
         help="Weights of FID's Inception network, for the references.  [default: those that are installed]",
     ),
+    click.option(
+        "--without-inception", is_flag=True, help="Leave out FID, KID and Feature L1, which take most of the time."
+    ),
     device_option,
 )
 """The options for what is measured, against what and where."""
@@ -118,9 +121,6 @@ def _collect_arguments(
 
 @click.command()
 @add_measuring_options
-@click.option(
-    "--without-inception", is_flag=True, help="Leave out FID, KID and Feature L1, which take most of the time."
-)
 @json_option
 def evaluate(store: str | Path, runs: tuple[Path, ...], as_json: bool, **asked: Any) -> None:
     """Measure trained networks on views that none of them was trained on, each by its first sample.

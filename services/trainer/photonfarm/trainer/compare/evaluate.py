@@ -146,6 +146,7 @@ class MeasureOptions(TypedDict, total=False):
     denoisers: Sequence[ReadyChoice]
     references: Path | None
     inception: Path | None
+    without_inception: bool
     most: int
     device: str
     on_progress: MeasureProgress | None

@@ -73,13 +73,18 @@ class DevicePredictor:
         return inputs.to(self.device, copy=True)
 
     @torch.no_grad()
-    def wall_s(self, inputs: Inputs) -> float:
-        """The seconds to make the images of these inputs, which are on the device; the results are left there."""
+    def work_s(self, inputs: Inputs) -> float:
+        """The seconds to make the images of these inputs, which are on the device; the results are left there.
+
+        One thread's are those of the processor, so that other load does not count; others go by the clock.
+        """
+        alone = self.device.type == "cpu" and torch.get_num_threads() == 1
+        now = time.process_time if alone else time.perf_counter
         self._wait()
-        began = time.perf_counter()
+        began = now()
         self.images(inputs)
         self._wait()
-        return time.perf_counter() - began
+        return now() - began
 
     def _wait(self) -> None:
         if self.device.type == "cuda":
@@ -88,7 +93,7 @@ class DevicePredictor:
 
 def time_by_turns(calls: Sequence[tuple[DevicePredictor, Inputs]]) -> list[Seconds]:
     """The time of each predictor for its inputs, over `TIMED_ROUNDS` rounds of all; the inputs are `of_its_own`."""
-    rounds = [[predict.wall_s(inputs) for predict, inputs in calls] for _ in range(WARM_ROUNDS + TIMED_ROUNDS)]
+    rounds = [[predict.work_s(inputs) for predict, inputs in calls] for _ in range(WARM_ROUNDS + TIMED_ROUNDS)]
     return [Seconds.of(times) for times in np.array(rounds[WARM_ROUNDS:]).T]
 
 

@@ -58,7 +58,7 @@ LONGEST_S = 10.0  # for all of them, and for each half that the longest is of
 
 @dataclass(frozen=True, slots=True)
 class FrameTime:
-    """Wall seconds of one frame, by parts in the order in which they are made; None for parts that are not needed.
+    """Seconds of one frame, by parts in the order in which they are made; None for parts that are not needed.
 
     These are halves A at 1/k of the pixels, depth with albedo and normal, the view's guides together with these (for
     denoisers that are given reflectance, without their shadow rays), which points of the cloud it sees, photons traced

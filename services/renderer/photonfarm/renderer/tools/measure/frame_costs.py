@@ -1,6 +1,7 @@
 """`photonfarm measure-frames`: the cost of the parts of one frame on this machine, and the surfaces in its pixels.
 
-A part is timed on the wall clock until its result is in numpy's memory, in a process whose thread pool is one thread.
+A part is timed until its result is in numpy's memory, in a process whose thread pool is one thread: by what the
+processor spends on it, so that other load does not count, and on a card by the clock.
 
 *Images of 1/k of the pixels* tell the cost of rendering only the pixels that a method keeps. They stand for some pixels
 of the whole image: the same field of view on a smaller film, with as many light paths as the whole image has, since
@@ -37,6 +38,7 @@ from photonfarm.core.keys import Key, view_key
 from photonfarm.core.records import F32, BasePointCloud, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, locate
+from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
 from photonfarm.renderer.scene.view_rays import ViewCameras
@@ -218,9 +220,9 @@ def _seconds(
             break
         if stays:  # else there would be nothing to edit
             scene.apply(rest(scene.spec))
-        parts = time_parts(scene, cloud, frame.modification, frame.key, frame.view, time.perf_counter)
+        parts = time_parts(scene, cloud, frame.modification, frame.key, frame.view, backend.work_s)
         renders = [partial(film.render, scene.scene, frame.view, seed) for film in films]
-        render_s = [time_work(render, time.perf_counter)[0] for render in renders]
+        render_s = [time_work(render, backend.work_s)[0] for render in renders]
         measured.append([*(parts[name] for name in PARTS), *render_s])
     return np.array(measured[WARM_UPS:]).T
 

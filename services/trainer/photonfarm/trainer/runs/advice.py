@@ -37,9 +37,10 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
     """Advice by the records of a run's log; None for fewer than three validations with an error above 0.
 
     Twice the steps multiply the held-out error by 2^slope, if it goes on as a power of the steps as since a quarter of
-    them: at the end of a cosine it falls less, for want of rate and not of steps. Twice the images halve its excess over the training error, which falls as 1 / images; what may be chance, two
-    standard errors of a few held-out views, does not count. With `images_s`, the core-seconds that the present images
-    took, what takes off more in a second wins; without it, what takes off more.
+    them: at the end of a cosine it falls less, for want of rate and not of steps. Twice the images halve its excess
+    over the training error, which falls as 1 / images; what may be chance, two standard errors of a few held-out views,
+    does not count. With `images_s`, the core-seconds that the present images took, what takes off more in a second
+    wins; without it, what takes off more.
     """
     measured = [each for each in records if each["kind"] == "validation" and "excess" in each]
     curve = [each for each in measured if each["excess_held_out"] and each["excess_held_out"][0] > 0]

@@ -43,7 +43,7 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
     wins; without it, what takes off more.
     """
     measured = [each for each in records if each["kind"] == "validation" and "excess" in each]
-    curve = [each for each in measured if each["excess_held_out"] and each["excess_held_out"][0] > 0]
+    curve = [each for each in measured if (excess := each.get("excess_held_out")) and excess[0] > 0]
     late = [each for each in curve if 4 * each["step"] >= curve[-1]["step"] > 0]
     if len(late) < LEAST_POINTS:
         return None

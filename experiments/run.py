@@ -6,11 +6,11 @@
 
 Each is a file NAME.toml beside this one; without names all are run, in the order of their names. What is rendered
 and trained stays in WORK/SIZE/NAME; the report lies in its folder report/. With `--minutes` what is at work then is
-stopped, and the same command goes on later; in each room the most telling networks come first. With `--networks` these
-alone are trained, from the first seed, and reported: a look, of which tables.py makes no page. `--dry-run` says what
-that would take: what a sample costs is measured on this machine, training is counted in operations. Exit code 0, 2 for
-wrong usage, 3 for a name that no experiment has or a file that is wrong, 7 where an experiment did not come to its end:
-the others are run all the same.
+stopped, and the same command goes on later; what would begin anew, as a report does, comes to its end first. In each
+room the most telling networks come first. With `--networks` these alone are trained, from the first seed, and reported:
+a look, of which tables.py makes no page. `--dry-run` says what that would take: what a sample costs is measured on this
+machine, training is counted in operations. Exit code 0, 2 for wrong usage, 3 for a name that no experiment has or a
+file that is wrong, 7 where an experiment did not come to its end: the others are run all the same.
 """
 
 from __future__ import annotations

@@ -46,7 +46,7 @@ class Stages:
     experiment: Experiment
     folder: Path
     workers: int
-    until: float = math.inf  # by time.monotonic(): then what is at work is stopped, and nothing else begins
+    until: float = math.inf  # by time.monotonic(): then what goes on later is stopped, and nothing else begins
 
     def run(self) -> Path:
         """All stages; the folder of the report. Raises StageError, and StoreError where store or runs are damaged."""
@@ -243,7 +243,7 @@ class Stages:
         """Run a verb, or another program, to its end; what it says goes to a log. Raises StageError.
 
         One that leaves the files `made` is not run again while they are there, its arguments are the same and none of
-        the files `of` is newer than its last end.
+        the files `of` is newer than its last end. It is not stopped either: it would begin anew, and might never end.
         """
         log, done = (self.folder / "logs" / f"{stage}{suffix}" for suffix in (".log", ".done"))
         asked = json.dumps([*map(str, arguments)])
@@ -256,7 +256,7 @@ class Stages:
             line = [*program, *map(str, arguments)] if program else command(*map(str, arguments))
             process = subprocess.Popen(tie(line), stdout=output, stderr=subprocess.STDOUT)
         try:
-            code = process.wait(None if math.isinf(self.until) else max(self.until - began, 0.0))
+            code = process.wait(None if made or math.isinf(self.until) else max(self.until - began, 0.0))
         except subprocess.TimeoutExpired:
             process.terminate()
             process.wait()

@@ -242,6 +242,15 @@ def test_stages_stop_when_their_time_is_over_and_the_same_command_goes_on(tiny: 
     assert before == {run: run.stat().st_mtime_ns for run in before}
 
 
+def test_what_would_begin_anew_comes_to_its_end_after_its_time(tiny: Experiment, tmp_path: Path) -> None:
+    made, late = tmp_path / "made", ["import sys, time; time.sleep(0.6); open(sys.argv[1], 'w')"]
+    stages = Stages(tiny, tmp_path, 1, until=time.monotonic() + 0.2)
+    stages._verb("report", [made], made=[made], program=[sys.executable, "-c", *late])
+    assert made.is_file()
+    with pytest.raises(StageError, match="the time is over before path"):
+        stages._verb("path", [made], made=[made], program=[sys.executable, "-c", *late])
+
+
 def test_a_dry_run_counts_samples_passes_and_operations(tiny: Experiment) -> None:
     need = Need.of(tiny, SampleCosts("0" * 32, 1.0, 2.0, 3.0, 0.5, 0.1))
     assert (need.samples, need.passes, need.runs) == (12, 2, 3)  # 2 spp a pass; a network twice, and a denoiser

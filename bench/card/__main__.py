@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.card import equal_time, networks, optix, rates, sample, values, worker
+from bench.card import equal_time, networks, optix, rates, sample, trained, values, worker
 from bench.card.rooms import ROOMS
 from bench.harness import results
 from bench.trainer.train_step import shown
@@ -30,7 +30,8 @@ from photonfarm.core.files import write_whole
 from photonfarm.core.processes import tie
 
 KINDS: dict[str, Any] = {
-    kind.__name__.rpartition(".")[2]: kind for kind in (values, sample, rates, worker, networks, equal_time, optix)
+    kind.__name__.rpartition(".")[2]: kind
+    for kind in (values, sample, rates, worker, networks, equal_time, trained, optix)
 }
 LEAST_S = 5.0
 """The least time with which a part is begun."""
@@ -62,6 +63,7 @@ def list_parts() -> list[Part]:
         ("worker", ROOMS[:1]),
         ("networks", list(shown())),
         ("equal_time", ROOMS),
+        ("trained", [f"{room}-{network}" for network in trained.NETWORKS for room in ROOMS]),
         ("optix", ROOMS[:1]),
     ]
     return [Part(kind, each) for kind, all_ in of for each in all_]
@@ -74,11 +76,11 @@ def describe_run(size: int) -> dict[str, Any]:
     return {"size": size, "device": backend.device().name, "commit": results.commit()}
 
 
-def measure(part: Part, run: dict[str, Any], out: Path) -> None:
+def measure(part: Part, run: dict[str, Any], out: Path, limit_s: float) -> None:
     """Measure a part in this process, and write what it found, or why it cannot be found here."""
     began = time.monotonic()
     try:
-        found = KINDS[part.kind].measure(part.of, run["size"], out)
+        found = KINDS[part.kind].measure(part.of, run["size"], out, limit_s)
     except SpecError as error:
         found = {"missing": f"skipped: {error}"}
     write_whole(file_of(part, out), json.dumps({"run": run, "took_s": time.monotonic() - began, **found}) + "\n")
@@ -116,7 +118,8 @@ def measure_missing(parts: Sequence[Part], run: dict[str, Any], out: Path, minut
 
 def measure_apart(part: Part, run: dict[str, Any], out: Path, limit_s: float) -> str:
     """Measure a part in another process, within a time; returns how it failed, or nothing."""
-    command = [sys.executable, "-m", "bench.card", "--part", part.name, "--size", str(run["size"]), "--out", str(out)]
+    told = ["--part", part.name, "--limit-s", str(limit_s), "--size", str(run["size"]), "--out", str(out)]
+    command = [sys.executable, "-m", "bench.card", *told]
     log = out / "parts" / f"{part.name}.log"
     with log.open("w") as said:
         try:
@@ -156,6 +159,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", choices=parts, default=list(parts), metavar="PART", help="not all parts")
     parser.add_argument("--make-references", action="store_true", help="write the values that others are held against")
     parser.add_argument("--part", choices=parts, help=argparse.SUPPRESS)
+    parser.add_argument("--limit-s", type=float, default=120.0, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.make_references:
         os.environ["PHOTONFARM_DEVICE"] = "cpu"
@@ -165,7 +169,7 @@ def main() -> int:
     (out / "parts").mkdir(parents=True, exist_ok=True)
     run = describe_run(options.size)
     if options.part:
-        measure(parts[options.part], run, out)
+        measure(parts[options.part], run, out, options.limit_s)
         return 0
     chosen = [parts[name] for name in parts if name in options.only]
     measure_missing(chosen, run, out, options.minutes)

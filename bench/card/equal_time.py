@@ -41,7 +41,7 @@ Guide = tuple[F32, F32]  # (H, W, 3): albedo or reflectance, and normals
 Denoiser = Callable[[F32, F32, F32], F32]
 
 
-def measure(name: str, size: int, out: Path) -> dict[str, Any]:
+def measure(name: str, size: int, out: Path, _limit_s: float) -> dict[str, Any]:
     """The errors of `path`, `bdpt`, and Open Image Denoise in its qualities, by the time of a frame."""
     denoisers, rendered = load_oidn(), RenderedRoom(name, size, out)
     rows = {method: rendered.errors(method) for method in ("path", BDPT, PLAIN)}
@@ -95,6 +95,7 @@ class RenderedRoom:
         method: str,
         denoise: Denoiser | None = None,
         guide: Callable[[LoadedScene, View], Guide] | None = None,
+        frames_ms: Sequence[float] = FRAMES_MS,
     ) -> dict[str, Any]:
         """Of each frame's time the samples per pixel that fit, the time that they take, and the error."""
         guides: Sequence[Guide] = ()
@@ -107,7 +108,7 @@ class RenderedRoom:
             denoised_s = statistics.median(timed_s(once)[0] for _ in range(REPETITIONS))
             further_s = statistics.median(inputs_s) + denoised_s
         rows: dict[str, Any] = {}
-        for frame_ms in FRAMES_MS:
+        for frame_ms in frames_ms:
             spp = self._most_spp(method, 1e-3 * frame_ms - further_s)
             if not spp:
                 continue

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.card.rooms import on_card
+from bench.card.rooms import make_once, on_card
 from bench.harness import results
 from bench.trainer.train_step import WHOLE, WorkTimer, filled, for_architecture, resized, time_step
 from photonfarm.trainer.runs.settings import make_preset
@@ -16,7 +15,7 @@ TITLE = "A training step and a frame"
 BATCH, REPETITIONS, SAMPLES = 32, 7, 96
 
 
-def measure(architecture: str, size: int, out: Path) -> dict[str, Any]:
+def measure(architecture: str, size: int, out: Path, _limit_s: float) -> dict[str, Any]:
     """Milliseconds of a step and of an image alone, whose inputs lie on the device."""
     import torch
 
@@ -24,7 +23,9 @@ def measure(architecture: str, size: int, out: Path) -> dict[str, Any]:
     device, batch, precision = ("cuda", BATCH, "bfloat16") if on_card() else ("cpu", 2, "float32")
     preset = make_preset("paper-dynamic", device=device, batch=batch, network={"precision": precision})
     settings, clock = for_architecture(preset, architecture), WorkTimer(device, REPETITIONS)
-    where = fill_once(out / f"store-{size}", size, settings.network.points)
+    spec = resized(size, settings.network.points)
+    where = out / f"store-{size}", spec.scene_id
+    make_once(where[0], lambda root: filled(spec, root, SAMPLES))
     parameters, step, _ = time_step(where, settings, clock)
     _, _, frame = time_step(where, settings.model_copy(update={"batch": 1}), clock)
     peak_gb = torch.cuda.max_memory_allocated() / 1e9 if on_card() else 0.0
@@ -39,16 +40,6 @@ def measure(architecture: str, size: int, out: Path) -> dict[str, Any]:
         "peak_gb": peak_gb,
         "deterministic_ms": fixed_ms,
     }
-
-
-def fill_once(root: Path, size: int, points: int | None) -> tuple[Path, str]:
-    """The store that all architectures read, made by the first of them."""
-    spec = resized(size, points)
-    if not root.is_dir():
-        with tempfile.TemporaryDirectory(dir=root.parent) as folder:
-            filled(spec, Path(folder) / "store", SAMPLES)
-            (Path(folder) / "store").rename(root)
-    return root, spec.scene_id
 
 
 def describe(found: Mapping[str, Mapping[str, Any]]) -> str:

@@ -43,7 +43,7 @@ def make_integrators() -> dict[str, Any]:
     return {"path": mi.load_dict({"type": "path", **depths}), **recorded}
 
 
-def measure(name: str, size: int, _out: Path) -> dict[str, Any]:
+def measure(name: str, size: int, _out: Path, _limit_s: float) -> dict[str, Any]:
     """Millions a second, and the first call's seconds."""
     spp = 256 if on_card() else 16
     scene = load_room(name, size, spp)

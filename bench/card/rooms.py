@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import statistics
+import tempfile
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from bench.harness.scenes import in_passes, ready_spec, square
@@ -34,6 +36,14 @@ def draw_view(scene: LoadedScene, number: int, of_it: int = 0) -> tuple[Modifica
     modification = sample_modification(scene.spec, 0, number)
     key = modification.key(scene.spec.radiance_id)
     return modification, key, sample_view(scene.spec, key, 0, of_it, modification)
+
+
+def make_once(store: Path, fill: Callable[[Path], object]) -> None:
+    """Fill a store, unless an earlier part has; one that is not filled to its end leaves nothing."""
+    if not store.is_dir():
+        with tempfile.TemporaryDirectory(dir=store.parent) as folder:
+            fill(made := Path(folder) / "store")
+            made.rename(store)
 
 
 def on_card() -> bool:

@@ -15,7 +15,7 @@ TITLE = "A sample"
 HALF_SPP, REPETITIONS, MOST_TOGETHER = 4, 5, 64
 
 
-def measure(name: str, size: int, _out: Path) -> dict[str, Any]:
+def measure(name: str, size: int, _out: Path, _limit_s: float) -> dict[str, Any]:
     """The parts at this size and at a quarter of it, in milliseconds."""
     return {"rows": [measure_at(name, side) for side in (max(16, size // 4), size)]}
 

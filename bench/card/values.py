@@ -29,7 +29,7 @@ MOST_Z, MOST_DIFFERENCE = 5.0, 0.01
 """The largest z of a block, and the largest difference of an input's block means, over its largest, that pass."""
 
 
-def measure(name: str, _size: int, _out: Path) -> dict[str, Any]:
+def measure(name: str, _size: int, _out: Path, _limit_s: float) -> dict[str, Any]:
     """The block means of a scene, and how far they are from the references."""
     found = render_means(name)
     return {"means": found, **compare(found, json.loads(REFERENCES.read_text())[name])}

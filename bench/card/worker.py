@@ -27,7 +27,7 @@ LEAST_JOBS, LEAST_S, MOST_S = 3, 10.0, 60.0
 """It is watched for so many jobs and seconds beyond its first job, or for the most seconds in all."""
 
 
-def measure(name: str, size: int, out: Path) -> dict[str, Any]:
+def measure(name: str, size: int, out: Path, _limit_s: float) -> dict[str, Any]:
     """What it does between the end of its first job and that of its last."""
     with tempfile.TemporaryDirectory(dir=out) as folder:
         scene = Store(Path(folder), create=True).add(square(ready_spec(name), size))

@@ -127,6 +127,8 @@ def format_setting(value: object) -> str:
         return "–"
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return ", ".join(value)
     if value in (1 / 8, 1 / 16):
         return f"1/{1 / value:.0f}"  # type: ignore[operator]
     return f"{value:g}" if isinstance(value, float) else str(value)

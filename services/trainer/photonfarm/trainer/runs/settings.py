@@ -260,6 +260,7 @@ SMALL: Mapping[str, Any] = {
     "average": 0.99,
     "epoch_samples": 256,
     "hold_out": HOLD_OUT,
+    "skip_views": ("unlit",),  # one of 448 had a third of the squared gradient
     "max_steps": 4000,
 }
 

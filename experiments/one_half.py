@@ -46,10 +46,10 @@ class HeldOutView:
 
     def half(self, passes: int) -> NoisyColour:
         """The mean of the first passes, and the variance of that."""
-        image, variance = self.given[:passes].mean(dim=0), torch.full(self.given.shape[1:3], -1.0)
-        if passes > 1:
-            variance = self.given[:passes].mean(dim=-1).var(dim=0) / passes
-        return NoisyColour(image[None], torch.ones(1, *image.shape[:2], dtype=torch.bool), variance[None])
+        given = self.given[:passes]
+        image, kept = given.mean(dim=0)[None], torch.ones(1, *given.shape[1:3], dtype=torch.bool)
+        variance = given.mean(dim=-1).var(dim=0, correction=min(passes - 1, 1))[None] / passes
+        return NoisyColour(image, kept, torch.tensor([float(passes)]), variance)
 
 
 def read_views(source: SceneReader, hold_out: float, most: int, least: int) -> Iterator[HeldOutView]:

@@ -71,9 +71,11 @@ def test_it_starts_from_the_filtered_half_and_the_known_light_and_goes_on_to_the
     made.shares[:2] = -torch.inf  # what our own filter makes, which depends on the variance
     images = {}
     for variance in (1e9, 1e-4, 0.0):
-        told = replace(inputs.noisy, filtered=filtered, variance=torch.full_like(inputs.depth, variance))
+        how = {"passes": torch.full((1,), 2.0), "variance": torch.full_like(inputs.depth, variance)}
+        told = replace(inputs.noisy, filtered=filtered, **how)
         images[variance] = made(replace(inputs, noisy=told))
-    torch.testing.assert_close(images[1e9], known + 0.8808 * (filtered - known), rtol=1e-3, atol=1e-3)
+    wanted = filtered + 0.1192 * (known - filtered) / 2  # what is added to the filtered half, over the passes
+    torch.testing.assert_close(images[1e9], wanted, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(images[0.0], inputs.noisy.colour)
     off = [float((image - inputs.noisy.colour).detach().abs().mean()) for image in images.values()]
     assert off[0] > 1.5 * off[1] > 0
@@ -151,7 +153,8 @@ def test_half_a_is_the_mean_of_some_passes_and_its_noise_is_what_they_differ_by(
         for half, told in enumerate((batch.inputs.noisy, batch.other)):
             torch.testing.assert_close(told.colour, batch.target[:, half])
             passes = np.stack(halves[row + 1 - count : row + 1])[:, half].mean(axis=-1)
-            wanted = passes.var(axis=0, ddof=1) / count if count > 1 else np.full(passes.shape[1:], -1.0)
+            wanted = passes.var(axis=0, ddof=1) / count if count > 1 else np.zeros(passes.shape[1:])
+            assert told.passes.tolist() == [count]
             np.testing.assert_allclose(told.variance[0].numpy(), wanted, rtol=1e-3, atol=1e-5)
     expected = 24 * np.array([1 + 1 / 2 + 1 / 3 + 1 / 4, 1 / 2 + 1 / 3 + 1 / 4, 1 / 3 + 1 / 4, 1 / 4])
     assert (np.abs(counts - expected) < 4 * np.sqrt(expected)).all()

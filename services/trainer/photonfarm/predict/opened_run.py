@@ -158,10 +158,11 @@ class OpenRun:
         numbers = range(count * other, count * (1 + other))
         keys = [make_key(sample, number) if number else sample for number in numbers]
         images = np.stack([half_of(self._scene, key, view) for key in keys]) * np.float32(self._exposure)
-        kept, variance = choose_kept_pixels(sample, self.spec, self._needs.kept or 1), None
+        kept, number, variance = choose_kept_pixels(sample, self.spec, self._needs.kept or 1), None, None
         if len(images) > 1:
+            number = torch.full((1,), float(len(images)), device=self._device)
             variance = self._tensor(images.mean(axis=-1).var(axis=0, ddof=1) / len(images))
-        return NoisyColour(self._tensor(images.mean(axis=0) * kept[..., None]), self._tensor(kept), variance)
+        return NoisyColour(self._tensor(images.mean(axis=0) * kept[..., None]), self._tensor(kept), number, variance)
 
 
 def take_torch(values: Any) -> Tensor:

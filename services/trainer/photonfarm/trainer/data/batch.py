@@ -46,20 +46,20 @@ class TrainingBatch:
         units: Sequence[Key],
         tensors: Mapping[str, Tensor],
         kept: Tensor | None = None,
-        variance: Tensor | None = None,
+        passes: tuple[Tensor, Tensor] | None = None,
         colour: Tensor | None = None,
     ) -> TrainingBatch:
         """What a `SceneDataset` has read, (B, …) by field, in the same memory; and A's `kept` pixels, (B, H, W).
 
-        With the `variance` of both halves, (B, 2, H, W), each has its own. A `colour`, (B, H, W, 3), stands for A's as
-        an input alone: it has to be independent of B.
+        `passes` are how many each sample is the mean of, (B,), and the variances of both halves, (B, 2, H, W). A
+        `colour`, (B, H, W, 3), stands for A's as an input alone: it has to be independent of B.
         """
         target = tensors["radiance"]
         if kept is None:
             return cls(tuple(rows), tuple(units), Inputs.of(tensors), target)
-        own = (None, None) if variance is None else variance.unbind(1)
+        count, variance = (None, (None, None)) if passes is None else (passes[0], passes[1].unbind(1))
         halves = (target[:, 0] if colour is None else colour, target[:, 1])
-        a, b = (NoisyColour(half * kept[..., None], kept, of) for half, of in zip(halves, own, strict=True))
+        a, b = (NoisyColour(half * kept[..., None], kept, count, of) for half, of in zip(halves, variance, strict=True))
         return cls(tuple(rows), tuple(units), Inputs.of(tensors, a), target, b)
 
     def to(self, device: torch.device) -> TrainingBatch:

@@ -258,17 +258,18 @@ def read_batch(
     Raises IncompleteError if a view has fewer passes than there are to be halves.
     """
     film = dataset.spec.film.height, dataset.spec.film.width
-    pixels = variance = colour = None
+    pixels = passes = colour = None
     tensors = dataset.read(rows, memory)
     if needs.kept:
         chosen = [choose_kept_pixels(key, dataset.spec, needs.kept) for key in source.sample_keys(rows)]
         pixels = torch.from_numpy(np.array(chosen, np.bool_).reshape(-1, *film))
     if needs.passes:
         samples = zip(rows, tensors["radiance"], strict=True)
-        variance = torch.stack([_average_passes(source, dataset, row, halves) for row, halves in samples])
+        counts, variances = zip(*(_average_passes(source, dataset, *sample) for sample in samples), strict=True)
+        passes = torch.tensor(counts), torch.stack(variances)
     if needs.halves > 1:
         colour = torch.from_numpy(np.stack([_average_halves(source, row, needs.halves) for row in rows]))
-    return TrainingBatch.of(rows, units_of(source, rows), tensors, pixels, variance, colour)
+    return TrainingBatch.of(rows, units_of(source, rows), tensors, pixels, passes, colour)
 
 
 def _average_halves(source: SceneReader, row: int, count: int) -> F32:
@@ -280,19 +281,19 @@ def _average_halves(source: SceneReader, row: int, count: int) -> F32:
     return np.asarray(source.spec.exposure * total / count, np.float32)
 
 
-def _average_passes(source: SceneReader, dataset: SceneDataset, row: int, halves: Tensor) -> Tensor:
+def _average_passes(source: SceneReader, dataset: SceneDataset, row: int, halves: Tensor) -> tuple[float, Tensor]:
     """Replace the halves of a sample (2, H, W, 3) by their means with earlier passes of its view in the same job.
 
     How many these are is drawn by the sample's key: none to all. So one network learns from any number of samples. As
-    a job is committed whole, the same ones are there whenever the row is read. Returns the variance of the means of
-    colour, (2, H, W), from the passes; -1 if there is one alone.
+    a job is committed whole, the same ones are there whenever the row is read. Returns the number of passes, and the
+    variance of the means of colour, (2, H, W), by which these differ.
     """
     earlier = source.earlier_passes(row)
     count = int(Stream(source.sample_keys([row])[0], "passes").uniform(1)[0] * (len(earlier) + 1))
     if not count:
-        return halves.new_full(halves.shape[:3], -1.0)
+        return 1.0, halves.new_zeros(halves.shape[:3])
     factor = dataset.spec.exposure
     others = [torch.from_numpy(source.read_radiance(int(each))) * factor for each in earlier[-count:]]
     passes = torch.stack([halves.clone(), *others])
     halves.copy_(passes.mean(dim=0))
-    return passes.mean(dim=-1).var(dim=0) / len(passes)
+    return float(len(passes)), passes.mean(dim=-1).var(dim=0) / len(passes)

@@ -1,13 +1,14 @@
 """A guided network that is also given one noisy half of the view, and learns from the other one. All ours.
 
 filtered = Σ shares · filtered halves
-guess = filtered + s / (s + SETTLED) · ((1 − w) · (known light − filtered) + reflectance × U-Net)
+guess = filtered + ((1 − w) · (known light − filtered) + reflectance × U-Net) / n
 image = guess + v · (half − guess),   v = β / (β + s)
 
 The half is filtered by the two scales of a filter of our own, below, and where it is installed by a denoiser
 [predictors.half_filter]: errors of filters that work differently are less in their mean. Shares and w are learned for
 each pixel; w starts at 0.88. s, the squared relative noise of the half, is estimated from its passes, or from its
-neighbourhood where it has one alone. So the more samples there are, the less the network adds to the filtered half.
+neighbourhood where it has one alone. n is the number of passes: what the network adds to the filtered half is as
+uncertain as ever, while that has less noise.
 β, the squared relative error of the guess, is learned, and v is the weight by which two independent estimates have the
 least error: in the end the image goes on to the mean of the samples (Back et al., Deep Combiner, 2020, learn such
 weights). All inputs depend on half A alone, so half B is an unbiased target; the two take turns [data.batch].
@@ -43,9 +44,6 @@ HALF_CHANNELS = 3 + 3 * (1 + len(WINDOWS)) + 1
 SHARES = (-3.0, 0.0, 1.0)
 """The logits of what is filtered before anything is learned: finely, coarsely, by a denoiser."""
 
-SETTLED = 0.2
-"""The noise s at which half of what the network adds is left."""
-
 DARK = 0.1
 """The brightness, in exposed radiance, that noise is relative to in darker places."""
 
@@ -77,7 +75,9 @@ class GuidedDenoise(Guided):
         error = functional.softplus(TRUSTED + made[..., 4:5])
         shares = torch.softmax(self.shares + made[..., 5:], dim=-1)
         filtered = (half.filtered * shares[..., None, :]).sum(dim=-1)
-        added = half.noise / (half.noise + SETTLED) * ((1 - weight) * (known - filtered) + light)
+        added = (1 - weight) * (known - filtered) + light
+        if noisy.passes is not None:
+            added = added / noisy.passes[:, None, None, None]
         guess = torch.lerp(known + light, filtered + added, half.shows)
         return guess + half.shows * (error / (error + half.noise)) * (noisy.colour - guess)
 
@@ -110,8 +110,9 @@ def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor, denoised: T
     direct = guides.emission + guides.direct + guides.gloss
     light = noisy.colour - direct
     spread = _estimate_variance(light, reflects)
-    if noisy.variance is not None:
-        spread = torch.where(noisy.variance[..., None] < 0, spread, _mean(noisy.variance[..., None], 5))
+    if noisy.passes is not None and noisy.variance is not None:
+        several = noisy.passes[:, None, None, None] > 1
+        spread = torch.where(several, _mean(noisy.variance[..., None], 5), spread)
     fine, coarse = (direct + image for image in filter_light(light, reflects, spread, inputs.normal, places))
     brightness = coarse.mean(dim=-1, keepdim=True)
     noise = spread / (brightness**2 + DARK**2)

@@ -131,7 +131,8 @@ class NoisyColour:
 
     colour: Tensor  # (B, H, W, 3) linear radiance × exposure, zero where not kept
     kept: Tensor  # (B, H, W) bool
-    variance: Tensor | None = None  # (B, H, W) of its mean colour, from its passes; −1: there is one alone
+    passes: Tensor | None = None  # (B,) float: it is the mean of so many; None: 1
+    variance: Tensor | None = None  # (B, H, W) of its mean colour, from its passes; of no meaning for one alone
     filtered: Tensor | None = None  # (B, H, W, 3) as a denoiser shows it
 
 

@@ -159,10 +159,8 @@ def timed(
     """A step, or an image, and its parts, each by itself."""
     network = learner.network
     inputs = (batch.to(device).for_training() if gradients else batch.to(device)).inputs
-    calls = projections(network, inputs)
-    with torch.no_grad():
-        channels = network.channels(inputs, network.further(inputs))
-    channels.requires_grad_(gradients)
+    calls, ((channels,),) = (find_calls(network, method, inputs) for method in ("project", "synthesise"))
+    channels = channels.clone().requires_grad_(gradients)
     leaves = [(told[0].detach().requires_grad_(gradients), *told[1:]) for told in calls]
 
     def with_gradients(make: Callable[[], list[Tensor]]) -> Callable[[], object]:
@@ -189,19 +187,20 @@ def timed(
     return {**found, "point branch": max(found["point branch"] - others, 0.0)}
 
 
-def projections(network: Network, inputs: Inputs) -> list[tuple[Any, ...]]:
-    """What the network projects of these inputs: the arguments of each call."""
+def find_calls(network: Network, method: str, inputs: Inputs) -> list[tuple[Any, ...]]:
+    """What the network gives a method of its own as it makes these inputs' image: the arguments of each call."""
     calls: list[tuple[Any, ...]] = []
-    plain = network.project
+    plain = getattr(network, method)
 
     def noted(*told: Any) -> Tensor:
         calls.append(told)
-        return plain(*told)
+        made: Tensor = plain(*told)
+        return made
 
-    network.project = noted  # type: ignore[method-assign, assignment]
+    setattr(network, method, noted)
     with torch.no_grad():
-        network.further(inputs)
-    network.project = plain  # type: ignore[method-assign]
+        network(inputs)
+    setattr(network, method, plain)
     return calls
 
 

@@ -12,7 +12,7 @@ from click.testing import CliRunner, Result
 
 from photonfarm.core.pictures import display_values
 from photonfarm.core.waiting import Steps, WorkLog
-from photonfarm.renderer.cli.measuring_verbs import scene_exposure
+from photonfarm.renderer.cli.scene_verbs import scene_exposure
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.tools.measure import exposure
 from photonfarm.renderer.tools.measure.exposure import DarkError, Pictures, propose

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from photonfarm.plan.sample_costs import SECONDS, SampleCosts, relative_variance
-from photonfarm.renderer.cli.measuring_verbs import scene_cost
+from photonfarm.renderer.cli.scene_verbs import scene_cost
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.tools.measure import sample_costs as measuring

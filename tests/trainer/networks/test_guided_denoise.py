@@ -178,6 +178,22 @@ def test_it_ends_after_so_many_rounds_with_a_rate_that_has_fallen_and_says_how_m
     assert learner.rate(outcome.step // 2) > 0.3 * settings.learning_rate
 
 
+class PlansSource(AnalyticSource):
+    """Samples of plans of 16 each."""
+
+    @property
+    def plan_requests(self) -> list[dict[str, Any]]:
+        return [{"samples": 16}] * (self.planned // 16)
+
+
+def test_a_run_whose_rounds_are_over_goes_on_with_further_samples(make_source, run) -> None:
+    spec = make_source(1).spec
+    settings = settings_of(batch=2, rounds=1, hold_out=0.25, poll_seconds=0.01)
+    ends = [train(PlansSource(spec, samples), settings, run) for samples in (16, 32, 32)]
+    assert [end.reason for end in ends] == ["rounds"] * 3
+    assert ends[0].step < ends[1].step == ends[2].step
+
+
 def test_a_run_that_was_stopped_goes_on_to_the_same_state(make_source, tmp_path) -> None:
     """With passes averaged, and with the schedule that its rounds end."""
     spec = make_source(1).spec
@@ -189,7 +205,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_state(make_source, tmp_path)
         assert ends[-1].reason == "rounds"
     assert ends[0].step == 2 < ends[1].step
     whole, parts = (load(tmp_path / name / CHECKPOINT) for name in ("whole", "parts"))
-    assert whole["following"]["last_step"] == parts["following"]["last_step"] == ends[1].step
+    assert whole["step"] == parts["step"]
     assert torch.equal(whole["excess"], parts["excess"])
     for name, weight in whole["network"].items():
         assert torch.equal(weight, parts["network"][name])

@@ -129,3 +129,20 @@ def test_views_that_are_black_or_near_are_counted_with_the_squared_gradient_of_t
     assert shares["samples"] == 0.5
     assert 0 < shares["gradient"] < 1
     assert learner.take_poor() == {}
+
+
+def test_a_sample_of_which_one_half_is_black_counts_for_networks_of_halves_only_if_both_are(
+    make_source: Any, tiny: Any
+) -> None:
+    source, settings = make_source(2), tiny(network={"width": 4, "architecture": "denoise_1"})
+    learner = Learner(SceneFrame.of(source.spec, *source.base(), settings.network), settings, Ranks())
+    batch = batch_of(source, range(2), Needs(points=False, kept=1))
+    batch.target[0, 0] = 0
+    learner.step(0, batch)
+    assert learner.take_poor() == {}
+    batch.target[0, 1] = 0
+    learner.step(1, batch)
+    assert learner.take_poor() == {"samples": 0.5, "gradient": 1.0}
+    batch.target[1] = torch.nan
+    learner.step(2, batch)
+    assert learner.take_poor() == {}, "JSON has no number for it"

@@ -123,8 +123,13 @@ def test_each_process_reads_its_own_part_and_only_rank_0_what_is_held_out(make_s
     assert not set(reads[1]) & held_out
 
 
-def test_a_killed_run_of_two_goes_on_to_the_same_weights_to_the_bit(make_source, tiny, run, tmp_path) -> None:
-    settings, killed = tiny(batch=4), tmp_path / "killed"
+BY_ROUNDS = {"network": {"architecture": "guided_denoise", "width": 4, "filter": "own"}, "schedule": "cosine"}
+
+
+@pytest.mark.parametrize("changes", [{}, {**BY_ROUNDS, "rounds": 2.5}], ids=["steps", "rounds"])
+def test_a_killed_run_of_two_goes_on_to_the_same_weights_to_the_bit(make_source, tiny, run, tmp_path, changes) -> None:
+    """Also where both have to know at which step the rounds over the samples end, and so the rate falls to 0."""
+    settings, killed = tiny(batch=4, **changes), tmp_path / "killed"
     assert together(lambda: make_source(24), settings, run) == [0, 0]
 
     def die(draws: int, _samples: int) -> None:

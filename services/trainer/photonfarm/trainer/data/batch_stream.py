@@ -136,10 +136,11 @@ class BatchStream:
             self.growth.append((self.drawn, len(self.arrived)))
             self.held_out.extend(row for row, is_held_out in new.items() if is_held_out)
             self._sampler.add(row for row, is_held_out in new.items() if not is_held_out)
-        last = self._rounds * len(self.training_rows) // self._settings.batch if self.complete else math.inf
-        if last < math.inf and last != self.last_step:
-            self.last_step = int(last)
-            self._ranks.send("last", self.last_step)
+        ends = self.complete and self._rounds < math.inf
+        last_step = int(self._rounds * len(self.training_rows)) // self._settings.batch if ends else None
+        if last_step != self.last_step:
+            self.last_step = last_step
+            self._ranks.send("last", last_step)
 
     def may_draw(self) -> bool:
         """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and `minimum_samples` have arrived.
@@ -207,16 +208,15 @@ class BatchStream:
             "sampler": self._sampler.state(),
             "asked": [list(rows) for rows in (*self._restored, *self._asked)],
             "drawn": self.drawn,
-            "last_step": self.last_step,
             "arrived": torch.tensor(self.arrived, dtype=torch.int64),
             "growth": torch.tensor(self.growth, dtype=torch.int64).reshape(-1, 2),
             "held_out": torch.tensor(self.held_out, dtype=torch.int64),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Continue from what `state` returned."""
+        """Continue from what `state` returned; then `look`, as more may be planned by now."""
         self._sampler.restore(state["sampler"])
-        self.drawn, self.last_step = state["drawn"], state.get("last_step")
+        self.drawn = state["drawn"]
         self.arrived = state["arrived"].tolist()
         self.growth = [(drawn, arrived) for drawn, arrived in state["growth"].tolist()]
         self.held_out = state["held_out"].tolist()

@@ -208,13 +208,14 @@ class Learner:
         for options in self.optimiser.param_groups:
             options["lr"] = self.rate(number) * options["factor"]
         self.optimiser.zero_grad()
-        batch = batch.to(self._device).for_training()
+        given = batch.to(self._device)
+        batch = given.for_training()
         image = predict_image(self.network, batch.inputs)
         loss = self._loss(image, batch.target)
         self._note_excess(number, image.detach(), batch)
         torch.autograd.backward(loss)
         mean_loss = self._ranks.average_gradients(list(self.network.parameters()), loss, len(batch.rows))
-        self._note_gradient(batch)
+        self._note_gradient(given)
         self.optimiser.step()
         if self.average is not None:
             self.average.take(self.network)
@@ -269,7 +270,8 @@ class Learner:
         """The shares of black or near views among samples, and in the squared gradient, since the last call."""
         poor, samples, of_poor, squared = [0.0, 1, 0, 1] if self._poor is None else self._poor.tolist()
         self._poor = None
-        return {"samples": poor / samples, "gradient": of_poor / squared} if poor and squared else {}
+        is_known = poor > 0 and 0 < squared < math.inf  # not so after a step whose gradient was not finite
+        return {"samples": poor / samples, "gradient": of_poor / squared} if is_known else {}
 
     def describe_excess(self, steps_of_each: float) -> dict[str, float]:
         """The excess of the last steps, and of a network of halves the rounds over them."""

@@ -179,6 +179,7 @@ class Session:
         self._send_begin(continues=True)
         self._feed.expect(state["following"]["arrived"].tolist())
         self._stream.restore(state["following"])
+        self._stream.look()
         return changed
 
     def _send_begin(self, *, continues: bool) -> None:

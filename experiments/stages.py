@@ -129,9 +129,10 @@ class Stages:
             return False
         state = checkpoint.load(self._checkpoint(run))
         settings = {"scene_id": state["scene_id"], **state["settings"], **state["settings"]["network"]}
+        asked = json.loads(json.dumps({"scene_id": self._scene_id, **self._asked(run)}))  # in the checkpoint's types
         differing = [
             f"{key} = {settings.get(key)!r}, and {value!r} is asked for now"
-            for key, value in {"scene_id": self._scene_id, **self._asked(run)}.items()
+            for key, value in asked.items()
             if settings.get(key) != value
         ]
         if differing:

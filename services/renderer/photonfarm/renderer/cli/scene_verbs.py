@@ -1,4 +1,4 @@
-"""Verbs of scenes: `check`, `import`, `shapes` show or make one; `cost`, `exposure`, `free-space`, `plan` measure it."""
+"""Verbs of scenes: `check`, `import`, `shapes` show or make one; `cost`, `exposure`, `free-space`, `plan` measure."""
 
 from __future__ import annotations
 

@@ -19,6 +19,7 @@ from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
 from photonfarm.trainer.networks.guided_denoise import filter_light, look_at_half
 from photonfarm.trainer.networks.inputs import SceneFrame
+from photonfarm.trainer.predictors import half_filter
 from photonfarm.trainer.predictors.half_filter import FOLDER, HalfFilter, settle_filter
 from photonfarm.trainer.runs.checkpoint import load
 from photonfarm.trainer.runs.devices import Ranks
@@ -236,24 +237,35 @@ def test_oidn_s_images_come_with_the_batch_and_are_kept_beside_the_run(make_sour
     pytest.importorskip("mitsuba_oidn", reason="the extra `oidn` is not installed")
     source, settings = make_source(2), settle_filter(settings_of())
     assert settings.network.filter == "oidn"
-    batch, keys = batch_of(source, (0, 1), NEEDS), source.sample_keys((0, 1))
+    batch = batch_of(source, (0, 1), NEEDS)
     with pytest.raises(ValueError, match="inputs"):
         network(source, filter="oidn-fast")(batch.inputs)
 
     def filtered(given: TrainingBatch) -> TrainingBatch:
-        return HalfFilter(settings, run=tmp_path).filter_both(given, keys)
+        return HalfFilter(settings, run=tmp_path).filter_both(given)
 
     one, again = filtered(batch), filtered(batch)
-    assert len(list((tmp_path / FOLDER).glob("oidn-*/*.npy"))) == 2
+    assert len(list((tmp_path / FOLDER).glob("oidn-*/*.npy"))) == 4
     assert torch.equal(one.inputs.noisy.filtered, again.inputs.noisy.filtered)
     assert torch.equal(one.other.filtered, again.other.filtered)
     poked = replace(batch, other=replace(batch.other, colour=batch.other.colour + 1))
-    fresh = HalfFilter(settings).filter_both(poked, keys)
+    fresh = filtered(poked)  # which nothing kept of another half stands for
+    assert len(list((tmp_path / FOLDER).glob("oidn-*/*.npy"))) == 6
     assert torch.equal(fresh.inputs.noisy.filtered, one.inputs.noisy.filtered)
     assert not torch.equal(fresh.other.filtered, one.other.filtered)
     at_prediction = HalfFilter(settings)(batch.inputs)
     assert torch.equal(at_prediction.noisy.filtered, one.inputs.noisy.filtered)
     assert torch.isfinite(network(source, filter="oidn-fast")(at_prediction)).all()
+
+
+def test_a_run_goes_on_by_the_filter_that_it_was_begun_with(make_source, run, monkeypatch) -> None:
+    settings = settings_of(batch=2, hold_out=0.25, poll_seconds=0.01)
+    monkeypatch.setattr(half_filter, "find_spec", lambda _: None)
+    train(make_source(16), settings.model_copy(update={"max_steps": 1}), run)
+    monkeypatch.setattr(half_filter, "find_spec", lambda _: "installed since")
+    assert settle_filter(settings).network.filter == "oidn"
+    train(make_source(16), settings.model_copy(update={"max_steps": 2}), run)
+    assert load(run / CHECKPOINT)["settings"]["network"]["filter"] == "own"
 
 
 def test_noise_is_found_from_neighbours_where_there_is_one_pass(make_source) -> None:

@@ -53,12 +53,12 @@ class Feed:
         clock: Callable[[], float] = time.monotonic,
         needs: Needs | None = None,
         resident: ResidentSamples | None = None,
-        finish: Callable[[TrainingBatch, Sequence[Key]], TrainingBatch] | None = None,
+        finish: Callable[[TrainingBatch], TrainingBatch] | None = None,
     ) -> None:
         """Feed a batch with the inputs that the settings' network needs, or those in `needs`.
 
-        With `resident`, samples are kept there, and batches are on its device. What is read, of samples of some keys,
-        is what `finish` makes of it.
+        With `resident`, samples are kept there, and batches are on its device. What is read is what `finish` makes of
+        it.
         """
         self._finish = finish
         self._source, self._settings, self._clock = source, settings, clock
@@ -242,7 +242,7 @@ class Feed:
         fresh = rows if self._resident is None else self._resident.list_lacking(rows)
         batch = read_batch(self._source, self._dataset, fresh, self._needs, memory)
         if self._finish is not None and fresh:
-            batch = self._finish(batch, self._source.sample_keys(fresh))
+            batch = self._finish(batch)
         return batch if self._resident is None else self._resident.batch(rows, batch)
 
 

@@ -1,12 +1,14 @@
-"""A denoiser's images of noisy halves, for networks that are given both: made once a sample, and kept beside the run.
+"""A denoiser's images of noisy halves, for networks that are given both: made once a half, and kept beside the run.
 
-They are a function of the half, of what surfaces reflect and of normals, and of the denoiser's version and quality,
-which name their folder. They are no part of the store, whose samples nothing has denoised.
+They are a function of the half, of what surfaces reflect and of normals, whose digest is their name, and of the
+denoiser's version and quality, which name their folder. They are no part of the store, whose samples nothing has
+denoised.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+from collections.abc import Callable
 from dataclasses import replace
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -18,11 +20,12 @@ from torch import Tensor
 
 from photonfarm.core.errors import store_errors
 from photonfarm.core.files import whole_file
-from photonfarm.core.keys import Key
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import find_kind
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, replace_albedo, require
 from photonfarm.trainer.predictors.denoisers import OIDN, PACKAGE, Oidn
+from photonfarm.trainer.runs import checkpoint
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings
 
 FOLDER = "filtered"
@@ -34,12 +37,18 @@ def uses_denoiser(settings: TrainSettings) -> bool:
     return find_kind(settings.network.architecture).needs.passes and settings.network.filter in OIDN
 
 
-def settle_filter(settings: TrainSettings) -> TrainSettings:
-    """The settings with the denoiser named that is there, where they leave that open to a network of halves."""
+def settle_filter(settings: TrainSettings, run: Path | None = None) -> TrainSettings:
+    """The settings with the filter named that a `run` was begun with, or else that is there.
+
+    If they leave that open to a network of halves; else as they are. Raises StoreError for an unreadable checkpoint.
+    """
     network = settings.network
     if network.filter != "auto" or not find_kind(network.architecture).needs.passes:
         return settings
     chosen = "own" if find_spec(PACKAGE) is None else "oidn"
+    if run is not None and (run / CHECKPOINT).exists():
+        begun = checkpoint.load(run / CHECKPOINT)["settings"]["network"]
+        chosen = begun["filter"] if begun.get("filter", "auto") != "auto" else chosen
     return settings.model_copy(update={"network": network.model_copy(update={"filter": chosen})})
 
 
@@ -58,55 +67,39 @@ class HalfFilter:
     def __call__(self, inputs: Inputs) -> Inputs:
         """The inputs with the half filtered; as they are if it is."""
         noisy = require(inputs.noisy)
-        if noisy.filtered is not None:
-            return inputs
-        return replace(inputs, noisy=replace(noisy, filtered=self._denoise(inputs, [noisy])[:, 0]))
+        return inputs if noisy.filtered is not None else replace(inputs, noisy=self._filter(inputs, noisy))
 
-    def filter_both(self, batch: TrainingBatch, keys: Sequence[Key]) -> TrainingBatch:
-        """A batch on the processor, of the samples of these keys, with both halves filtered.
-
-        Raises StoreError where the images cannot be kept.
-        """
-        halves = [require(batch.inputs.noisy), require(batch.other)]
-        found = [self._read(key, halves[0].colour.shape[1:]) for key in keys]
-        if any(images is None for images in found):
-            made = self._denoise(batch.inputs, halves)
-            for place, key in enumerate(keys):
-                if found[place] is None:
-                    found[place] = made[place]
-                    self._write(key, made[place])
-        images = torch.stack([require(each) for each in found])
-        a, b = (replace(half, filtered=images[:, place]) for place, half in enumerate(halves))
+    def filter_both(self, batch: TrainingBatch) -> TrainingBatch:
+        """A batch on the processor with both halves filtered. Raises StoreError where the images cannot be kept."""
+        a, b = (self._filter(batch.inputs, require(half)) for half in (batch.inputs.noisy, batch.other))
         return replace(batch, inputs=replace(batch.inputs, noisy=a), other=b)
 
-    def _denoise(self, inputs: Inputs, halves: Sequence[NoisyColour]) -> Tensor:
-        """The images of some halves of each sample, (B, n, H, W, 3)."""
-        albedo = replace_albedo(inputs.albedo, require(inputs.guides))
-        return torch.stack(
-            [
-                torch.stack([self._oidn.denoise(half.colour[place], *surfaces) for half in halves])
-                for place, surfaces in enumerate(zip(albedo, inputs.normal, strict=True))
-            ]
-        )
+    def _filter(self, inputs: Inputs, half: NoisyColour) -> NoisyColour:
+        """A half of each sample with its image."""
+        surfaces = replace_albedo(inputs.albedo, require(inputs.guides)), inputs.normal
+        images = [self._find_image(*given) for given in zip(half.colour, *surfaces, strict=True)]
+        return replace(half, filtered=torch.stack(images))
 
-    def _file(self, key: Key) -> Path:
-        return require(self._folder) / f"{key.hex()}.npy"
-
-    def _read(self, key: Key, shape: torch.Size) -> Tensor | None:
+    def _find_image(self, *given: Tensor) -> Tensor:
+        """The denoiser's image of colour, albedo and normals, (H, W, 3): a kept one if there is one, or a new one."""
         if self._folder is None:
-            return None
+            return self._oidn.denoise(*given)
+        digest = hashlib.sha256()
+        for image in given:
+            digest.update(image.numpy().tobytes())
+        file = self._folder / f"{digest.hexdigest()}.npy"
         try:
-            images = np.load(self._file(key))
+            image = torch.from_numpy(np.load(file))
+            if image.shape == given[0].shape:
+                return image
         except (OSError, ValueError, EOFError):
-            return None  # not there, or cut short by a machine that failed
-        return torch.from_numpy(images) if images.shape == (2, *shape) else None
-
-    def _write(self, key: Key, images: Tensor) -> None:
-        if self._folder is not None:
-            with store_errors("keep filtered images", self._folder), whole_file(self._file(key)) as part:
-                np.save(part, images.numpy())
+            pass  # not there, or cut short by a machine that failed
+        image = self._oidn.denoise(*given)
+        with store_errors("keep filtered images", self._folder), whole_file(file) as part:
+            np.save(part, image.numpy())
+        return image
 
 
-def choose_filter(settings: TrainSettings, run: Path) -> Callable[[TrainingBatch, Sequence[Key]], TrainingBatch] | None:
+def choose_filter(settings: TrainSettings, run: Path) -> Callable[[TrainingBatch], TrainingBatch] | None:
     """What filters the halves of batches for a run, before its network sees them; None if nothing is to."""
     return HalfFilter(settings, run=run).filter_both if uses_denoiser(settings) else None

@@ -77,7 +77,7 @@ def train(source: SceneReader, settings: TrainSettings, run: Path, hooks: Hooks 
     the held-out error are not finite, or much worse than before, and there is no good state, or the run has gone back
     too often; the last checkpoint stays.
     """
-    hooks, settings = hooks or Hooks(), settle_filter(settings)
+    hooks, settings = hooks or Hooks(), settle_filter(settings, run)
     torch.set_num_threads(settings.threads)
     usable_device(settings.device)
     watch = Stopwatch(hooks.clock, "wait_data", hooks.waited, hooks.on_phase)

@@ -36,7 +36,7 @@ def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings,
 
     A resumed run is read from the folder `run`, which rank 0 writes. Raises what `train` does.
     """
-    settings = settle_filter(settings)
+    settings = settle_filter(settings, run)
     torch.set_num_threads(settings.threads)
     command, value = ranks.receive()
     if command == "end":

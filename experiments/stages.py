@@ -145,9 +145,9 @@ class Stages:
 
     def _asked(self, run: Run) -> dict[str, Any]:
         """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""
-        from photonfarm.trainer.runs.settings import PRESETS
+        from photonfarm.trainer.runs.settings import find_preset
 
-        preset = dict(PRESETS[run.train["preset"]])
+        preset = dict(find_preset(run.train["preset"], run.train["architecture"]))
         return {**preset.pop("network"), **preset, **self._settings(run)}
 
     def _settings(self, run: Run) -> dict[str, Any]:

@@ -111,7 +111,7 @@ def measure(store: Path, runs: Sequence[TrainedRun], passes: Sequence[int], leas
             interval = 1.96 * (difference.standard_error or np.nan) / best.mean()
             rows.append(
                 (
-                    str(2 * source.spec.transport.half_spp * count // 2),
+                    str(source.spec.transport.half_spp * count),
                     name,
                     f"{own.mean():.5f} ± {1.96 * own.std(ddof=1) / len(own) ** 0.5:.5f}",
                     f"{own.mean() / best.mean():.2f} ± {interval:.2f}",

@@ -31,8 +31,9 @@ HAND = 1 / 64
 
 def hand_of(spec: SceneSpec) -> float:
     """A hand in scene units."""
-    boxes = spec.view.origin, spec.view.look_at
-    low, high = (list(map(end, *(getattr(box, name) for box in boxes))) for name, end in (("min", min), ("max", max)))
+    origin, look_at = spec.view.origin, spec.view.look_at
+    low = [min(pair) for pair in zip(origin.min, look_at.min, strict=True)]
+    high = [max(pair) for pair in zip(origin.max, look_at.max, strict=True)]
     return HAND * math.dist(low, high)
 
 

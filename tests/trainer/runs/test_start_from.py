@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.trainer import service
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, read_log
@@ -75,3 +76,9 @@ def test_weights_of_another_network_are_refused_by_each_setting(
         begin("second", start_from=str(first), network={**NETWORK, **network})
     with pytest.raises(StoreError):
         begin("third", start_from=str(first.with_name("none")))
+
+
+def test_a_folder_that_holds_no_run_is_refused_before_samples_are_waited_for(tmp_path: Path) -> None:
+    changes = {"start_from": str(tmp_path / "none"), "max_seconds": 60.0}
+    with pytest.raises(StoreError):
+        service.run("cornell", tmp_path / "store", tmp_path / "run", "small", changes, log=str)

@@ -24,6 +24,7 @@ from photonfarm.store.read.find import describe_scenes
 from photonfarm.trainer.runs import user_code
 from photonfarm.trainer.runs.progress import RunProgress, follow_progress
 from photonfarm.trainer.runs.run_folder import (
+    CHECKPOINT,
     INITIAL,
     lock_run,
     note_preset,
@@ -77,6 +78,7 @@ def run(
     Raises IncompleteError if the time is over before there is anything to train on, and with `until_complete` also if a
     signal stops it.
     """
+    from photonfarm.trainer.runs import checkpoint
     from photonfarm.trainer.runs.devices import describe_device, join_ranks
     from photonfarm.trainer.training.loop import Hooks
     from photonfarm.trainer.training.other_ranks import assist
@@ -85,6 +87,8 @@ def run(
     for key, name in (("architecture", settings.network.architecture), ("loss", settings.loss)):
         if user_code.is_own(name):
             user_code.load(key, name)  # so that a mistake is said before samples are waited for
+    if settings.start_from is not None and not (folder / CHECKPOINT).exists():
+        checkpoint.load(Path(settings.start_from) / CHECKPOINT)  # likewise
     with join_ranks(settings.device, settings.batch) as ranks, stop_on_signals() as stop:
         device = ranks.device(settings.device)
         if ranks.rank:

@@ -41,9 +41,10 @@ Request = tuple[int, ...] | Callable[[], object] | None
 class Feed:
     """Batches in the order of their requests, and rows as they arrive; a context manager.
 
-    Only the feed's thread uses the source. On a CPU there is no cache of samples besides the batches, unless one is
-    asked for: to read a sample from the system's cache, checked, takes less than half of the time to write it into a
-    batch (docs/results/train_step.md), so that a cache would hardly be worth its memory.
+    Only the feed's thread uses the source, but for `is_skipped`, which reads. On a CPU there is no cache of samples
+    besides the batches, unless one is asked for: to read a sample from the system's cache, checked, takes less than
+    half of the time to write it into a batch (docs/results/train_step.md), so that a cache would hardly be worth its
+    memory.
     """
 
     def __init__(

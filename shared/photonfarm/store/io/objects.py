@@ -19,6 +19,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import threading
 import uuid
 import zipfile
 from collections.abc import Iterable
@@ -73,6 +74,7 @@ class ObjectStorage:
         self._objects = connect(self._url, TIMEOUT_S)
         self._transfers = connect(self._url, TRANSFER_TIMEOUT_S)
         self._cache = ObjectCache.of(self._url)
+        self._transfer = threading.Lock()
         self._is_conditional = False
 
     @property
@@ -261,16 +263,19 @@ class ObjectStorage:
         """Put an object if there is none, or with `replace` in place of the current one; False if that is refused.
 
         It is tried for PATIENCE_S while the server fails, or refuses for another put that may fail. The replaced object
-        is identified by its tag, so that a put that arrives late cannot undo a later one.
+        is identified by its tag, so that a put that arrives late cannot undo a later one. Of larger objects one is put
+        at a time: they would share the bandwidth that their time limit counts on, and lie in memory together.
         """
         writer = uuid.uuid4().hex
         size = content.stat().st_size if isinstance(content, Path) else len(content)
-        objects = self._transfers if size > SMALL_BYTES else self._objects
+        is_small = size <= SMALL_BYTES
+        objects = self._objects if is_small else self._transfers
 
         def attempt() -> bool:
             mode: PutMode = self._mode(name) if replace else "create"
             try:
-                obstore.put(objects, name, content, mode=mode, attributes={WRITER: writer}, use_multipart=False)
+                with contextlib.nullcontext() if is_small else self._transfer:
+                    obstore.put(objects, name, content, mode=mode, attributes={WRITER: writer}, use_multipart=False)
             except (AlreadyExistsError, PreconditionError):
                 holder = self._writer(name)
                 if holder == writer:
@@ -281,7 +286,7 @@ class ObjectStorage:
             return True
 
         with os_errors(name):
-            times = TRANSFER_TIMES if size > SMALL_BYTES else 1
+            times = 1 if is_small else TRANSFER_TIMES
             return patiently(attempt, AlreadyExistsError, PreconditionError, times=times)
 
     def _mode(self, name: str) -> PutMode:

@@ -130,6 +130,26 @@ def test_a_long_transfer_that_breaks_off_is_begun_again_though_its_time_is_over(
             put(storage, bytes(size), "object")
 
 
+@pytest.mark.parametrize("size", [10, objects.SMALL_BYTES + 1])
+def test_large_objects_are_put_one_at_a_time_and_small_ones_together(
+    url: str, monkeypatch: pytest.MonkeyPatch, size: int
+) -> None:
+    storage, plain, under_way = ObjectStorage(url), obstore.put, [0, 0]  # now, and at most
+    storage.check()
+
+    def counting(*args: Any, **how: Any) -> Any:
+        under_way[0] += 1
+        under_way[1] = max(under_way)
+        time.sleep(0.2)
+        made = plain(*args, **how)
+        under_way[0] -= 1
+        return made
+
+    monkeypatch.setattr(obstore, "put", counting)
+    assert all(at_once(*(lambda number=number: put(storage, bytes(size), f"object-{number}") for number in range(3))))
+    assert (under_way[1] == 1) is (size > objects.SMALL_BYTES)
+
+
 def test_a_refusal_is_told_at_once(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     storage = ObjectStorage(url)
     put(storage, b"", "object")

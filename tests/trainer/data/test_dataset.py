@@ -178,7 +178,10 @@ def test_where_a_look_at_the_store_takes_long_looks_are_rare(repaired, tiny, mon
 
 
 def test_views_that_are_skipped_are_never_drawn_and_stay_held_out(scene, commit, tiny) -> None:
-    """Rows 0 to 3 are near, and so is 14 as it happens; without the setting they are drawn as all others are."""
+    """Rows 0 to 3 are near, and so is 14 as it happens; without the setting they are drawn as all others are.
+
+    Where rounds are limited, the others are drawn no more often for that.
+    """
     scene.plan(Request(modifications=16), shard_rows=8)
     rows = scene.job_rows(0)
     with JobWriter(scene, rows) as out:
@@ -203,3 +206,14 @@ def test_views_that_are_skipped_are_never_drawn_and_stay_held_out(scene, commit,
     everything, held_out = drawn()
     assert everything | set(held_out) == set(range(16))
     assert drawn(skip_views=["unlit", "near"]) == (everything - {0, 1, 2, 3, 14}, held_out)
+
+    network = {"architecture": "guided_denoise", "width": 4, "points": 64, "filter": "own"}
+    settings = tiny(prefetch=16, hold_out=0.1, network=network, rounds=2, skip_views=["near"])
+    with Feed(SceneReader(scene.storage.root, scene.scene_id), settings) as feed:
+        stream, again = (BatchStream(feed, settings, Ranks()) for _ in range(2))
+        stream.draw_ahead(16)
+        stream.look()
+        assert stream.drawn == stream.last_step == 2 * len(everything - {0, 1, 2, 3, 14}) // settings.batch
+        again.restore(stream.state())
+        again.complete = stream.complete
+        assert not again.may_draw()

@@ -112,6 +112,7 @@ class BatchStream:
         self._feed, self._settings, self._ranks = feed, settings, ranks
         self._sampler = RoundSampler(settings.seed, settings.catch_up)
         self._known: set[int] = set()
+        self._skipped: set[int] = set()  # of the training rows that were drawn so far
         self._asked: deque[tuple[int, ...]] = deque()  # drawn, not yet trained on
         self._restored: list[tuple[int, ...]] = []  # the same of an earlier session, not requested in this one yet
         self._rounds = settings.rounds if find_kind(settings.network.architecture).needs.passes else math.inf
@@ -137,21 +138,26 @@ class BatchStream:
             self.held_out.extend(row for row, is_held_out in new.items() if is_held_out)
             self._sampler.add(row for row, is_held_out in new.items() if not is_held_out)
         ends = self.complete and self._rounds < math.inf
-        last_step = int(self._rounds * len(self.training_rows)) // self._settings.batch if ends else None
+        last_step = int(self._rounds * self._count_left()) // self._settings.batch if ends else None
         if last_step != self.last_step:
             self.last_step = last_step
             self._ranks.send("last", last_step)
+
+    def _count_left(self) -> int:
+        """The training rows without those that are known to be skipped, as all are once each has been drawn."""
+        return len(self.training_rows) - len(self._skipped)
 
     def may_draw(self) -> bool:
         """Whether another batch may be drawn: draws ≤ R × arrived + buffer, and `minimum_samples` have arrived.
 
         Once everything planned has arrived, there is no limit but that of `rounds`, where a network has one.
         """
-        arrived, s = len(self.training_rows), self._settings
+        arrived, s = self._count_left(), self._settings
         draws = (self.drawn + 1) * s.batch
         if self.complete:
             return arrived > 0 and draws <= self._rounds * arrived
-        return arrived >= s.minimum_samples and draws <= min(s.replay_ratio, self._rounds) * arrived + s.replay_buffer
+        is_enough = len(self.training_rows) >= s.minimum_samples
+        return is_enough and draws <= min(s.replay_ratio, self._rounds) * arrived + s.replay_buffer
 
     def draw_ahead(self, until: int) -> bool:
         """Draw and request batches, up to `prefetch` ahead and up to batch `until`; False if no batch is requested."""
@@ -171,7 +177,8 @@ class BatchStream:
         size, rounds = self._settings.batch, 2 + self._settings.catch_up
         for _ in range(size * rounds * len(self.training_rows)):  # by then each row has come so many times
             drawn = self._sampler.draw(size - len(rows))
-            rows += (row for row in drawn if not self._feed.is_skipped(row))
+            self._skipped.update(filter(self._feed.is_skipped, drawn))
+            rows += (row for row in drawn if row not in self._skipped)
             if len(rows) == size:
                 return tuple(rows)
         skipped = ", ".join(self._settings.skip_views)
@@ -211,6 +218,7 @@ class BatchStream:
             "arrived": torch.tensor(self.arrived, dtype=torch.int64),
             "growth": torch.tensor(self.growth, dtype=torch.int64).reshape(-1, 2),
             "held_out": torch.tensor(self.held_out, dtype=torch.int64),
+            "skipped": torch.tensor(sorted(self._skipped), dtype=torch.int64),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -220,5 +228,5 @@ class BatchStream:
         self.arrived = state["arrived"].tolist()
         self.growth = [(drawn, arrived) for drawn, arrived in state["growth"].tolist()]
         self.held_out = state["held_out"].tolist()
-        self._known = set(self.arrived)
+        self._known, self._skipped = set(self.arrived), set(state.get("skipped", torch.zeros(0)).tolist())
         self._restored = [tuple(rows) for rows in state["asked"]]

@@ -9,7 +9,7 @@ import torch
 from analytic_room import render, visibility
 from analytic_room_samples import known
 
-from photonfarm.core.errors import CorruptError, IncompleteError
+from photonfarm.core.errors import CorruptError, IncompleteError, SpecError
 from photonfarm.core.records import LIT_POINTS, ViewBuffers, Visibility
 from photonfarm.plan.hold_out import are_held_out, rows_held_out
 from photonfarm.plan.request import Request
@@ -175,6 +175,20 @@ def test_where_a_look_at_the_store_takes_long_looks_are_rare(repaired, tiny, mon
         feed.ask([0])
         assert feed.take().rows == (0,), "batches do not wait for the next look"
     assert len(looks) == 1, "the next one is due 4 s after the first"
+
+
+def test_skipped_views_alone_are_waited_for_while_more_are_to_come_and_refused_then(
+    make_source, tiny, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = tiny(skip_views=["near"], minimum_samples=1, poll_seconds=1e9)
+    with Feed(make_source(24, per_look=12), settings) as feed:
+        monkeypatch.setattr(feed, "is_skipped", lambda _: True)
+        stream = BatchStream(feed, settings, Ranks())
+        assert not stream.draw_ahead(1)
+        with feed.quiet():
+            pass  # it looks anew
+        with pytest.raises(SpecError):
+            stream.draw_ahead(1)
 
 
 def test_views_that_are_skipped_are_never_drawn_and_stay_held_out(scene, commit, tiny) -> None:

@@ -51,7 +51,7 @@ def train(
     from photonfarm.trainer import service
     from photonfarm.trainer.predictors.trained import TrainedRun
 
-    preset = preset or service.find_preset(Path(run), settings)
+    preset = preset or service.find_preset_name(Path(run), settings)
     scene_id = scene_named(Store(store), scene)
     service.run(None, store, Path(run), preset, settings, redis_url, scene_id=scene_id, log=log)
     return TrainedRun.load(Path(run))

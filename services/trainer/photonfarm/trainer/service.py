@@ -48,7 +48,7 @@ REPORT_S = 5.0  # between reports to the workers
 ALIVE_S = 60.0  # a run whose sign of life is older counts as dead
 
 
-def find_preset(folder: Path, changes: Mapping[str, Any]) -> str:
+def find_preset_name(folder: Path, changes: Mapping[str, Any]) -> str:
     """The preset of a run for which none is named: the one that it was begun with, or else that of its device."""
     from photonfarm.trainer.runs.devices import AUTO, choose_preset
 

@@ -196,7 +196,7 @@ def train(
     if check:
         service.check(run)
         return
-    preset = preset or service.find_preset(run, changes)
+    preset = preset or service.find_preset_name(run, changes)
     if summary:
         click.echo(service.summarise(spec, store, preset, changes))
     elif dry_run:

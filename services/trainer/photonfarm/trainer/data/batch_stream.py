@@ -167,12 +167,17 @@ class BatchStream:
             self.look()
             if not self.may_draw():
                 break
-            self._ask(self._draw())
+            if not (rows := self._draw()):
+                break
+            self._ask(rows)
             self.drawn += 1
         return bool(self._asked)
 
     def _draw(self) -> tuple[int, ...]:
-        """The rows of the next batch; skipped ones are drawn and passed over. Raises SpecError if all are skipped."""
+        """The rows of the next batch; skipped ones are drawn and passed over.
+
+        No rows if all that have arrived are skipped; SpecError once everything has arrived.
+        """
         rows: list[int] = []
         size, rounds = self._settings.batch, 2 + self._settings.catch_up
         for _ in range(size * rounds * len(self.training_rows)):  # by then each row has come so many times
@@ -181,8 +186,10 @@ class BatchStream:
             rows += (row for row in drawn if row not in self._skipped)
             if len(rows) == size:
                 return tuple(rows)
+        if not self.complete:
+            return ()
         skipped = ", ".join(self._settings.skip_views)
-        raise SpecError(f"skip_views: without views that are {skipped}, none of those that have arrived is left")
+        raise SpecError(f"skip_views: without views that are {skipped}, none of those planned is left")
 
     def _ask(self, rows: tuple[int, ...]) -> None:
         self._asked.append(rows)

@@ -34,7 +34,7 @@ from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSetting
 FORMAT = 5
 ANEW = "remove it, and the run begins anew"
 TENSOR = "tensor"
-OIDN = "mitsuba-oidn"  # which filters what some networks are given
+DENOISER = "mitsuba-oidn"  # which filters what some networks are given
 
 LASTING = ("scene_id", "exposure", "network", "batch", "hold_out", "optimiser", "loss", "seed", "start_from")
 """The settings that a run keeps for ever. The others may change when it is resumed."""
@@ -163,7 +163,7 @@ def list_versions() -> dict[str, str]:
     """The versions of the packages that a run's arithmetic depends on."""
     others = {"python": platform.python_version(), "torch": torch.__version__, "numpy": np.__version__}
     with suppress(PackageNotFoundError):
-        others[OIDN] = version(OIDN)
+        others[DENOISER] = version(DENOISER)
     return {"photonfarm": version("photonfarm"), **others}
 
 

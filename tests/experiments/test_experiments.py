@@ -1,4 +1,4 @@
-"""The experiments' files, and the way through all stages of a tiny one."""
+"""The way through all stages of a tiny experiment."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import shutil
 import subprocess
 import sys
 import time
-from itertools import product
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +18,7 @@ import pytest
 from experiments import experiment, free_space, run
 from experiments.dry_run import Need
 from experiments.equal_time import place_rows
-from experiments.experiment import FREE_SPACE, Experiment, Size, SizeName, keep_free_space, list_names, merge
+from experiments.experiment import Experiment, Size, keep_free_space, merge
 from experiments.paper_tables import format_errors
 from experiments.path_tracing import SPP
 from experiments.rooms import Room
@@ -28,43 +27,7 @@ from experiments.tables import format_page
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.plan.sample_costs import SampleCosts
 from photonfarm.scene.free_space import FreeSpace, pack
-from photonfarm.scene.spec import Emitters
-from photonfarm.scene.spec_loading import SCENES_VARIABLE
 from photonfarm.trainer.report.contents import MOVABLE_LIGHTS
-
-ROOMS = ("dining-room", "living-room", "living-room-2", "veach-ajar")
-EXPECTED = [*(f"{lights}-{room}" for lights in ("fixed", "movable") for room in ROOMS)]
-EXPECTED += ["night-dining-room", "night-living-room", "night-living-room-2"]
-EXPECTED += ["static-ablation", "static-bathroom", "static-kitchen", "vanishing-living-room-2"]
-
-
-def test_the_experiments_are_all_there_and_others_are_refused() -> None:
-    assert list_names() == EXPECTED == list(json.loads((experiment.HERE / FREE_SPACE).read_text()))
-    with pytest.raises(SpecError, match="fixed-dining-room"):
-        Experiment.load("kitchen-sink", "small")
-
-
-@pytest.mark.parametrize(("name", "size"), [*product(EXPECTED, get_args(SizeName))])
-def test_an_experiment_s_file_is_right_in_both_sizes(name: str, size: SizeName) -> None:
-    found = Experiment.load(name, size)
-    runs = {run.name: run.train for run in found.trained()}
-    assert {"light_transport", "cnn"} <= set(runs)
-    losses = {settings["loss"] for settings in runs.values() if not settings["architecture"].startswith("denoise")}
-    assert len(losses) == 1, "networks of one table are trained alike"
-
-
-@pytest.mark.skipif(SCENES_VARIABLE not in os.environ, reason=f"{SCENES_VARIABLE} names no folder with the rooms")
-@pytest.mark.parametrize("name", EXPECTED)
-def test_an_experiment_s_scene_is_what_its_name_says(name: str) -> None:
-    spec, paper = (Experiment.load(name, size).spec() for size in ("small", "paper"))
-    assert spec.credits is not None
-    assert spec.view.free_space is not None
-    assert bool(spec.lights) == name.startswith(("movable", "night", "vanishing"))
-    assert (spec.emitters == Emitters(all=0)) == name.startswith(("night", "vanishing"))
-    assert bool(spec.objects) != name.startswith("static")
-    size = 128 if name == "static-ablation" else 256
-    assert (paper.film.width, paper.film.height) == (size, size)
-
 
 TINY = """
 title = "A tiny room"
@@ -148,12 +111,6 @@ def test_free_space_is_measured_for_an_experiment_s_own_groups(
 
 def with_size(tiny: Experiment, **changes: Any) -> Experiment:
     return tiny.model_copy(update={"size": tiny.size.model_copy(update=changes)})
-
-
-def test_the_size_card_is_for_ten_minutes_a_network_and_has_the_most_telling_first() -> None:
-    found = Experiment.load("fixed-veach-ajar", "card")
-    assert [run.name for run in found.trained()[:2]] == ["guided_transport", "denoise_1"]
-    assert all(run.train["max_seconds"] == 600 for run in found.trained())
 
 
 SMALLEST_CARD = """

@@ -104,7 +104,10 @@ def submit(
     else:
         url = None if no_queue else redis_url
         result = submission.submit(
-            *(named, store, url, request),
+            named,
+            store,
+            url,
+            request,
             retry=retry,
             shard_rows=shard_rows,
             on_card=is_card_wanted(os.environ.get(DEVICE_VARIABLE) or AUTO),

@@ -229,10 +229,8 @@ class SceneReader:
         modification_row = self.modification_row(row)
         with self._reading([row], "read photons"):
             bounce = self._read("photon_bounce", modification_row)
-            floats = [f.name for f in fields(Photons) if f.name != "bounce"]
-            read = {
-                name: self._read(f"photon_{name}", modification_row).astype(np.float32, copy=False) for name in floats
-            }
+            names = [f.name for f in fields(Photons) if f.name != "bounce"]
+            read = {name: np.asarray(self._read(f"photon_{name}", modification_row), np.float32) for name in names}
         return Photons(**read, bounce=bounce)
 
     def rows_of_view(self, view_row: int) -> NDArray[np.int64]:

@@ -223,8 +223,8 @@ def test_whoever_submits_a_spec_with_its_scene_beside_it_is_told_how_workers_fin
     (here / "mine/ball.xml").write_text(f'<scene version="3.0.0">{ball}</scene>')
     (here / "mine/ball.toml").write_text('name = "ball"\nscene.file = "ball.xml"\n' + VIEW)
     found = here / "mine"
-    assert (
-        said("submit mine/ball.toml --no-queue")[2] == f"workers find its scene file with PHOTONFARM_SCENES={found}\n"
-    )
+    warning, told = said("submit mine/ball.toml --no-queue")[2].splitlines()
+    assert warning.startswith("warning: mine/ball.toml line 4: cameras may stand inside furniture")
+    assert told == f"workers find its scene file with PHOTONFARM_SCENES={found}"
     monkeypatch.setenv("PHOTONFARM_SCENES", str(found))
-    assert said("submit mine/ball.toml --no-queue")[2] == ""
+    assert said("submit mine/ball.toml --no-queue")[2] == f"{warning}\n"

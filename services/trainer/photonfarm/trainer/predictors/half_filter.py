@@ -38,16 +38,18 @@ def uses_denoiser(settings: TrainSettings) -> bool:
 
 
 def settle_filter(settings: TrainSettings, run: Path | None = None) -> TrainSettings:
-    """The settings with the filter named that a `run` was begun with, or else that is there.
+    """The settings with the filter named, if they leave it open to a network of halves; else as they are.
 
-    If they leave that open to a network of halves; else as they are. Raises StoreError for an unreadable checkpoint.
+    It is the one that the `run` was begun with, or the run that it starts from, or else what is installed. Raises
+    StoreError for an unreadable checkpoint.
     """
     network = settings.network
     if network.filter != "auto" or not find_kind(network.architecture).needs.passes:
         return settings
     chosen = "own" if find_spec(PACKAGE) is None else "oidn"
-    if run is not None and (run / CHECKPOINT).exists():
-        begun = checkpoint.load(run / CHECKPOINT)["settings"]["network"]
+    before = next((each for each in (run, settings.start_from) if each and Path(each, CHECKPOINT).exists()), None)
+    if before is not None:
+        begun = checkpoint.load(Path(before, CHECKPOINT))["settings"]["network"]
         chosen = begun["filter"] if begun.get("filter", "auto") != "auto" else chosen
     return settings.model_copy(update={"network": network.model_copy(update={"filter": chosen})})
 

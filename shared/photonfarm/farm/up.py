@@ -103,7 +103,10 @@ def run_farm(
         stack.enter_context(_unwound_by_sigterm())
         redis = stack.enter_context(EmbeddedRedis(run / "redis"))
         planned = submit(
-            *(named, store, redis.url, request),
+            named,
+            store,
+            redis.url,
+            request,
             retry=True,
             shard_rows=shard_rows,
             workers=workers,

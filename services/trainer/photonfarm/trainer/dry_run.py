@@ -78,7 +78,7 @@ class MadeUpScene:
             tensor.copy_(values < 0.5 if tensor.dtype == torch.bool else values)
         kept = torch.rand(size, spec.film.height, spec.film.width, generator=generator) < 0.5 if needs.kept else None
         batch = TrainingBatch.of(range(size), (b"made up",) * size, tensors, kept)
-        if needs.passes and settings.filter.startswith("oidn"):  # as if they were filtered
+        if needs.passes and settings.has_denoiser:  # as if they were filtered
             a, b = (replace(half, filtered=half.colour) for half in map(require, (batch.inputs.noisy, batch.other)))
             batch = replace(batch, inputs=replace(batch.inputs, noisy=a), other=b)
         inputs = batch.inputs

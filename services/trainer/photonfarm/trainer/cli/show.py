@@ -17,6 +17,7 @@ from photonfarm.core.processes import repeat
 from photonfarm.core.statistics import format_estimate
 from photonfarm.core.waiting import SILENCE_S, Steps
 from photonfarm.trainer.runs import progress
+from photonfarm.trainer.runs.advice import knows_noise
 
 if TYPE_CHECKING:
     from photonfarm.trainer.dry_run import DryRun
@@ -50,7 +51,8 @@ def _format_rounds(of: dict[str, Any]) -> str:
     """How often a network was given each half, and whether it has learned by heart what it goes with."""
     if "rounds" not in of:
         return ""
-    heart = " and learns their noise by heart, as its loss is below that of clean images" if of["excess"] < 0 else ""
+    knows = of["excess_held_out"] and knows_noise(of["excess"], of["excess_held_out"][0])
+    heart = " and learns their noise by heart, as its loss is below that of clean images" if knows else ""
     return f"has seen each half in {of['rounds']:.1f} rounds{heart}; "
 
 

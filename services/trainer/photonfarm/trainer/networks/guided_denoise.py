@@ -57,11 +57,10 @@ class GuidedDenoise(Guided):
     shares: Tensor
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        has_denoiser = settings.filter.startswith("oidn")
-        filters = 2 + has_denoiser
+        filters = 2 + settings.has_denoiser
         further, outputs = HALF_CHANNELS + 6 * filters, 3 + 2 + filters
         super().__init__(settings, frame, transport=LitPoints, further=further, outputs=outputs)
-        self._has_denoiser = has_denoiser
+        self._has_denoiser = settings.has_denoiser
         self.register_buffer("shares", torch.tensor(SHARES[:filters]), persistent=False)
 
     def forward(self, inputs: Inputs) -> Tensor:

@@ -34,7 +34,7 @@ FOLDER = "filtered"
 
 def uses_denoiser(settings: TrainSettings) -> bool:
     """Whether a run's network is given halves that a denoiser has filtered."""
-    return find_kind(settings.network.architecture).needs.passes and settings.network.filter in OIDN
+    return find_kind(settings.network.architecture).needs.passes and settings.network.has_denoiser
 
 
 def settle_filter(settings: TrainSettings, run: Path | None = None) -> TrainSettings:

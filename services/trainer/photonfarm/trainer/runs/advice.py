@@ -56,7 +56,7 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
         f"{max(gain, 0):.0%} off the held-out error"
         for name, (gain, cost) in gains.items()
     )
-    if training < BY_HEART * held_out:
+    if knows_noise(training, held_out):
         worth: Worth = "fresh passes"
         said = "it learns the noise of its samples by heart, as its training loss is below what noise alone leaves"
     elif max(of_steps, of_images) < LEAST_GAIN:
@@ -65,6 +65,11 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
         best = max(gains, key=lambda name: gains[name][0] / ((gains[name][1] or 1) if images_s else 1))
         worth = "more steps" if best == "more steps" else "more images"
     return Advice(worth, f"worth its seconds next: {worth}; {said}")
+
+
+def knows_noise(training: float, held_out: float) -> bool:
+    """Whether the error on training samples is so far below 0 that a network has learned their noise by heart."""
+    return training < BY_HEART * abs(held_out)
 
 
 def _fit_slope(curve: Sequence[tuple[float, float]]) -> float:

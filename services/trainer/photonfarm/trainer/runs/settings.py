@@ -160,6 +160,11 @@ class NetworkSettings(Frozen):
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it
 
+    @property
+    def has_denoiser(self) -> bool:
+        """Whether `filter` names Open Image Denoise, of a run that has begun."""
+        return self.filter not in ("auto", "own")
+
     @model_validator(mode="after")
     def _fits_its_architecture(self) -> Self:
         if self.architecture == "feature_projection" and not self.descriptor:

@@ -38,6 +38,15 @@ class Run(Frozen):
 
     name: Name
     train: Mapping[str, Any]
+    further: tuple[int, ...] = ()  # seeds from which it is trained again
+
+
+class Long(Frozen):
+    """Some of the networks once more, trained for longer, and from how many seeds."""
+
+    steps: int
+    names: tuple[str, ...]
+    seeds: tuple[int, ...] = (0,)
 
 
 class Size(Frozen):
@@ -56,6 +65,7 @@ class Size(Frozen):
     kept: tuple[int, ...]
     halves: tuple[int, ...]
     runs: tuple[Run, ...] = ()  # beside one of each architecture
+    long: Long | None = None
     inception: bool = True  # whether reports have FID, KID and Feature L1
     train: Mapping[str, Any]
     train_denoisers: Mapping[str, Any]
@@ -106,29 +116,39 @@ class Experiment(Frozen):
 
     def only(self, names: Sequence[str]) -> Self:
         """The same with these networks alone, from the first seed. Raises SpecError for one that it does not have."""
-        size, runs = self.size, [run for run in (*self.size.runs, *self.runs) if run.name in names]
-        architectures = [name for name in size.architectures if name in names]
-        if unknown := {*names} - {*architectures, *(run.name for run in runs)}:
+        size, chosen = self.size, [run for run in self.trained() if run.name in names]
+        if unknown := {*names} - {run.name for run in chosen}:
             raise SpecError(f"{self.name}: no network of it is named {', '.join(sorted(unknown))}")
-        less = {"architectures": tuple(architectures), "runs": (), "seeds": size.seeds[:1], "inception": False}
-        return self.model_copy(update={"size": size.model_copy(update=less), "runs": tuple(runs)})
+        less = {"architectures": (), "runs": (), "long": None, "seeds": size.seeds[:1], "inception": False}
+        return self.model_copy(update={"size": size.model_copy(update=less), "runs": tuple(chosen)})
 
     def trained(self) -> list[Run]:
-        """Every network from the first seed: one of each architecture, then the size's and the experiment's own."""
-        alike = [Run(name=name, train={"architecture": name}) for name in self.size.architectures]
-        return [Run(name=run.name, train=self._settings(run)) for run in (*alike, *self.size.runs, *self.runs)]
+        """Every network from the first seed: long runs, one of each architecture, the size's and the experiment's own.
+
+        Denoisers have no further seeds.
+        """
+        size, long = self.size, self.size.long
+        alike = [Run(name=name, train={"architecture": name}) for name in size.architectures]
+        short = {run.name: self._settings(run) for run in (*alike, *size.runs, *self.runs)}
+        made = [(name, settings, size.seeds) for name, settings in short.items()]
+        if long:
+            steps = {"max_steps": long.steps}
+            made = [(name_long(name, long.steps), {**short[name], **steps}, long.seeds) for name in long.names] + made
+        return [
+            Run(name=name, train=settings, further=() if _is_denoiser(settings) else seeds[1:])
+            for name, settings, seeds in made
+        ]
 
     def again(self) -> list[Run]:
-        """The same networks from each further seed, but for denoisers."""
-        networks = [run for run in self.trained() if not _is_denoiser(run)]
+        """The same networks from each further seed."""
         return [
             Run(name=name_seeded(run.name, seed), train={**run.train, "seed": seed})
-            for seed in self.size.seeds[1:]
-            for run in networks
+            for run in self.trained()
+            for seed in run.further
         ]
 
     def _settings(self, run: Run) -> dict[str, Any]:
-        own = self.size.train_denoisers if _is_denoiser(run) else {}
+        own = self.size.train_denoisers if _is_denoiser(run.train) else {}
         return {"seed": self.size.seeds[0], **self.size.train, **own, **run.train}
 
 
@@ -137,8 +157,13 @@ def name_seeded(name: str, seed: int) -> str:
     return f"{name}-seed-{seed}"
 
 
-def _is_denoiser(run: Run) -> bool:
-    return str(run.train["architecture"]).startswith("denoise")
+def name_long(name: str, steps: int) -> str:
+    """The name of a network's run of more steps than others."""
+    return f"{name}-{steps}"
+
+
+def _is_denoiser(train: Mapping[str, Any]) -> bool:
+    return str(train["architecture"]).startswith("denoise")
 
 
 def list_names() -> list[str]:

@@ -188,7 +188,7 @@ def _read_further_seeds(experiment: Experiment, file: Path) -> dict[str, list[li
     errors = {run.name: row["metric_space"]["mse"]["values"] for run, row in zip(experiment.again(), rows, strict=True)}
     by_run: dict[str, list[list[float]]] = {}
     for run in experiment.trained():
-        names = [name_seeded(run.name, seed) for seed in experiment.size.seeds[1:]]
+        names = [name_seeded(run.name, seed) for seed in run.further]
         by_run[run.name] = [[round(value, 6) for value in errors[name]] for name in names if name in errors]
     return {name: values for name, values in by_run.items() if values}
 

@@ -51,3 +51,22 @@ def test_the_size_card_is_for_ten_minutes_a_network_and_has_the_most_telling_fir
     found = Experiment.load("fixed-veach-ajar", "card")
     assert [run.name for run in found.trained()[:2]] == ["guided_transport", "denoise_1"]
     assert all(run.train["max_seconds"] == 600 for run in found.trained())
+
+
+def test_some_networks_are_trained_for_longer_too_and_in_three_rooms_from_three_seeds() -> None:
+    found = {name: {run.name: run for run in Experiment.load(name, "small").trained()} for name in EXPECTED}
+    for name, runs in found.items():
+        long = [run for run in runs if run.endswith("-4000")]
+        assert bool(long) == (name != "static-ablation")
+        for run in long:
+            short = runs[run.removesuffix("-4000")]
+            assert runs[run].train == {**short.train, "max_steps": 4000}
+            assert runs[run].further == short.further
+    assert {name for name, runs in found.items() if runs["cnn"].further} == {
+        "fixed-living-room",
+        "fixed-veach-ajar",
+        "night-living-room-2",
+        "static-ablation",
+    }
+    chosen = Experiment.load("fixed-veach-ajar", "small").only(["cnn-4000", "guided"])
+    assert [run.name for run in chosen.trained()] == ["cnn-4000", "guided"]

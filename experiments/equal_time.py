@@ -7,7 +7,8 @@ prints every row of an experiment that has run, or of a look at it (run.py, `--n
 
 Time is that of editing the scene, buffers, guides, photons, what is rendered, and the network. A family is one way to
 make an image of more or fewer samples, such as a denoiser in its qualities: of it count those that nothing quicker has
-less error than, and between two of these the error is taken to follow a power of the time.
+less error than, and between two of these the error is taken to follow a power of the time. Of ours each row counts by
+itself: by how many halves it is given, and by how many steps it was trained (NETWORK-STEPS).
 """
 
 from __future__ import annotations
@@ -42,8 +43,11 @@ F64 = NDArray[np.float64]
 
 OURS = ("guided_transport", "guided_transport_photons", "guided_denoise")
 NETWORKS = ("cnn", "feature_projection", "light_transport", "light_transport_photons", "guided", *OURS)
+LONGER = re.compile(r"(?P<network>\w+)-\d+")
+"""The name of a run that took so many steps, where others of its network took as many as the size says."""
+
 FAMILIES = {
-    r"denoise_\d+(_reflectance)?": "denoisers trained on the room",
+    r"denoise_\d+(_reflectance)?(-\d+)?": "denoisers trained on the room",
     r"oidn\S*(?<!reflectance) .*": "OIDN by albedo",
     r"oidn\S*reflectance .*": "OIDN by reflectance",
     r"none .*": "bdpt",
@@ -86,6 +90,21 @@ class AtTime:
         """The error from those of both."""
         mixed: F64 = first ** (1 - self.share) * second**self.share
         return mixed
+
+
+def find_network(name: str) -> str:
+    """The network of a row, whatever its steps and however many halves it is given."""
+    run = name.split(" ")[0]
+    return longer["network"] if (longer := LONGER.fullmatch(run)) else run
+
+
+def group_networks(room: Room, networks: Sequence[str]) -> dict[str, list[str]]:
+    """The rows of these networks by the run, in their order: those of several halves are of one run."""
+    of = {name: networks.index(find_network(name)) for name in room.rows if find_network(name) in networks}
+    runs: dict[str, list[str]] = {}
+    for name in sorted(of, key=lambda name: of[name]):
+        runs.setdefault(name.split(" ")[0], []).append(name)
+    return runs
 
 
 def place_rows(room: Room, names: Sequence[str]) -> list[Placed]:
@@ -149,7 +168,7 @@ def format_table(rooms: Sequence[Room]) -> str:
     head += [f"MSE over that of {called} (95 %)" for called in FAMILIES.values()]
     lines = []
     for room in rooms:
-        for ours in place_rows(room, OURS):
+        for ours in place_rows(room, [name for of_run in group_networks(room, OURS).values() for name in of_run]):
             line = [room.name, ours.name, f"{ours.milliseconds:.0f}", f"{ours.mse:.5f}"]
             lines.append([*line, *(_format_ratio(ours, order_family(room, names)) for names in FAMILIES)])
     return format_markdown_table(head, lines)
@@ -200,8 +219,11 @@ def _draw(axes: Axes, room: Room) -> None:
         members = order_family(room, names)
         places = [each.milliseconds for each in members], [each.mse for each in members]
         axes.plot(*places, marker=marker, markersize=4, linestyle=line, color=GREY, label=called)
-    for each in place_rows(room, NETWORKS):
-        axes.plot(each.milliseconds, each.mse, "D", color=colours[NETWORKS.index(each.name)], label=each.name)
+    for run, of_run in group_networks(room, NETWORKS).items():
+        if members := place_rows(room, of_run):
+            places = [each.milliseconds for each in members], [each.mse for each in members]
+            look = "D-" if run == (network := find_network(run)) else "D:"
+            axes.plot(*places, look, markersize=5, color=colours[NETWORKS.index(network)], label=run)
     axes.margins(0.09, 0.1)
     axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", xscale="log", yscale="log")
     set_plain_ticks(axes)

@@ -186,11 +186,12 @@ OF_TIME = """\
 
 Everything is charged: editing the scene, buffers, guides, photons, samples that a denoiser is given, and the network,
 on one core. OIDN is given one half-estimate of each pixel, or of one of 4, or the mean of 2 to 16, which are halves A
-of further passes; errors are by the halves B of the references, and what is timed is one image of all these samples.
-OIDN's three qualities are one family, once by diffuse albedo and once by reflectance, whose guides take no shadow
-rays and are charged so. `bdpt` and Mitsuba's `path` are not denoised. Of a family count those rows that no quicker
-one has less error than; between two of these the error is taken to follow a power of the time. Below 1 ours is ahead
-of the best that the family reaches in the same time. Intervals are a bootstrap over configurations.
+of further passes; `guided_denoise` one, or the mean of as many, which its line joins; errors are by the halves B of the
+references, and what is timed is one image of all these samples. OIDN's three qualities are one family, once by diffuse
+albedo and once by reflectance, whose guides take no shadow rays and are charged so. `bdpt` and Mitsuba's `path` are not
+denoised. Of a family count those rows that no quicker one has less error than; between two of these the error is taken
+to follow a power of the time. Below 1 ours is ahead of the best that the family reaches in the same time. Intervals are
+a bootstrap over configurations.
 
 In frames longer than its slowest row, a family is credited with the least error that it has reached by then. Such
 ratios are marked ≥: our advantage is at most what they say.

@@ -49,24 +49,28 @@ def test_what_views_share_is_not_in_the_interval() -> None:
     assert low < value < high
 
 
+def make_room(times: dict[str, tuple[float, float]]) -> Room:
+    """A room whose rows have these seconds a frame and errors."""
+    rows = {
+        name: {
+            "frame_seconds": {"total": seconds},
+            "mse": {"mean": 0.03 * error, "standard_error": None, "count": 2},
+            "mse_of_images": [0.04 * error, 0.02 * error],
+        }
+        for name, (seconds, error) in times.items()
+    }
+    return Room(Experiment.load("night-living-room", "small"), {"edit_seconds": 0.5, "rows": rows})
+
+
 def test_a_family_is_all_ways_to_feed_it_less_those_that_something_quicker_is_better_than() -> None:
-    of_views = [0.04, 0.02]
-    times = {
+    times: dict[str, tuple[float, float]] = {
         "oidn 1/1": (3, 1),
         "oidn-fast 1/1": (1, 2),
         "oidn-fast 2/1": (2, 3),
         "oidn-fast-reflectance 1/1": (4, 0.5),
     }
     times |= {"denoise_1": (5, 1), "denoise_1_reflectance": (6, 0.9), "guided_denoise": (1, 1)}
-    rows = {
-        name: {
-            "frame_seconds": {"total": seconds},
-            "mse": {"mean": 0.03 * error, "standard_error": None, "count": 2},
-            "mse_of_images": [error * each for each in of_views],
-        }
-        for name, (seconds, error) in times.items()
-    }
-    room = Room(Experiment.load("night-living-room", "small"), {"edit_seconds": 0.5, "rows": rows})
+    room = make_room(times)
     found = {
         called: [each.name for each in equal_time.order_family(room, names)]
         for names, called in equal_time.FAMILIES.items()
@@ -79,3 +83,18 @@ def test_a_family_is_all_ways_to_feed_it_less_those_that_something_quicker_is_be
         "path": [],
     }
     assert equal_time.format_rows(room).splitlines()[2].startswith("| oidn-fast 1/1 | 1500 | 0.06")
+
+
+def test_rows_of_ours_are_grouped_by_run_whatever_the_steps_and_the_halves() -> None:
+    times = {"guided_denoise": (1, 1), "guided_denoise 8/1": (5, 0.2), "guided_denoise-4000": (1, 0.7)}
+    times |= {"guided_denoise-4000 8/1": (5, 0.1), "guided_transport": (0.5, 2), "cnn-4000": (0.4, 9)}
+    room = make_room({**times, "denoise_1-4000": (2, 0.8), "oidn-reflectance 8/1": (4, 0.4)})
+    found = equal_time.group_networks(room, equal_time.OURS)
+    assert [*found.values()] == [["guided_transport"], *([run, f"{run} 8/1"] for run in [*found][1:])]
+    assert [*found] == ["guided_transport", "guided_denoise", "guided_denoise-4000"]
+    assert [*equal_time.group_networks(room, equal_time.NETWORKS)] == ["cnn-4000", *found]
+    of_ours = [line.split(" | ")[1] for line in equal_time.format_table([room]).splitlines()[2:]]
+    assert of_ours == [each.name for each in equal_time.place_rows(room, [*found, *(f"{run} 8/1" for run in found)])]
+    denoisers = next(names for names, called in equal_time.FAMILIES.items() if called.startswith("denoisers"))
+    assert [each.name for each in equal_time.order_family(room, denoisers)] == ["denoise_1-4000"]
+    assert equal_time.draw_picture([room]).startswith(b"\x89PNG")

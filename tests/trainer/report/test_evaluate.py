@@ -38,6 +38,7 @@ from photonfarm.trainer.predictors.evaluation import (
     WARM_ROUNDS,
     DevicePredictor,
     read_batches,
+    read_in_turn,
     time_by_turns,
 )
 from photonfarm.trainer.predictors.trained import TrainedRun
@@ -78,9 +79,9 @@ def test_the_row_of_the_metric_space_is_that_of_the_predictors_images(measured, 
 def test_what_is_given_several_halves_has_the_mean_of_a_over_as_many_passes_and_an_error_by_b_alone(
     measured, trained
 ) -> None:
-    amounts = [("none", 1), ("none", 1, 2), ("none", 4)]
-    found = compare(measured.store, [trained()], amounts, references=measured.references, **QUICK)
-    one, two = found.rows[1:3]
+    amounts, references = [("none", 1), ("none", 4)], measured.references
+    found = compare(measured.store, [trained()], amounts, halves=[2], references=references, **QUICK)
+    one, _, two = found.rows[1:]
     assert (two.name, two.halves, two.shown) == ("none 2/1", 2, {})
     assert draw_comparison(found).shape[1] == 4 * 256 + 3 * 8
     with Feed(measured.reader(), trained().settings, needs=Needs(points=False, kept=1, halves=2)) as feed:
@@ -92,7 +93,26 @@ def test_what_is_given_several_halves_has_the_mean_of_a_over_as_many_passes_and_
     assert 0.4 < ratio < 0.7, "half of the noise, up to the display's curve"
     assert "denoisers: up to 50.0% of a reference" in format_evaluation(found)
     with pytest.raises(IncompleteError, match="none 3/1: no held-out view has 3 passes"):
-        compare(measured.store, [trained()], [("none", 1, 3)], **QUICK)
+        compare(measured.store, [trained()], [("none", 1)], halves=[3], **QUICK)
+
+
+def test_a_network_of_halves_is_given_several_with_their_number_and_their_variance(measured, trained) -> None:
+    run = trained(network={"width": 4, "architecture": "guided_denoise", "filter": "own"})
+    found = compare(measured.store, [run, trained()], halves=[2], references=measured.references, **QUICK)
+    one, _, two = found.rows
+    assert (one.name, one.halves, two.name, two.halves, two.shown) == ("guided_denoise", 1, "guided_denoise 2/1", 2, {})
+    assert 0 < two.held_out.error.mean < one.held_out.error.mean
+    assert 0 < two.metrics.mse.estimate.mean < one.metrics.mse.estimate.mean
+    reader, several = measured.reader(), replace(run, halves=2)
+    (batch,) = read_in_turn(reader, found.measured[:1], 1, several.needs, run.settings.network.points)
+    passes = np.stack([reader.read(row).radiance[0] for row in (found.measured[0], found.measured[0] + 1)])
+    noisy = batch.inputs.noisy
+    assert noisy.passes.tolist() == [2]
+    np.testing.assert_allclose(noisy.colour[0], passes.mean(axis=0), rtol=1e-6)
+    np.testing.assert_allclose(noisy.variance[0], passes.mean(axis=-1).var(axis=0, ddof=1) / 2, rtol=1e-4, atol=1e-6)
+    assert torch.equal(batch.target[0], torch.from_numpy(reader.read(found.measured[0]).radiance))
+    with pytest.raises(SpecError, match="halves: no run is of a network of halves"):
+        compare(measured.store, [trained()], halves=[2], **QUICK)
 
 
 def test_runs_and_denoisers_are_rows_of_one_table_which_each_run_keeps(measured, trained, tmp_path: Path) -> None:

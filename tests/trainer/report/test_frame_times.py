@@ -38,6 +38,9 @@ def test_the_time_of_a_frame_is_that_of_the_parts_which_a_predictor_needs(measur
         (ReadyPredictor("oidn-reflectance", 4, settings), 1.0 + 0.7 + 2.0),
     ):
         assert assemble_frame_time(ready, network, costs).total == pytest.approx(seconds)
+    of_halves = settings.network.model_copy(update={"architecture": "guided_denoise"})
+    several = replace(TrainedRun.load(transport), settings=settings.model_copy(update={"network": of_halves}), halves=8)
+    assert assemble_frame_time(several, network, costs).total == pytest.approx(1.0 + 1.6 + 30.0)
     with_photons = replace(
         TrainedRun.load(transport),
         settings=settings.model_copy(

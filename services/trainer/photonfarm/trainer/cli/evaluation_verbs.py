@@ -67,7 +67,8 @@ MEASURING = (
         cls=RepeatableOption,
         multiple=True,
         metavar="N",
-        help="And also the mean of N halves, of as many passes of the view (`top-up`); may be repeated.",
+        help="Denoisers, and networks of halves such as guided_denoise, are also given the mean of N halves, of as "
+        "many passes of the view (`top-up`); may be repeated.",
     ),
     click.option(
         "--samples",
@@ -101,21 +102,18 @@ def add_measuring_options(command: Callable[..., None]) -> Callable[..., None]:
 def _collect_arguments(
     denoisers: tuple[ReadyDenoiser, ...],
     kept: tuple[int, ...],
-    halves: tuple[int, ...],
     references: Path | None,
     inception: Path | None,
     **others: Any,
 ) -> dict[str, Any]:
     """The arguments of `compare`: every denoiser with every share of the pixels. Raises UsageError."""
-    for name in ("kept" if kept else "", "halves" if halves else ""):
-        if name and not denoisers:
-            raise click.UsageError(f"--{name} applies only to ready denoisers; name one with --denoiser")
+    if kept and not denoisers:
+        raise click.UsageError("--kept applies only to ready denoisers; name one with --denoiser")
     if inception and references is None:
         raise click.UsageError(
             "--inception is used only to compare with references; give their folder with --references"
         )
-    amounts = [*((k, 1) for k in dict.fromkeys(kept or (1,))), *((1, n) for n in dict.fromkeys(halves))]
-    chosen = [(denoiser, *amount) for denoiser, amount in product(dict.fromkeys(denoisers), amounts)]
+    chosen = [*product(dict.fromkeys(denoisers), dict.fromkeys(kept or (1,)))]
     return {"denoisers": chosen, "references": references, "inception": inception, **others}
 
 

@@ -144,6 +144,7 @@ class MeasureOptions(TypedDict, total=False):
     """The options of `compare` that reports have too."""
 
     denoisers: Sequence[ReadyChoice]
+    halves: Sequence[int]
     references: Path | None
     inception: Path | None
     without_inception: bool
@@ -157,6 +158,7 @@ def compare(
     runs: Sequence[TrainedRun],
     denoisers: Sequence[ReadyChoice] = (),
     *,
+    halves: Sequence[int] = (),
     references: Path | None = None,
     inception: Path | None = None,
     without_inception: bool = False,
@@ -168,26 +170,26 @@ def compare(
 ) -> Evaluation:
     """Compare runs, and ready denoisers, on the first `most` views that no run was trained on.
 
-    Each view is measured once, by its first sample, however many passes of it there are; denoisers that are given the
-    halves of several passes on the views that have so many, in errors alone. References are files
-    `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric space.
-    FID, KID and Feature L1 take most of the time; `without_inception` leaves them out. What `beside` makes with the
-    samples' reader is measured on what the first run reads. Raises SpecError for runs of
-    different scenes, for references of another size, for a film with too few pixels to keep some, and for a package
-    that is missing; IncompleteError if no held-out sample is complete.
+    Each view is measured once, by its first sample, however many passes of it there are. Denoisers and networks of
+    halves are also given the mean of so many `halves`, of views that have so many passes, in errors alone. References
+    are files `<view key>.npz` as `photonfarm store merge` writes them; views without one are left out of the metric
+    space. FID, KID and Feature L1 take most of the time; `without_inception` leaves them out. What `beside` makes with
+    the samples' reader is measured on what the first run reads. Raises SpecError for runs of different scenes, for
+    references of another size, for a film with too few pixels to keep some, and for a package that is missing;
+    IncompleteError if no held-out sample is complete.
     """
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
     torch.set_num_threads(first.settings.threads)
     samples = HeldOutSamples.of(first.source(store), min(run.settings.hold_out for run in runs), most)
     spec = samples.source.spec
-    for _, kept, *_ in denoisers:
+    for _, kept in denoisers:
         count_kept(spec, kept)
     references_by_row = {} if references is None else read_references(references, samples)
     shown = samples.to_show(references_by_row)
     network = load_inception(inception, str(place)) if references_by_row and not without_inception else None
     test = _Test(samples, references_by_row, network, str(place), on_progress or (lambda *_: None))
-    predictors = list_predictors(runs, denoisers)
+    predictors = list_predictors(runs, denoisers, halves)
     test.on_progress("networks are loaded and timed", 0, 0)
     calls = [test.load(predictor) for predictor in predictors]
     times, predicts = time_by_turns(calls), [predict for predict, _ in calls]

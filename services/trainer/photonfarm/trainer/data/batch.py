@@ -47,20 +47,20 @@ class TrainingBatch:
         tensors: Mapping[str, Tensor],
         kept: Tensor | None = None,
         passes: tuple[Tensor, Tensor] | None = None,
-        colour: Tensor | None = None,
+        given: NoisyColour | None = None,
     ) -> TrainingBatch:
         """What a `SceneDataset` has read, (B, …) by field, in the same memory; and A's `kept` pixels, (B, H, W).
 
-        `passes` are how many each sample is the mean of, (B,), and the variances of both halves, (B, 2, H, W). A
-        `colour`, (B, H, W, 3), stands for A's as an input alone: it has to be independent of B.
+        `passes` are how many each sample is the mean of, (B,), and the variances of both halves, (B, 2, H, W). What is
+        `given` stands for A's as an input alone: it has to be independent of B.
         """
         target = tensors["radiance"]
         if kept is None:
             return cls(tuple(rows), tuple(units), Inputs.of(tensors), target)
         count, variance = (None, (None, None)) if passes is None else (passes[0], passes[1].unbind(1))
-        halves = (target[:, 0] if colour is None else colour, target[:, 1])
-        a, b = (NoisyColour(half * kept[..., None], kept, count, of) for half, of in zip(halves, variance, strict=True))
-        return cls(tuple(rows), tuple(units), Inputs.of(tensors, a), target, b)
+        halves = zip(target.unbind(1), variance, strict=True)
+        a, b = (NoisyColour(half * kept[..., None], kept, count, of) for half, of in halves)
+        return cls(tuple(rows), tuple(units), Inputs.of(tensors, given or a), target, b)
 
     def to(self, device: torch.device) -> TrainingBatch:
         """The same batch on a device; itself on the CPU. A card may still be copying, as by `Inputs.to`."""

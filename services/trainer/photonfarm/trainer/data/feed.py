@@ -25,7 +25,7 @@ from photonfarm.store import SceneReader
 from photonfarm.store.read.batch import Batch
 from photonfarm.trainer.data.batch import ResidentSamples, TrainingBatch, allocate_memory, choose_kept_pixels
 from photonfarm.trainer.networks import find_needs
-from photonfarm.trainer.networks.inputs import Needs
+from photonfarm.trainer.networks.inputs import Needs, NoisyColour
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.settings import TrainSettings
 
@@ -259,7 +259,7 @@ def read_batch(
     Raises IncompleteError if a view has fewer passes than there are to be halves.
     """
     film = dataset.spec.film.height, dataset.spec.film.width
-    pixels = passes = colour = None
+    pixels = passes = given = None
     tensors = dataset.read(rows, memory)
     if needs.kept:
         chosen = [choose_kept_pixels(key, dataset.spec, needs.kept) for key in source.sample_keys(rows)]
@@ -268,18 +268,24 @@ def read_batch(
         samples = zip(rows, tensors["radiance"], strict=True)
         counts, variances = zip(*(_average_passes(source, dataset, *sample) for sample in samples), strict=True)
         passes = torch.tensor(counts), torch.stack(variances)
-    if needs.halves > 1:
-        colour = torch.from_numpy(np.stack([_average_halves(source, row, needs.halves) for row in rows]))
-    return TrainingBatch.of(rows, units_of(source, rows), tensors, pixels, passes, colour)
+    if needs.halves > 1 and pixels is not None:
+        means, variances = zip(*(_average_halves(source, row, needs.halves) for row in rows), strict=True)
+        colour, count = torch.from_numpy(np.stack(means)), torch.full((len(rows),), float(needs.halves))
+        given = NoisyColour(colour * pixels[..., None], pixels, count, torch.from_numpy(np.stack(variances)))
+    return TrainingBatch.of(rows, units_of(source, rows), tensors, pixels, passes, given)
 
 
-def _average_halves(source: SceneReader, row: int, count: int) -> F32:
-    """The mean of the halves A of the first passes of a sample's view, (H, W, 3), linear radiance × exposure."""
+def _average_halves(source: SceneReader, row: int, count: int) -> tuple[F32, F32]:
+    """The mean of the halves A of the first passes of a sample's view, and the variance of its mean colour.
+
+    (H, W, 3), linear radiance × exposure, and (H, W).
+    """
     passes = source.rows_of_view(source.view_row(row))[:count].tolist()
     if len(passes) < count:
         raise IncompleteError(f"row {row}: its view has {len(passes)} complete passes, and {count} halves are wanted")
-    total = sum(source.read_radiance(each)[0].astype(np.float64) for each in passes)
-    return np.asarray(source.spec.exposure * total / count, np.float32)
+    halves = np.stack([source.read_radiance(each)[0] for each in passes]) * np.float32(source.spec.exposure)
+    variance = halves.mean(axis=-1, dtype=np.float64).var(axis=0, ddof=1) / count
+    return halves.mean(axis=0, dtype=np.float64).astype(np.float32), variance.astype(np.float32)
 
 
 def _average_passes(source: SceneReader, dataset: SceneDataset, row: int, halves: Tensor) -> tuple[float, Tensor]:

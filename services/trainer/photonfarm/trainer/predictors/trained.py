@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
@@ -37,6 +37,7 @@ class TrainedRun:
     scene_id: str
     exposure: float  # of the scene when the run began
     weights: dict[str, Any]  # that predict: averaged over its steps, if the run averages
+    halves: int = 1  # of a network of halves: it is given the mean of so many
 
     @classmethod
     def load(cls, folder: Path, name: str = CHECKPOINT) -> Self:
@@ -72,15 +73,22 @@ class TrainedRun:
 
     @property
     def name(self) -> str:
-        """The architecture, and the folder if its name adds something; of an absolute path its last part."""
+        """The architecture, and the folder if its name adds something; of an absolute path its last part.
+
+        With several halves it ends in such as " 8/1", as names of denoisers do.
+        """
         architecture, folder = self.settings.network.architecture, self.folder
         name = folder.name if folder.is_absolute() else str(folder)
-        return architecture if name == architecture else f"{architecture} ({name})"
+        return self.name_halves(architecture if name == architecture else f"{architecture} ({name})")
+
+    def name_halves(self, name: str) -> str:
+        """A name of the run, with the number of halves where there are several."""
+        return name if self.halves == 1 else f"{name} {self.halves}/1"
 
     @property
     def needs(self) -> Needs:
         """The inputs of its network."""
-        return find_needs(self.settings.network)
+        return replace(find_needs(self.settings.network), halves=self.halves)
 
     @property
     def sees_points(self) -> bool:
@@ -101,8 +109,8 @@ class TrainedRun:
         return replace(predict, images=lambda inputs: predict.images(filtered(inputs)))
 
 
-ReadyChoice = tuple[ReadyDenoiser, int] | tuple[ReadyDenoiser, int, int]
-"""A ready denoiser; it is given one of so many pixels, of one half or of the mean of so many."""
+ReadyChoice = tuple[ReadyDenoiser, int]
+"""A ready denoiser; it is given one of so many pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +151,16 @@ class ReadyPredictor:
         return Oidn(self.settings.threads, device, OIDN[self.denoiser])
 
 
-def list_predictors(runs: Sequence[TrainedRun], denoisers: Iterable[ReadyChoice]) -> list[TrainedRun | ReadyPredictor]:
-    """The runs, then ready denoisers, which read samples as the first run does."""
-    return [*runs, *(ReadyPredictor(name, kept, runs[0].settings, *halves) for name, kept, *halves in denoisers)]
+def list_predictors(
+    runs: Sequence[TrainedRun], denoisers: Sequence[ReadyChoice], halves: Sequence[int] = ()
+) -> list[TrainedRun | ReadyPredictor]:
+    """The runs, then ready denoisers, which read samples as the first run does.
+
+    Networks of halves and denoisers are given the mean of so many `halves`, too. Raises SpecError where there are none.
+    """
+    several = [replace(run, halves=count) for run in runs if run.needs.passes for count in halves]
+    if halves and not (several or denoisers):
+        raise SpecError("halves: no run is of a network of halves, as guided_denoise is, and no denoiser is named")
+    amounts = [*((*choice, 1) for choice in denoisers)]
+    amounts += [(name, 1, count) for name in dict.fromkeys(name for name, _ in denoisers) for count in halves]
+    return [*runs, *several, *(ReadyPredictor(name, k, runs[0].settings, count) for name, k, count in amounts)]

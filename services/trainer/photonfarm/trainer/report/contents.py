@@ -145,7 +145,7 @@ def gather_contents(
     store: str | Path, runs: Sequence[TrainedRun], *, timed: bool, **how: Unpack[MeasureOptions]
 ) -> ReportContents:
     """Measure everything; the times of frames only if `timed`. Raises what `compare` raises."""
-    first, predictors = runs[0], list_predictors(runs, how.get("denoisers", ()))
+    first, predictors = runs[0], list_predictors(runs, how.get("denoisers", ()), how.get("halves", ()))
     card = DatasetCard.of(store, first.scene_id, first.exposure)
     needs = [predictor.needs for predictor in predictors]
     tell = how.get("on_progress") or (lambda *_: None)
@@ -181,11 +181,14 @@ def gather_contents(
     evaluation = compare(store, runs, choose=look_closely, beside=make_beside, **how)
     title, table = find_published_table(card.spec)
     names = shorten_names(list(runs))
+    by_folder = {run.folder: name for run, name in zip(runs, names, strict=True)}
     entries = []
-    for i, (predictor, row) in enumerate(zip(predictors, evaluation.rows, strict=True)):
-        architecture = predictor.settings.network.architecture if isinstance(predictor, TrainedRun) else None
+    for predictor, row in zip(predictors, evaluation.rows, strict=True):
+        name, architecture = row.name, None
+        if isinstance(predictor, TrainedRun):
+            name, architecture = by_folder[predictor.folder], predictor.settings.network.architecture
+            name = predictor.name_halves(name)
         time = None if costs is None else assemble_frame_time(predictor, row.seconds, costs)
-        name = names[i] if i < len(runs) else row.name
         entries.append(ReportEntry(name, architecture, row, time, table.get(architecture or "")))
     return ReportContents(
         card=card,

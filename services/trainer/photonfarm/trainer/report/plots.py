@@ -187,8 +187,13 @@ def _name_group(entry: ReportEntry) -> str:
 
 
 def _name_series(entry: ReportEntry) -> str:
-    """The name of what has one colour: a ready denoiser, however much it is given, or another predictor."""
-    return entry.name if entry.architecture else entry.name.split(" ")[0]
+    """The name of what has one colour: a predictor, however much it is given."""
+    return entry.name.removesuffix(f" {entry.row.halves}/1") if entry.architecture else entry.name.split(" ")[0]
+
+
+def _name_line(entry: ReportEntry) -> str:
+    """What one line joins: the denoisers of the paper, or how much a predictor is given."""
+    return "" if (entry.architecture or "").startswith("denoise_") else _name_series(entry)
 
 
 def _place(entry: ReportEntry, metric: str) -> tuple[float, float]:
@@ -199,10 +204,8 @@ def _place(entry: ReportEntry, metric: str) -> tuple[float, float]:
 def _scatter(metric: str, plotted: Sequence[Plotted], axes: Axes) -> None:
     for name, (marker, line) in GROUPS.items():
         members = sorted((each for each in plotted if _name_group(each[0]) == name), key=lambda e: _place(e[0], metric))
-        joined = dict.fromkeys(_name_series(entry) if entry.architecture is None else "" for entry, _ in members)
-        for series in joined:
-            of_series = (entry for entry, _ in members if series in ("", _name_series(entry)))
-            x, y = zip(*(_place(entry, metric) for entry in of_series), strict=True)
+        for joined in dict.fromkeys(_name_line(entry) for entry, _ in members):
+            x, y = zip(*(_place(entry, metric) for entry, _ in members if _name_line(entry) == joined), strict=True)
             axes.plot(x, y, linestyle=line, color="#999999", linewidth=1)
         named: set[str] = set()
         for entry, colour in members:

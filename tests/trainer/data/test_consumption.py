@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.plan.request import Request
 from photonfarm.queue.connection import connect
@@ -127,19 +127,36 @@ def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene,
         service.check(run)
 
 
-def test_a_run_goes_on_by_the_preset_that_it_was_begun_with_wherever_that_is(
+def test_a_run_goes_on_as_it_was_begun_and_ends_where_it_ended(
     scene, commit, run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As a run that began on a card and goes on here does."""
+    """Wherever that is: as a run that began on a card and goes on here does."""
     settings = {"architecture": "cnn", "width": 4, "hold_out": 0.4, "minimum_samples": 1, "device": "cpu"}
     scene.plan(Request(modifications=12), shard_rows=6)
     for job in range(scene.jobs()):
         commit(scene, job)
-    call = partial(train, Path(scene.storage.where), scene.scene_id, run, log=str, **settings)
+    store, said = Path(scene.storage.where), []
+    call = partial(train, store, scene.scene_id, run, log=said.append)
     monkeypatch.setattr(devices, "choose_preset", lambda _device: "card")
-    call(max_steps=1)
+    begun = call(max_steps=2, **settings).settings
     monkeypatch.undo()
-    assert call(max_steps=2).settings.batch == make_preset("card").batch
+    left = {file: file.read_bytes() for file in run.iterdir() if file.is_file()}
+    assert (
+        call().settings
+        == begun
+        == make_preset(
+            "card",
+            network={"architecture": "cnn", "width": 4},
+            hold_out=0.4,
+            minimum_samples=1,
+            device="cpu",
+            max_steps=2,
+        )
+    )
+    assert {file: file.read_bytes() for file in run.iterdir() if file.is_file()} == left
+    assert any("--steps N trains on" in line for line in said)
     with pytest.raises(SpecError, match="batch = 8, and 2"):
-        call(max_steps=2, preset="small")
-    assert call(max_steps=3).settings.max_steps == 3
+        call(max_steps=3, preset="small", **settings)
+    assert call(max_steps=3).settings == begun.model_copy(update={"max_steps": 3})
+    with pytest.raises(StoreError, match="on which run"):
+        service.run(None, store.with_name("moved"), run, None, {}, log=print)

@@ -12,7 +12,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.trainer import service
 from photonfarm.trainer.cli.train_verb import train
-from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, make_preset, make_settings
+from photonfarm.trainer.runs.settings import PRESETS, TrainSettings, make_preset
 from photonfarm.trainer.training.losses import paired_loss
 
 
@@ -59,8 +59,8 @@ def chosen(monkeypatch: pytest.MonkeyPatch) -> list[TrainSettings]:
     """The settings that training was started with."""
     found: list[TrainSettings] = []
 
-    def run(spec, store, run, preset_name, changes, redis_url, **_) -> None:
-        found.append(make_settings(preset_name, changes))
+    def run(spec, store, run, preset, changes, redis_url, **_) -> None:
+        found.append(service.settle_settings(run, preset, changes))
 
     monkeypatch.setattr(service, "run", run)
     return found

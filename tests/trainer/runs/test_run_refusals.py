@@ -12,8 +12,7 @@ from photonfarm.trainer import service
 from photonfarm.trainer.cli import train_verb as cli
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
-from photonfarm.trainer.runs.checkpoint import read_settings
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, lock_run
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, lock_run, read_settings
 from photonfarm.trainer.runs.settings import NetworkSettings
 from photonfarm.trainer.training.loop import train
 

@@ -10,8 +10,7 @@ import torch
 from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.trainer import service
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.checkpoint import read_settings
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, read_log
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, read_log, read_settings
 from photonfarm.trainer.training.loop import train
 
 NETWORK = {"width": 4, "architecture": "light_transport", "points": 64, "descriptor": 2}
@@ -82,6 +81,13 @@ def test_a_folder_that_holds_no_run_is_refused_before_samples_are_waited_for(tmp
     changes = {"start_from": str(tmp_path / "none"), "max_seconds": 60.0}
     with pytest.raises(StoreError, match="there is no such folder"):
         service.run("cornell", tmp_path / "store", tmp_path / "run", "small", changes, log=str)
+
+
+def test_a_start_that_is_refused_leaves_no_folder(begin: Callable[..., Path], tmp_path: Path) -> None:
+    changes = {**NETWORK, "start_from": str(begin("first", steps=1)), "width": 8}
+    with pytest.raises(SpecError, match="width = 4 there, and 8"):
+        service.run("cornell", tmp_path / "store", tmp_path / "run", "paper", changes, log=str)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_filter_that_is_left_open_is_that_of_the_run_which_it_starts_from(begin: Callable[..., Path]) -> None:

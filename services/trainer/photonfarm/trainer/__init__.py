@@ -31,11 +31,11 @@ def train(
     """Train on a scene's samples, or continue a run, as `photonfarm train` does; returns the run with its last weights.
 
     `store` is a folder or the URL of a bucket, and `scene` a scene's name, its id, or the beginning of its id. The
-    settings are a preset's, by default the one that the run was begun with, and of a new run `card` on a card and
-    `small` elsewhere, with changes by key, such as
-    `max_steps`, `architecture` or `width`; `photonfarm train --help` lists them. The folder `run` is that of
-    `photonfarm train --run`: either goes on with what the other began. While it trains, `photonfarm train --check`
-    finds the run alive, and TensorBoard, if it is installed, its curves.
+    settings are those of the run, or of a new one those of a preset, by default `card` on a card and `small` elsewhere,
+    with changes by key, such as `max_steps`, `architecture` or `width`; `photonfarm train --help` lists them. The
+    folder `run` is that of `photonfarm train --run`: either goes on with what the other began, and a run that has ended
+    by its steps stays as it is. While it trains, `photonfarm train --check` finds the run alive, and TensorBoard, if it
+    is installed, its curves.
 
     Training waits for samples that workers are still to render, also for the first ones; `log` is told of that, and
     `max_seconds` limits it. With `redis_url`, the queue's Redis, workers learn how many samples are used; without it,
@@ -51,7 +51,6 @@ def train(
     from photonfarm.trainer import service
     from photonfarm.trainer.predictors.trained import TrainedRun
 
-    preset = preset or service.find_preset_name(Path(run), settings)
     scene_id = scene_named(Store(store), scene)
     service.run(None, store, Path(run), preset, settings, redis_url, scene_id=scene_id, log=log)
     return TrainedRun.load(Path(run))

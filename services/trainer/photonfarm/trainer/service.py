@@ -27,9 +27,8 @@ from photonfarm.trainer.runs.run_folder import (
     CHECKPOINT,
     INITIAL,
     lock_run,
-    note_preset,
     note_scene_folder,
-    read_preset,
+    read_settings,
     write_views,
 )
 from photonfarm.trainer.runs.settings import TrainSettings, make_settings
@@ -48,18 +47,23 @@ REPORT_S = 5.0  # between reports to the workers
 ALIVE_S = 60.0  # a run whose sign of life is older counts as dead
 
 
-def find_preset_name(folder: Path, changes: Mapping[str, Any]) -> str:
-    """The preset of a run for which none is named: the one that it was begun with, or else that of its device."""
-    from photonfarm.trainer.runs.devices import AUTO, choose_preset
+def settle_settings(folder: Path, preset: str | None, changes: Mapping[str, Any]) -> TrainSettings:
+    """A run's settings with changes by key: those of a named preset, or of the run, or of a new run's device.
 
-    return read_preset(folder) or choose_preset(changes.get("device", AUTO))
+    Raises SpecError for changes that cannot be, StoreError for a run's settings that cannot be read.
+    """
+    if preset is None and (folder / CHECKPOINT).exists():
+        return make_settings(read_settings(folder), changes)
+    from photonfarm.trainer.runs.devices import AUTO, choose_preset  # loads torch
+
+    return make_settings(preset or choose_preset(changes.get("device", AUTO)), changes)
 
 
 def run(
     spec: str | None,
     store: str | Path,
     folder: Path,
-    preset_name: str,
+    preset: str | None,
     changes: dict[str, Any],
     redis_url: str | None = None,
     *,
@@ -70,26 +74,26 @@ def run(
 ) -> None:
     """Train on one scene of a store, until the settings' end, SIGTERM or SIGINT; all leave a checkpoint.
 
-    The scene is that of the spec or the id; without both, the store's only one. The time spent waiting for a scene, its
+    The settings are those of `settle_settings`. The scene is that of the spec or the id; without both, that of the run,
+    or the store's only one. The time spent waiting for a scene, its
     base and its samples counts. With a Redis, the used samples are reported to workers. Under torchrun, rank 0 does all
     this, and the other ranks train with it until it ends; all need the same folder. `log` takes sentences about the
     service, `on_record` each record of the run's log.
 
     Raises IncompleteError if the time is over before there is anything to train on, and with `until_complete` also if a
-    signal stops it.
+    signal stops it; StoreError where a run goes on and the store does not hold its scene.
     """
-    from photonfarm.trainer.runs import checkpoint
     from photonfarm.trainer.runs.devices import describe_device, join_ranks
     from photonfarm.trainer.training.loop import Hooks
     from photonfarm.trainer.training.other_ranks import assist
+    from photonfarm.trainer.training.start_from import check_same_network
 
-    settings = make_settings(preset_name, changes)
+    settings = settle_settings(folder, preset, changes)
     for key, name in (("architecture", settings.network.architecture), ("loss", settings.loss)):
         if user_code.is_own(name):
             user_code.load(key, name)  # so that a mistake is said before samples are waited for
     if settings.start_from is not None and not (folder / CHECKPOINT).exists():
-        checkpoint.read_settings(Path(settings.start_from))  # likewise
-        checkpoint.load(Path(settings.start_from) / CHECKPOINT)
+        check_same_network(Path(settings.start_from), settings)  # likewise
     with join_ranks(settings.device, settings.batch) as ranks, stop_on_signals() as stop:
         device = ranks.device(settings.device)
         if ranks.rank:
@@ -104,9 +108,13 @@ def run(
                 raise SpecError(
                     f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
                 )
+            if begun_on and (is_vacant(store) or not Store(store).has_scene(begun_on)):
+                raise StoreError(
+                    f"{store}: holds no scene {begun_on}, on which run {folder} was begun; --store names the store "
+                    "that does, and another --run begins anew"
+                )
             with _give_sign_of_life(folder):
                 note_scene_folder(folder, scene_folder(spec, loaded) if spec and loaded else None)
-                note_preset(folder, preset_name)
                 hooks = Hooks(stop=stop, on_record=on_record, on_wait=log, ranks=ranks)
                 _train(loaded, store, scene_id or begun_on, exposure, folder, settings, redis_url, hooks)
         if until_complete and stop.is_set():
@@ -195,7 +203,7 @@ def check(folder: Path) -> None:
         )
 
 
-def summarise(spec: str | None, store: str | Path, preset_name: str, changes: dict[str, Any]) -> str:
+def summarise(spec: str | None, store: str | Path, settings: TrainSettings) -> str:
     """The parameters and the work of a network, as a table; nothing is trained, and of a store only a spec is read.
 
     Raises SpecError without a spec, unless the store has one scene.
@@ -203,8 +211,7 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
     from photonfarm.trainer.dry_run import format_summary, summarise
     from photonfarm.trainer.networks import find_kind
 
-    network = make_settings(preset_name, changes).network
-    scene = _find_spec(spec, store)
+    network, scene = settings.network, _find_spec(spec, store)
     points = min(network.points or scene.points, scene.points)
     head = (
         f"{network.architecture} for {scene.name}: {scene.film.width} × {scene.film.height} pixels, "
@@ -214,9 +221,7 @@ def summarise(spec: str | None, store: str | Path, preset_name: str, changes: di
         return f"{head}\n{format_summary(summarise(scene, network))}"
 
 
-def rehearse(
-    spec: str | None, store: str | Path, preset_name: str, changes: dict[str, Any], film: int | None
-) -> DryRun:
+def rehearse(spec: str | None, store: str | Path, settings: TrainSettings, film: int | None) -> DryRun:
     """What a training would take; nothing is written, and of a store only a spec is read.
 
     `film` is the side of images in pixels, if it shall be another than the spec's. Raises SpecError without a spec,
@@ -230,7 +235,6 @@ def rehearse(
         raise SpecError(
             f"torchrun has started {size} processes, and a dry run is one's work; start it without torchrun"
         )
-    settings = make_settings(preset_name, changes)
     scene = _find_spec(spec, store)
     if film is not None:
         try:

@@ -63,8 +63,15 @@ class TrainCommand(click.Command):
         """Parse the arguments; raises SpecError for settings that are none."""
         left = super().parse_args(ctx, args)
         if not ctx.resilient_parsing:
-            make_settings(ctx.params["preset"] or "small", collect_changes(ctx.params))
+            self._check_settings(**ctx.params)
         return left
+
+    @staticmethod
+    def _check_settings(run: Path, preset: str | None, **params: Any) -> None:
+        from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings  # numpy is slow to load
+
+        own = preset is None and not params["check"] and (run / CHECKPOINT).exists()
+        make_settings(read_settings(run) if own else preset or "small", collect_changes(params))
 
 
 def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
@@ -81,7 +88,7 @@ def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
 @click.option(
     "--preset",
     type=click.Choice(list(PRESETS)),
-    help="Sizes of network and batch.  [default: what the run was begun with, or card on a card, small on a processor]",
+    help="Settings of a new run.  [default: card on a card, small on a processor; a run that was begun keeps its own]",
 )
 @click.option(
     "--architecture",
@@ -92,7 +99,9 @@ def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
 @click.option(
     "--precision", type=click.Choice(get_args(Precision)), help="Of the U-Net's computations.  [default: float32]"
 )
-@click.option("--steps", "max_steps", type=click.IntRange(1), help="Steps to train for.  [default: the preset's]")
+@click.option(
+    "--steps", "max_steps", type=click.IntRange(1), help="Steps to train for.  [default: the run's, or the preset's]"
+)
 @click.option(
     "--seconds",
     "max_seconds",
@@ -178,6 +187,9 @@ def train(
 ) -> None:
     """Train on SPEC's samples while they arrive, or continue a run; SPEC may be left out of a store with one scene.
 
+    A run that was begun goes on with its own settings, but for those that are named; one that has ended by its steps
+    goes on with more --steps.
+
     Redis, where there is one, gets the number of used samples, for `photonfarm work --ahead`. Several processes share
     each batch if torchrun starts them: `torchrun --nproc-per-node 2 --no-python -- photonfarm train …`; all must
     see the same run folder. Exits with 8 if training diverges.
@@ -196,11 +208,11 @@ def train(
     if check:
         service.check(run)
         return
-    preset = preset or service.find_preset_name(run, changes)
     if summary:
-        click.echo(service.summarise(spec, store, preset, changes))
+        click.echo(service.summarise(spec, store, service.settle_settings(run, preset, changes)))
     elif dry_run:
-        show.print_dry_run(service.rehearse(spec, store, preset, changes, film), as_json)
+        settings = service.settle_settings(run, preset, changes)
+        show.print_dry_run(service.rehearse(spec, store, settings, film), as_json)
     else:
         service.run(
             spec,

@@ -21,9 +21,8 @@ from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
 from photonfarm.trainer.predictors.evaluation import DevicePredictor, make_network_predictor
 from photonfarm.trainer.predictors.half_filter import HalfFilter, uses_denoiser
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.checkpoint import read_settings
 from photonfarm.trainer.runs.devices import usable_device
-from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings
 from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
 from photonfarm.trainer.runs.user_code import is_own, name_in_errors
 

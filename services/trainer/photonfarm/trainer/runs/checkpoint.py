@@ -19,17 +19,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from pydantic import ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
 from photonfarm.core.errors import SpecError, StoreError, store_errors
-from photonfarm.core.models import Changes, differing, sentences
+from photonfarm.core.models import Changes, differing
 from photonfarm.farm.training import METADATA
 from photonfarm.store.io.local import sync
-from photonfarm.trainer.runs.run_folder import GOOD, SETTINGS
-from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings
+from photonfarm.trainer.runs.run_folder import GOOD, check_version
 
 FORMAT = 5
 ANEW = "remove it, and the run begins anew"
@@ -187,18 +185,6 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     return changed
 
 
-def check_version(path: Path, network: Mapping[str, Any]) -> None:
-    """Raise SpecError unless a run's stored settings of its network have all present keys.
-
-    A missing key would take today's default, and make another network.
-    """
-    if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
-        raise SpecError(
-            f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder "
-            "(--run)"
-        )
-
-
 def _format_option(key: str, value: Any) -> str:
     """The command-line option that sets a key to a value."""
     name = key.split(".")[-1]
@@ -220,28 +206,3 @@ def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mappi
             f"{path}: was trained on samples of another store, or of other plans; use another run folder (--run), or "
             "the store that it was trained on (--store)"
         )
-
-
-def read_settings(run: Path) -> TrainSettings:
-    """The settings a run was made with.
-
-    Raises StoreError if there is no run or its settings cannot be read, SpecError for those of another version.
-    """
-    path = run / SETTINGS
-    try:
-        document = json.loads(path.read_text())
-        settings = TrainSettings.model_validate(document)
-    except FileNotFoundError as error:
-        if not run.is_dir():
-            raise StoreError(f"{run}: there is no such folder") from error
-        raise StoreError(
-            f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
-        ) from error
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValidationError as error:
-        raise StoreError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
-    except ValueError as error:
-        raise StoreError(f"{path}: is not the JSON that a training run leaves there: {error}") from error
-    check_version(path, document.get("network", {}))
-    return settings

@@ -1,4 +1,4 @@
-"""The folder of a training run: its lock, its log metrics.jsonl, and its pictures of held-out views.
+"""The folder of a training run: its settings, its lock, its log metrics.jsonl, and its pictures of held-out views.
 
 The log has one record a line, appended during training. The pictures let others watch a few views improve.
 """
@@ -9,19 +9,22 @@ import fcntl
 import json
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
-from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.errors import SpecError, StoreError, store_errors
 from photonfarm.core.files import whole_file
+from photonfarm.core.models import sentences
 from photonfarm.core.pictures import display
 from photonfarm.core.records import F32
 from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS, VIEWS
 from photonfarm.scene.spec_loading import SCENES_VARIABLE
+from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings
 
 __all__ = [
     "CHECKPOINT",
@@ -30,15 +33,13 @@ __all__ = [
     "SETTINGS",
     "lock_run",
     "make_environment",
-    "note_preset",
     "note_scene_folder",
-    "read_preset",
+    "read_settings",
 ]
 
 LOCK = "lock"
 GOOD = "good.safetensors"  # a checkpoint of the last good validation, which a run that diverges goes back to
 SCENE_FOLDER = "scene-folder.txt"
-PRESET = "preset.txt"
 
 
 @contextmanager
@@ -76,19 +77,41 @@ def make_environment(folder: Path) -> dict[str, str]:
     return {**os.environ, SCENES_VARIABLE: os.pathsep.join(folders)}
 
 
-def note_preset(folder: Path, preset: str) -> None:
-    """Note which preset a run begins with; one that has a checkpoint keeps what was noted."""
-    if not (folder / CHECKPOINT).exists():
-        with store_errors("note the preset", folder):
-            (folder / PRESET).write_text(f"{preset}\n")
+def read_settings(run: Path) -> TrainSettings:
+    """The settings a run was made with.
 
-
-def read_preset(folder: Path) -> str | None:
-    """The preset that a run was begun with; None where none was begun, or it was not noted."""
+    Raises StoreError if there is no run or its settings cannot be read, SpecError for those of another version.
+    """
+    path = run / SETTINGS
     try:
-        return (folder / PRESET).read_text().strip() if (folder / CHECKPOINT).exists() else None
-    except (OSError, UnicodeDecodeError):
-        return None
+        document = json.loads(path.read_text())
+        settings = TrainSettings.model_validate(document)
+    except FileNotFoundError as error:
+        if not run.is_dir():
+            raise StoreError(f"{run}: there is no such folder") from error
+        raise StoreError(
+            f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
+        ) from error
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValidationError as error:
+        raise StoreError(f"{path}: {'; '.join(sentences(error, KEYS))}") from error
+    except ValueError as error:
+        raise StoreError(f"{path}: is not the JSON that a training run leaves there: {error}") from error
+    check_version(path, document.get("network", {}))
+    return settings
+
+
+def check_version(path: Path, network: Mapping[str, Any]) -> None:
+    """Raise SpecError unless a run's stored settings of its network have all present keys.
+
+    A missing key would take today's default, and make another network.
+    """
+    if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
+        raise SpecError(
+            f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder "
+            "(--run)"
+        )
 
 
 class MetricsLog:

@@ -315,15 +315,21 @@ def make_preset(name: str, *, network: Mapping[str, object] = MappingProxyType({
     return TrainSettings.model_validate({**preset, **changes, "network": {**preset["network"], **network}})
 
 
-def make_settings(name: str, changes: Mapping[str, Any]) -> TrainSettings:
-    """A preset with changes by key; keys of the network stand among the others. Raises SpecError for each fault."""
+def make_settings(base: str | TrainSettings, changes: Mapping[str, Any]) -> TrainSettings:
+    """A preset, or the settings of a run, with changes by key; keys of the network stand among the others.
+
+    Raises SpecError for each fault.
+    """
     network = {key: value for key, value in changes.items() if key in NetworkSettings.model_fields}
     others = {key: value for key, value in changes.items() if key not in network}
     if "network" in others:
         raise SpecError("the settings of the training: network: its keys are set each by its own name, as in width=32")
-    if name not in PRESETS:
-        raise SpecError(f"the settings of the training: preset = {name!r}: is none of {', '.join(PRESETS)}")
+    if isinstance(base, str) and base not in PRESETS:
+        raise SpecError(f"the settings of the training: preset = {base!r}: is none of {', '.join(PRESETS)}")
     try:
-        return make_preset(name, network=network, **others)
+        if isinstance(base, str):
+            return make_preset(base, network=network, **others)
+        kept = base.model_dump()
+        return TrainSettings.model_validate({**kept, **others, "network": {**kept["network"], **network}})
     except ValidationError as error:
         raise SpecError(f"the settings of the training: {'; '.join(sentences(error, KEYS))}") from error

@@ -115,14 +115,18 @@ class Session:
         self._stream = BatchStream(feed, settings, hooks.ranks)
         self._step = 0
         self._last_error: float | None = None
+        self._ended_before: str | None = None  # what ended the last session, if it had these settings
         self._validated: int | None = None  # the step of the log's last validation
         self._compared: Comparison | None = None  # of this session's last one, if it ended there
         self._seconds_logged: dict[str, float] = {}  # at the last validation
 
     def run(self) -> TrainingOutcome:
-        """Train until something ends it."""
+        """Train until something ends it; a run that has ended by its steps, or its rounds, stays as it is."""
         self._begin()
         self._watch.turn("other")
+        if (reason := self._ended()) in ("steps", "rounds") and reason == self._ended_before:
+            self._hooks.on_wait(f"run {self._run} has ended at step {self._step}; --steps N trains on")
+            return TrainingOutcome(self._step, reason, self._last_error)
         while (reason := self._ended()) is None:
             due = self._step % self._settings.validate_every == 0
             if due and self._wait(self._can_validate) and self._step != self._validated:
@@ -146,6 +150,7 @@ class Session:
         with store_errors("write the settings", self._run):
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
         kept = self._log.cut(self._step) if continues else []
+        self._ended_before = kept[-1].get("reason") if kept and not changed else None
         self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
         if changed:
             self._log.write("changes", step=self._step, changes=changed)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import differing
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.run_folder import CHECKPOINT
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.learner import Learner
 
@@ -17,6 +18,25 @@ SAME = ("architecture", "width", "descriptor", "octaves", "maxima", "emission", 
 
 OF_POINTS = "descriptor"
 """The weights that belong to the points of one scene's cloud, and say nothing of those of another."""
+
+
+def check_same_network(run: Path, settings: TrainSettings) -> None:
+    """Raise SpecError, with each setting that differs, if a run's weights are of another network than the settings say.
+
+    Raises StoreError if there is no such run.
+    """
+    read_settings(run)  # which says what lacks
+    _name_differences(run, checkpoint.load(run / CHECKPOINT), settings, SAME)
+
+
+def _name_differences(run: Path, state: Mapping[str, Any], settings: TrainSettings, keys: Iterable[str]) -> None:
+    """Raise SpecError if the network of a run's state differs in one of these settings."""
+    changed = differing(state["settings"]["network"], settings.network.model_dump(mode="json"))
+    if named := [key for key in changed if key in keys]:
+        values = "; ".join(f"{key} = {changed[key][0]!r} there, and {changed[key][1]!r} is asked for" for key in named)
+        raise SpecError(
+            f"start_from = {str(run)!r}: its weights are of another network: {values}; give the same values"
+        )
 
 
 def start_from(run: Path, learner: Learner, scene_id: str, settings: TrainSettings) -> dict[str, Any]:
@@ -30,15 +50,12 @@ def start_from(run: Path, learner: Learner, scene_id: str, settings: TrainSettin
     weights = dict(average["weights"] if (average := state.get("average")) else state["network"])
     changed = differing(state["settings"]["network"], settings.network.model_dump(mode="json"))
     is_same_cloud = state["scene_id"] == scene_id and "points" not in changed
+    _name_differences(run, state, settings, SAME)
     anew = [] if is_same_cloud else sorted({OF_POINTS} & own.keys() & weights.keys())
     weights |= {name: own[name] for name in anew}
     shapes, needed = ({name: tuple(each.shape) for name, each in of.items()} for of in (weights, own))
-    if named := [key for key in changed if key in SAME] or (list(changed) if shapes != needed else []):
-        values = "; ".join(f"{key} = {changed[key][0]!r} there, and {changed[key][1]!r} is asked for" for key in named)
-        raise SpecError(
-            f"start_from = {str(run)!r}: its weights are of another network: {values}; give the same values"
-        )
     if shapes != needed:
+        _name_differences(run, state, settings, changed)
         raise SpecError(f"start_from = {str(run)!r}: its weights do not fit the network as its code is now")
     learner.begin_with(weights)
     return {"run": str(run), "of_step": state["step"], "of_scene": state["scene_id"], "anew": anew}

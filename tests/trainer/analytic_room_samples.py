@@ -81,6 +81,9 @@ class AnalyticSource:
     def modification_keys(self, rows: Sequence[int]) -> list[Key]:
         return [self.modification_key(row) for row in rows]
 
+    def are_uniform(self, rows: Sequence[int]) -> list[bool]:
+        return [True] * len(rows)
+
     def earlier_passes(self, row: int) -> NDArray[np.int64]:
         return np.arange(row, row)  # each row is a view of its own
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.records import Geometry
-from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
+from photonfarm.plan.hold_out import HOLD_OUT, sides_of
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.read.batch import Batch, Sample
@@ -158,8 +158,8 @@ class Scene:
             raise ValueError(f"split = {split!r}: is none of {', '.join(splits)}")
         if split == "all":
             return self.snapshot()
-        held_out = np.array(rows_held_out(self._reader, self._rows.tolist(), hold_out), np.bool_)
-        return self._of(self._rows[held_out if split == "held-out" else ~held_out])
+        sides = sides_of(self._reader, self._rows.tolist(), hold_out)
+        return self._of(self._rows[np.array([side == split for side in sides], np.bool_)])
 
     def torch(
         self,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import SpecError
 from photonfarm.core.records import Guides
 from photonfarm.data import Sample
-from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.plan.hold_out import are_held_out, units_of
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
@@ -187,7 +187,7 @@ class Snapshot:
         self.rows: list[int] = self._reader.refresh().tolist()  # of all complete samples, ascending
         self.spec: SceneSpec = self._reader.spec
         self._plans = stored.plans()
-        held_out = rows_held_out(self._reader, self.rows, hold_out)
+        held_out = are_held_out(units_of(self._reader, self.rows), hold_out)
         self._held_out = {row for row, is_held_out in zip(self.rows, held_out, strict=True) if is_held_out}
         self._figures: tuple[int, dict[str, Any]] = -1, {}  # of the last job, as rows come in order
         self.versions: list[dict[str, str]] = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, Literal, Protocol, TypeVar
 
 if TYPE_CHECKING:
     from photonfarm.core.keys import Key
@@ -12,6 +12,9 @@ if TYPE_CHECKING:
 
 HOLD_OUT = 0.125
 """The share that is held out unless another one is named, by `photonfarm up` and by the trainer's preset `small`."""
+
+Side = Literal["train", "held-out"] | None
+"""Samples to train on, samples that measure the error, and those that are neither."""
 
 Rows = TypeVar("Rows", contravariant=True)
 
@@ -29,19 +32,32 @@ class Keyed(Protocol[Rows]):
     def view_keys(self, rows: Rows) -> list[Key]:
         """The content key of each row's configuration and view."""
 
+    def are_uniform(self, rows: Rows) -> list[bool]:
+        """Whether each row's configuration and view were drawn uniformly from the spec."""
+
 
 def units_of(source: Keyed[Rows], rows: Rows) -> list[Key]:
     """The unit by which each row is held out: the key of its configuration or, in a static scene, of its view."""
     return source.modification_keys(rows) if source.spec.groups else source.view_keys(rows)
 
 
-def rows_held_out(source: Keyed[Rows], rows: Rows, share: float) -> list[bool]:
-    """Whether each row is held out of training, by its content and not by its time of arrival.
+def sides_of(source: Keyed[Rows], rows: Rows, share: float) -> list[Side]:
+    """The side of each row, by its content and not by its time of arrival.
 
     All views and passes of a configuration are on one side. A static scene has one configuration; there the view
-    decides, and all passes of a view are on one side.
+    decides, and all passes of a view are on one side. The held-out error is one over uniform draws from the spec; so a
+    row that was chosen otherwise, or by a person, is never held out, and of a configuration that is, it is on no side.
     """
-    return are_held_out(units_of(source, rows), share)
+    held_out, uniform = are_held_out(units_of(source, rows), share), source.are_uniform(rows)
+    return [
+        ("held-out" if is_uniform else None) if is_out else "train"
+        for is_out, is_uniform in zip(held_out, uniform, strict=True)
+    ]
+
+
+def rows_held_out(source: Keyed[Rows], rows: Rows, share: float) -> list[bool]:
+    """Whether each row is held out of training; some of the others may be on no side, as `sides_of` says."""
+    return [side == "held-out" for side in sides_of(source, rows, share)]
 
 
 def are_held_out(units: Iterable[Key], share: float) -> list[bool]:

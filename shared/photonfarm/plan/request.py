@@ -157,9 +157,21 @@ class PlannedContent:
         used = (rows.sample_key[rows.sample_modification != UNUSED] for _, rows in self.plans)
         return {key.tobytes() for keys in used for key in keys}
 
+    @cached_property
+    def _densities(self) -> tuple[F32, F32]:
+        return self.column("modification_density"), self.column("view_density")
+
     def column(self, name: str) -> NDArray[Any]:
         """One input of all rows."""
         return np.concatenate([getattr(rows, name) for _, rows in self.plans])
+
+    def are_uniform(self, modification_rows: NDArray[np.int64], view_rows: NDArray[np.int64]) -> list[bool]:
+        """Whether configurations and views in pairs of rows, (N,) each, were drawn uniformly: both densities are 1."""
+        if not self.plans:
+            return []
+        modification, view = self._densities
+        uniform: list[bool] = ((modification[modification_rows] == 1) & (view[view_rows] == 1)).tolist()
+        return uniform
 
     def vectors(self, kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
         """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""

@@ -149,6 +149,10 @@ class PlannedViews:
         """The content key of each of some views, by their places here."""
         return view_keys(self.modification_keys(views), self.known.vectors("view", self.view_row[views]))
 
+    def are_uniform(self, views: Rows | Mask) -> list[bool]:
+        """Whether each of some views, by their places here, and its configuration were drawn uniformly."""
+        return self.known.are_uniform(self.modification_row[views], self.view_row[views])
+
 
 # ---------------------------------------------------------------------------------------------------------- conditions
 

@@ -1,6 +1,7 @@
 """What is read, held out and kept in memory."""
 
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,10 @@ from analytic_room_samples import known
 
 from photonfarm.core.errors import CorruptError, IncompleteError, SpecError
 from photonfarm.core.records import LIT_POINTS, ViewBuffers, Visibility
+from photonfarm.data import open_scene
 from photonfarm.plan.hold_out import are_held_out, rows_held_out
-from photonfarm.plan.request import Request
+from photonfarm.plan.request import Joined, PlannedContent, Request, SamplesToPlan, expand, samples_to_join
+from photonfarm.plan.top_up import TopUp
 from photonfarm.scene.view import Camera
 from photonfarm.store import Figures, JobWriter, SceneReader, Store
 from photonfarm.store.check.check import check_store
@@ -33,6 +36,36 @@ def test_a_static_scene_is_split_by_views(make_source) -> None:
     source = make_source(200, moving=False)
     held = sum(rows_held_out(source, range(200), 1 / 4))
     assert abs(held - 50) <= 3 * np.sqrt(200 * 3 / 16), "binomial, 3 σ"
+
+
+def test_what_was_not_drawn_uniformly_is_never_held_out_nor_trained_on_beside_what_is(scene, commit, tiny) -> None:
+    scene.plan(Request(modifications=16), shard_rows=8)
+    rows = expand(scene.spec, Request(modifications=16, seed=1), PlannedContent(), first_job=0, shard_rows=8).rows
+    configuration, view = np.ones(16, np.float32), np.ones(16, np.float32)
+    configuration[:8], configuration[8:12], view[12:] = 2, np.nan, 0.5  # likelier, by hand, a rarer view
+
+    def choose(known: PlannedContent) -> SamplesToPlan:
+        samples = samples_to_join(PlannedContent([(0, rows)]), np.arange(16), known)
+        return replace(samples, modification_density=configuration, view_density=view)
+
+    scene.plan(Joined(store="other", samples=16), samples=choose)
+    for job in range(4):
+        commit(scene, job)
+    source, settings = SceneReader(scene.storage.root, scene.scene_id), tiny(prefetch=32, hold_out=0.4)
+    with Feed(source, settings) as feed:
+        stream = BatchStream(feed, settings, Ranks())
+        stream.draw_ahead(32)
+        drawn = {row for rows in stream.state()["asked"] for row in rows}
+    kept_apart = np.array(are_held_out(source.modification_keys(range(32)), 0.4))
+    assert all(kept_apart[part].any() for part in (slice(0, 16), slice(16, 24), slice(24, 28), slice(28, 32)))
+    held_out = [row for row in range(16) if kept_apart[row]]
+    assert stream.held_out == held_out
+    assert drawn == set(np.flatnonzero(~kept_apart).tolist())
+    opened = open_scene(scene.storage.root, scene.scene_id)
+    assert opened.split("held-out", hold_out=0.4).rows.tolist() == held_out
+    assert set(opened.split("train", hold_out=0.4).rows.tolist()) == drawn
+    told = scene.plan(TopUp.of("+8", ["held-out=0.4"]), shard_rows=8)
+    assert told.new == len(held_out)
 
 
 @pytest.mark.parametrize("moving", [True, False])

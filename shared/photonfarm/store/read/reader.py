@@ -278,6 +278,10 @@ class SceneReader:
         keys = view_keys([of_row[i] for i in first.tolist()], vectors)
         return [keys[i] for i in place.tolist()]
 
+    def are_uniform(self, rows: Sequence[int]) -> list[bool]:
+        """Whether configurations and views of many samples were drawn uniformly from the spec: both densities are 1."""
+        return self._inputs.are_uniform(self._modification_row[list(rows)], self._view_row[list(rows)])
+
     def view_key(self, row: int) -> Key:
         """The content key of a sample's configuration and view: equal for all passes of one view."""
         return self.view_keys([row])[0]

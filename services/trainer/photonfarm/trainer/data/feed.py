@@ -19,7 +19,7 @@ from photonfarm.core.keys import Key, Stream
 from photonfarm.core.records import F32
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import SceneDataset
-from photonfarm.plan.hold_out import are_held_out, enough, units_of
+from photonfarm.plan.hold_out import enough, sides_of, units_of
 from photonfarm.scene.poor_views import are_near, hand_of, is_unlit
 from photonfarm.store import SceneReader
 from photonfarm.store.read.batch import Batch
@@ -74,7 +74,7 @@ class Feed:
         self._sides: set[bool] = set()  # whether samples so far are held out
         self._units: set[Key] = set()  # what is held out as one, until some are and some are not
         self._known: set[int] = set()  # rows that have arrived
-        self._skipped: dict[int, bool] = {}  # by row, of those that were asked for
+        self._skipped: dict[int, bool] = {}  # by row, of those that were asked for or are on no side
         self._missing: set[int] = set()  # rows that are known, and were set aside and are not complete again yet
         self._complete = False
         self._error: BaseException | None = None
@@ -174,14 +174,14 @@ class Feed:
             return enough(self._units, least=0.0)
 
     def is_skipped(self, row: int) -> bool:
-        """Whether a row is never trained on, by `skip_views`; its sample is read for that, once."""
+        """Whether a row is never trained on: it is on no side, or by `skip_views`, for which it is read once."""
         kinds = self._settings.skip_views
         if kinds and row not in self._skipped:
             (sample,) = self._source.read_samples([row], Batch.empty(self.spec, 1, guides=True))
             lit_by = sample.images, sample.view.origin, sample.seen_photons, lambda: sample.photons
             is_near = "near" in kinds and bool(are_near(hand_of(self.spec), sample.images["depth"]))
             self._skipped[row] = is_near or ("unlit" in kinds and is_unlit(*lit_by))
-        return bool(kinds) and self._skipped[row]
+        return self._skipped.get(row, False)
 
     def _raise(self) -> None:
         if self._error is not None:
@@ -217,9 +217,10 @@ class Feed:
 
     def _poll(self) -> None:
         new = [int(row) for row in self._source.refresh()]
-        units = units_of(self._source, new)
-        held_out = are_held_out(units, self._settings.hold_out)
+        sides = sides_of(self._source, new, self._settings.hold_out)
+        units, held_out = units_of(self._source, new), [side == "held-out" for side in sides]
         with self._lock:
+            self._skipped.update((row, True) for row, side in zip(new, sides, strict=True) if side is None)
             self._arrived.extend(zip(new, held_out, strict=True))
             self._sides.update(held_out)
             self._units = set() if len(self._sides) > 1 else self._units.union(units)

@@ -16,7 +16,7 @@ import numpy as np
 
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.records import F32
-from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.plan.hold_out import sides_of
 from photonfarm.plan.request import UNUSED
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, SceneStatus, Store
@@ -263,8 +263,8 @@ def make_baselines(
     Of the samples the radiance alone is read. Raises IncompleteError without training samples for the colour.
     """
     complete = source.rows.tolist()
-    held_out = rows_held_out(source, complete, run.settings.hold_out)
-    training = [row for row, held in zip(complete, held_out, strict=True) if not held]
+    sides = sides_of(source, complete, run.settings.hold_out)
+    training = [row for row, side in zip(complete, sides, strict=True) if side == "train"]
     if not training:
         raise IncompleteError("no training sample is complete, and a report compares with their mean colour")
     some = training[:: -(-len(training) // MOST_TRAINING)]

@@ -3,12 +3,13 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from photonfarm.core.errors import IncompleteError
+from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.pictures import display
 from photonfarm.farm.devices import Card
 from photonfarm.plan.request import Request
@@ -164,6 +165,17 @@ def test_a_frame_from_a_noisy_half_goes_from_one_pass_to_several_and_to_two_halv
     assert spread == pytest.approx(2 * float(three.variance.mean()), rel=0.5)
     assert not torch.equal(one, several)
     assert not torch.equal(several, both)
+    with pytest.raises(SpecError, match="passes = 0"):
+        opened.predict(at, view, passes=0)
+
+
+@pytest.mark.parametrize(("architecture", "how"), [("denoise_4", {"passes": 3}), ("guided", {"both": True})])
+def test_halves_that_a_network_is_not_given_are_refused(
+    architecture: str, how: dict[str, Any], store: Path, tmp_path: Path
+) -> None:
+    opened = open_run(trained(store, tmp_path / "run", architecture), store)
+    with pytest.raises(SpecError, match=f"{next(iter(how))} = .*: {architecture} is given no"):
+        opened.predict(rest(opened.spec), sample_view(opened.spec, b"view of a test..", 0, 0), **how)
 
 
 def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_in_place(

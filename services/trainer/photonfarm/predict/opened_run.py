@@ -82,8 +82,10 @@ class OpenRun:
 
         It can be differentiated with respect to the network's weights. A network that is given a noisy half gets one
         rendered, and guided_denoise the mean over `passes` of them; with `both`, the image is the mean of two, each
-        from a half of its own. Raises IncompleteError where photons or halves stay non-finite with other seeds.
+        from a half of its own. Raises SpecError where the network is not given what is asked for, IncompleteError where
+        photons or halves stay non-finite with other seeds.
         """
+        self._check_halves(passes, both=both)
         if not np.array_equal(modification.vector, self._modification.vector):
             self._apply(Modification.from_vector(modification.vector))  # the caller may change theirs
         inputs = self._inputs(view)
@@ -91,6 +93,16 @@ class OpenRun:
             return self._images(inputs)[0] / self._exposure
         halves = [self._noisy(view, passes, other=other) for other in (False, True)[: 1 + both]]
         return torch.stack([self._images(replace(inputs, noisy=half))[0] for half in halves]).mean(0) / self._exposure
+
+    def _check_halves(self, passes: int, *, both: bool) -> None:
+        """Raise SpecError where the network cannot be given so many passes, or both halves."""
+        name = self._run.settings.network.architecture
+        if passes < 1:
+            raise SpecError(f"passes = {passes}: a half is the mean of at least 1")
+        if passes > 1 and not self._needs.passes:
+            raise SpecError(f"passes = {passes}: {name} is given no mean over passes; guided_denoise is")
+        if both and not self._needs.kept:
+            raise SpecError(f"both = True: {name} is given no noisy half; denoisers and guided_denoise are")
 
     def _apply(self, modification: Modification) -> None:
         """Bring the scene into a configuration, and its points and photons."""
@@ -154,8 +166,7 @@ class OpenRun:
         from photonfarm.renderer.jobs.estimates import half_of
 
         sample = make_key("frame", view_key(self._key, view.vector))
-        count = passes if self._needs.passes else 1
-        numbers = range(count * other, count * (1 + other))
+        numbers = range(passes * other, passes * (1 + other))
         keys = [make_key(sample, number) if number else sample for number in numbers]
         images = np.stack([half_of(self._scene, key, view) for key in keys]) * np.float32(self._exposure)
         kept, number, variance = choose_kept_pixels(sample, self.spec, self._needs.kept or 1), None, None

@@ -75,11 +75,40 @@ def test_it_starts_from_the_filtered_half_and_the_known_light_and_goes_on_to_the
         how = {"passes": torch.full((1,), 2.0), "variance": torch.full_like(inputs.depth, variance)}
         told = replace(inputs.noisy, filtered=filtered, **how)
         images[variance] = made(replace(inputs, noisy=told))
-    wanted = filtered + 0.1192 * (known - filtered) / 2  # what is added to the filtered half, over the passes
+    wanted = (
+        filtered + 0.1192 * (known - filtered) / 2**0.5
+    )  # what is added to the filtered half, over the passes' root
     torch.testing.assert_close(images[1e9], wanted, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(images[0.0], inputs.noisy.colour)
     off = [float((image - inputs.noisy.colour).detach().abs().mean()) for image in images.values()]
     assert off[0] > 1.5 * off[1] > 0
+
+
+def test_what_it_learned_for_one_pass_fades_by_the_root_of_their_number(make_source) -> None:
+    """By 25 passes the coarse filter's share is a fifth, and where nothing reflects four fifths are the half's."""
+    source = make_source(1)
+    made, inputs = network(source, filter="own"), batch_of(source, (0,), NEEDS).inputs
+    torch.nn.init.zeros_(made.image_synthesis.out.weight)
+    torch.nn.init.zeros_(made.image_synthesis.out.bias)
+    guides, never = inputs.guides, torch.full_like(inputs.depth, 1e9)
+    for image in (inputs.albedo, guides.specular, guides.throughput):
+        image.zero_()
+    noisy = replace(inputs.noisy, variance=never)
+    made.shares[:] = torch.tensor([-torch.inf, 0.0])
+
+    def image(passes: float) -> torch.Tensor:
+        told = replace(inputs, noisy=replace(noisy, passes=torch.full((1,), passes)))
+        return made(told).detach()
+
+    known = made.known(inputs, made.further(inputs))
+    half = look_at_half(inputs, replace(noisy, passes=torch.full((1,), 25.0)), made._measure_places(inputs))
+    coarse = half.filtered[..., 1]
+    torch.testing.assert_close(image(1.0), known)
+    torch.testing.assert_close(image(25.0), known + 0.8 * (1 - 0.1192 / 5) * (coarse - known), rtol=1e-3, atol=1e-4)
+    assert torch.equal(made(replace(inputs, noisy=replace(noisy, variance=None))), image(1.0))
+    made.shares[:] = 0.0
+    mixed = known + 0.8 * (1 - 0.1192 / 5) * ((5 * half.filtered[..., 0] + coarse) / 6 - known)
+    torch.testing.assert_close(image(25.0), mixed, rtol=1e-3, atol=1e-4)
 
 
 def test_its_image_depends_on_half_a_and_never_on_half_b(make_source) -> None:

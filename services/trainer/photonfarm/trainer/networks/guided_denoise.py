@@ -1,17 +1,21 @@
 """A guided network that is also given one noisy half of the view, and learns from the other one. All ours.
 
 filtered = Σ shares · filtered halves
-guess = filtered + ((1 − w) · (known light − filtered) + reflectance × U-Net) / n
-image = guess + v · (half − guess),   v = β / (β + s)
+guess = filtered + ((1 − w) · (known light − filtered) + reflectance × U-Net) / √n
+image = guess + v · (half − guess),   v = β/√n / (β/√n + s)
 
 The half is filtered by the two scales of a filter of our own, below, and where it is installed by a denoiser
 [predictors.half_filter]: errors of filters that work differently are less in their mean. Shares and w are learned for
 each pixel; w starts at 0.88. s, the squared relative noise of the half, is estimated from its passes, or from its
-neighbourhood where it has one alone. n is the number of passes: what the network adds to the filtered half is as
-uncertain as ever, while that has less noise.
-β, the squared relative error of the guess, is learned, and v is the weight by which two independent estimates have the
-least error: in the end the image goes on to the mean of the samples (Back et al., Deep Combiner, 2020, learn such
-weights). All inputs depend on half A alone, so half B is an unbiased target; the two take turns [data.batch].
+neighbourhood where it has one alone. β, the squared relative error of the guess, is learned, and v is the weight by
+which two independent estimates have the least error: in the end the image goes on to the mean of the samples (Back et
+al., Deep Combiner, 2020, learn such weights). All inputs depend on half A alone, so half B is an unbiased target; the
+two take turns [data.batch].
+
+n is the number of passes of the half. The squared error of a denoiser falls by √n (docs/results/networks.md), and that
+of what is known without any sample does not fall. So with √n fades what the network learned to set against the noise
+of one pass: what it adds, its error, and the share of the coarse filter, whose window stays as wide. By the same factor
+the half takes over from the known light where nothing reflects by the guides, which do not see all paths.
 
 Shape letters: B batch, H W image.
 """
@@ -47,6 +51,9 @@ SHARES = (-3.0, 0.0, 1.0)
 DARK = 0.1
 """The brightness, in exposed radiance, that noise is relative to in darker places."""
 
+COARSE = (0.0, 1.0, 0.0)
+"""1 for what is filtered coarsely, in the order of `SHARES`."""
+
 LEVELS = 3
 """The passes of the filter, with neighbours at 1, 2 and 4 pixels: it is fine after the first, coarse after the last."""
 
@@ -55,6 +62,7 @@ class GuidedDenoise(Guided):
     """Image synthesis from guides, lit points and a noisy half of the view, joined with the half and its filtering."""
 
     shares: Tensor
+    coarse: Tensor
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
         filters = 2 + settings.has_denoiser
@@ -62,6 +70,7 @@ class GuidedDenoise(Guided):
         super().__init__(settings, frame, transport=LitPoints, further=further, outputs=outputs)
         self._has_denoiser = settings.has_denoiser
         self.register_buffer("shares", torch.tensor(SHARES[:filters]), persistent=False)
+        self.register_buffer("coarse", torch.tensor(COARSE[:filters]), persistent=False)
 
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure. What reflects nothing shows what it emits."""
@@ -71,14 +80,15 @@ class GuidedDenoise(Guided):
         known = self.known(inputs, lit)
         made = self.synthesise(self.channels(inputs, [*half.channels, *lit]))
         light, weight = self.factor(inputs) * made[..., :3], torch.sigmoid(START + made[..., 3:4])
-        error = functional.softplus(TRUSTED + made[..., 4:5])
-        shares = torch.softmax(self.shares + made[..., 5:], dim=-1)
+        passes = torch.ones_like(noisy.colour[:, 0, 0, 0]) if noisy.passes is None else noisy.passes
+        fading = 1 / passes.sqrt()[:, None, None, None]
+        error = fading * functional.softplus(TRUSTED + made[..., 4:5])
+        shares = torch.softmax(self.shares + made[..., 5:] + self.coarse * fading.log(), dim=-1)
         filtered = (half.filtered * shares[..., None, :]).sum(dim=-1)
-        added = (1 - weight) * (known - filtered) + light
-        if noisy.passes is not None:
-            added = added / noisy.passes[:, None, None, None]
-        guess = torch.lerp(known + light, filtered + added, half.shows)
-        return guess + half.shows * (error / (error + half.noise)) * (noisy.colour - guess)
+        added = fading * ((1 - weight) * (known - filtered) + light)
+        shows = half.shows + (1 - half.shows) * (1 - fading)
+        guess = torch.lerp(known + light, filtered + added, shows)
+        return guess + shows * (error / (error + half.noise)) * (noisy.colour - guess)
 
     def _measure_places(self, inputs: Inputs) -> Tensor:
         """Where each pixel's surface is, from the eye, over the scene's size, (B, H, W, 3)."""

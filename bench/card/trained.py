@@ -108,7 +108,7 @@ def measure_frames(rendered: RenderedRoom, run: Path, stored: Path) -> tuple[flo
     opened, modification = open_run(run, stored), draw_view(rendered.scene, 0)[0]
 
     def predict(number: int) -> Any:
-        return opened.predict(modification, rendered.views[number]).detach().cpu().numpy()
+        return opened.predict(modification, rendered.views[number]).radiance.detach().cpu().numpy()
 
     for number in (0, 0):  # compiles, and may record once more
         predict(number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Callable
@@ -205,3 +206,67 @@ def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
             "most 32, and several jobs for every worker]",
         ),
     )(with_request)
+
+
+def _parse_point(ctx: click.Context, param: click.Parameter, text: str | None) -> tuple[float, ...] | None:  # noqa: ARG001
+    if text is None:
+        return None
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
+        raise click.BadParameter(f"{text!r}: three finite numbers are required, as X,Y,Z.")
+    return numbers
+
+
+def _parse_points(ctx: click.Context, param: click.Parameter, texts: tuple[str, ...]) -> dict[str, Any]:
+    """Points by the names before them."""
+    points: dict[str, Any] = {}
+    for text in texts:
+        name, _, point = text.rpartition("=")
+        if not name or name in points:
+            raise click.BadParameter(f"{text!r}: NAME=X,Y,Z is required, and each name once.")
+        points[name] = _parse_point(ctx, param, point)
+    return points
+
+
+def arrangement_options(*, camera: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """What stands where, by names, and with `camera` from where it is seen: the command gets it as `asked`."""
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        @wraps(command)
+        def with_arrangement(**options: Any) -> Any:
+            from photonfarm.scene.arrangement import Arrangement, Shot
+
+            kind = Shot if camera else Arrangement
+            asked = {name: options.pop(name) for name in kind.model_fields}
+            return command(asked=kind.of(**asked), **options)
+
+        several: dict[str, Any] = {"multiple": True, "metavar": "NAME=X,Y,Z", "callback": _parse_points}
+        single: dict[str, Any] = {"metavar": "X,Y,Z", "callback": _parse_point}
+        of_camera = (
+            click.option("--camera", help="Where the camera stands.", **single),
+            click.option("--look-at", help="The point that it looks at.", **single),
+        )
+        return combine_options(
+            click.option("--place", help="Where a group stands, as `at` in the spec; may be repeated.", **several),
+            click.option("--move", help="By how much a group goes from where it stands; may be repeated.", **several),
+            click.option("--without", multiple=True, metavar="NAME", help="A group to leave out; may be repeated."),
+            *(of_camera if camera else ()),
+        )(with_arrangement)
+
+    return decorate
+
+
+like_option = click.option("--like", metavar="KEY", help="What has this key: a configuration, a view or a sample.")
+
+start_options = combine_options(
+    click.option("--row", type=click.IntRange(0), help="Begin with what the sample in a row of the store shows."),
+    click.option("--like", metavar="KEY", help="Begin with what has this key: a configuration, a view or a sample."),
+)
+"""What an arrangement changes, as `find_start` takes it; by default the scene at rest."""
+
+fov_option = click.option(
+    "--fov", type=click.FloatRange(1, 170), metavar="DEGREES", help="Field of view along the width.  [default: spec's]"
+)

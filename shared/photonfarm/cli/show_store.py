@@ -151,10 +151,9 @@ def _print_sample(sample: FoundSample, store: str | Path) -> None:
     state = "complete" if sample.complete else "not complete"
     click.echo(f"{sample.scene_name} {sample.scene_id}, row {sample.row}, pass {sample.pass_}: {state}")
     click.echo(f"  key           {sample.key}")
-    vector = ", ".join(f"{value:.9g}" for group in sample.modification for value in group) or "static"
-    click.echo(f"  modification  {sample.modification_key}  row {sample.modification_row}: {vector}")
-    view = ", ".join(f"{value:.9g}" for value in sample.view)
-    click.echo(f"  view          {sample.view_key}  row {sample.view_row}: {view}")
+    click.echo(f"  modification  {sample.modification_key}  row {sample.modification_row}")
+    click.echo(f"  view          {sample.view_key}  row {sample.view_row}")
+    click.echo(f"  shows         {sample.shot}")
     for job, committed in dict(zip(sample.jobs, sample.committed, strict=True)).items():
         click.echo(f"  job           {job}: {'committed' if committed else 'missing'}")
     for place in sample.places:

@@ -8,12 +8,16 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 from click.decorators import FC
 
-from photonfarm.cli.options import json_option, store_option
+from photonfarm.cli.options import arrangement_options, json_option, like_option, store_option
 from photonfarm.core.errors import IncompleteError, StoreError
+
+if TYPE_CHECKING:
+    from photonfarm.scene.arrangement import Shot
 
 
 def _scene_option(which: str = "This scene alone", *, required: bool = False) -> Callable[[FC], FC]:
@@ -77,9 +81,8 @@ def check(store: str | Path, scene: str | None, repair: bool, joined_from: str |
 @click.command()
 @store_option
 @_scene_option()
-@click.option("--modification", metavar="VECTOR|KEY", help="4 numbers per movable group (x, y, z, present), or a key.")
-@click.option("--view", metavar="VECTOR|KEY", help="6 numbers (camera position, look-at point), or a key.")
-@click.option("--sample", metavar="KEY", help="The sample of a key: 32 hexadecimal digits.")
+@arrangement_options()
+@like_option
 @click.option("--row", type=click.IntRange(0), help="The sample in a row.")
 @click.option("--job", type=click.IntRange(0), help="The samples of a job.")
 @click.option(
@@ -94,9 +97,8 @@ def check(store: str | Path, scene: str | None, repair: bool, joined_from: str |
 def find(
     store: str | Path,
     scene: str | None,
-    modification: str | None,
-    view: str | None,
-    sample: str | None,
+    asked: Shot,
+    like: str | None,
     row: int | None,
     job: int | None,
     tolerance: float,
@@ -105,15 +107,15 @@ def find(
 ) -> None:
     """Look samples up by what they are: their rows, passes, files, and whether they are complete.
 
-    Conditions narrow each other; without any, all samples are listed. The nearest come first. Vectors are numbers
-    with commas or blanks between them, as printed.
+    Conditions narrow each other; without any, all samples are listed. The nearest come first. Groups that are not named
+    may stand anywhere; --move is from where a group was modelled.
     """
     from photonfarm.cli import show_store
     from photonfarm.store import Store
     from photonfarm.store.read.find import Query, find_samples, scene_named
 
     opened = Store(store)
-    query = Query.of(modification=modification, view=view, sample=sample, row=row, job=job, tolerance=tolerance)
+    query = Query.of(asked=asked, like=like, row=row, job=job, tolerance=tolerance)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
     show_store.print_matches(find_samples(opened, ids, query, limit=limit), store, as_json)
 
@@ -121,8 +123,7 @@ def find(
 @click.command()
 @store_option
 @_scene_option()
-@click.option("--modification", metavar="VECTOR|KEY", help="Views of this configuration, as `store find` takes it.")
-@click.option("--view", metavar="VECTOR|KEY", help="This view, as `store find` takes it.")
+@like_option
 @click.option("--row", type=click.IntRange(0), help="The view of the sample in a row.")
 @click.option(
     "--least",
@@ -136,8 +137,7 @@ def find(
 def merge(
     store: str | Path,
     scene: str | None,
-    modification: str | None,
-    view: str | None,
+    like: str | None,
     row: int | None,
     least: int,
     out: Path,
@@ -157,7 +157,7 @@ def merge(
     from photonfarm.store.read.merge import merge_views, write_views
 
     opened = Store(store)
-    query = Query.of(modification=modification, view=view, row=row)
+    query = Query.of(like=like, row=row)
     ids = opened.scene_ids() if scene is None else [scene_named(opened, scene)]
     merged = (each for scene_id in ids for each in merge_views(opened.scene(scene_id), query, least))
     written = []

@@ -56,6 +56,17 @@ def draw_depth(depth: F32) -> Picture:
     return _bytes(np.repeat((hit * (1 - 0.9 * np.clip(depth / far, 0, 1)))[..., None], 3, axis=2))
 
 
+CONTRAST = 4
+"""By how much differences are stronger in pictures."""
+
+
+def draw_difference(exposed: F32, wanted: F32) -> Picture:
+    """Two exposed images (H, W, 3) compared as a display shows them: red too bright, blue too dark, white equal."""
+    off = CONTRAST * (display_values(exposed) - display_values(wanted)).mean(axis=-1)
+    colour = 1 - np.stack([np.maximum(-off, 0), np.abs(off), np.maximum(off, 0)], axis=-1)
+    return _enlarge(_bytes(np.clip(colour, 0, 1)))
+
+
 def reduce_image(image: NDArray[V], most: int) -> NDArray[V]:
     """An image (H, W, C) of at most `most` pixels along each side: means over blocks, less a rest at the edges."""
     by = -(-max(image.shape[:2]) // most)
@@ -82,8 +93,12 @@ PICTURE_WIDTH = 256  # px, at least
 
 def enlarge(exposed: F32) -> Picture:
     """Exposed linear radiance, (H, W, 3), as a display shows it; the pixels of a small image are enlarged."""
-    scale = max(1, -(-PICTURE_WIDTH // exposed.shape[1]))
-    return display(exposed, 1.0).repeat(scale, axis=0).repeat(scale, axis=1)
+    return _enlarge(display(exposed, 1.0))
+
+
+def _enlarge(picture: Picture) -> Picture:
+    scale = max(1, -(-PICTURE_WIDTH // picture.shape[1]))
+    return picture.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
 def write_png(picture: Picture, file: Path) -> None:

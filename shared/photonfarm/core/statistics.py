@@ -124,6 +124,29 @@ class Estimate:
         error = float(np.std(per_sample, ddof=1) / np.sqrt(count)) if count > 1 else None
         return cls(float(np.mean(per_sample)), error, count)
 
+    @property
+    def interval(self) -> tuple[float, float] | None:
+        """Where the mean lies with probability 0.95, by Student's t; None without a standard error.
+
+        It is Wallace's bound of `student_to_normal`, solved for t.
+        """
+        if self.standard_error is None:
+            return None
+        freedom, z = self.count - 1, -NormalDist().inv_cdf(0.025)
+        t = np.sqrt(freedom * np.expm1((z * (8 * freedom + 3) / (8 * freedom + 1)) ** 2 / freedom))
+        return self.mean - float(t) * self.standard_error, self.mean + float(t) * self.standard_error
+
+
+def jackknife(value: float, without: NDArray[np.float64], weights: NDArray[np.integer]) -> Estimate:
+    """An estimate from all parts, with the standard error that follows from leaving out one part after another (N,).
+
+    Parts may weigh differently (Busing, Meijer and van der Leeden, *Delete-m jackknife for unequal m*, 1999, eq. 8).
+    """
+    h = weights.sum() / weights
+    pseudo = h * value - (h - 1) * without
+    centre = len(h) * value - float(((1 - 1 / h) * without).sum())
+    return Estimate(value, float(np.sqrt(np.mean((pseudo - centre) ** 2 / (h - 1)))), len(h))
+
 
 def format_estimate(mean: float, standard_error: float | None) -> str:
     """An estimate in words: "0.12345 ± 0.00678", without the error if it is None; large numbers get few digits."""

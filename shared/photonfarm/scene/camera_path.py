@@ -9,7 +9,6 @@ Shape letters: K key views or photon slots, F frames, G movable groups, H W imag
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from itertools import product
 from pathlib import Path
@@ -17,15 +16,16 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, FiniteFloat, ValidationError
+from pydantic import Field, ValidationError
 
 from photonfarm.core.archives import read_arrays, write_arrays
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Frozen, sentences
 from photonfarm.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
+from photonfarm.scene.arrangement import Arrangement, Point, find_obstacles
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.view import View, are_in_free_space, are_in_group
+from photonfarm.scene.view import View
 
 MOST_FRAMES = 10_000
 ORBIT = 0.9
@@ -37,18 +37,16 @@ SMALLER, HEIGHTS = (ORBIT, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1), (0.5, 0.75, 
 FORM = '{"frames": 48, "views": [{"origin": [x, y, z], "look_at": [x, y, z]}, …], "closed": false}'
 """What a path's file looks like."""
 
-FinitePoint = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
-
 
 class KeyView(Frozen):
     """A view that the path passes through."""
 
-    origin: FinitePoint
-    look_at: FinitePoint
+    origin: Point
+    look_at: Point
 
 
-class CameraPath(Frozen):
-    """A path's file, like `FORM`."""
+class CameraPath(Arrangement):
+    """A path's file, like `FORM`; `place`, `move` and `without` may say what stands where, too."""
 
     frames: Annotated[int, Field(ge=1, le=MOST_FRAMES)]
     views: Annotated[tuple[KeyView, ...], Field(min_length=1)]
@@ -89,9 +87,10 @@ def orbit(spec: SceneSpec, frames: int, modification: Modification | None = None
     few heights, on which no camera stands in what is there in this configuration, by default the scene at rest; raises
     SpecError where there is none. Otherwise it may pass through objects.
     """
+    standing = rest(spec) if modification is None else modification
     for size, height in product(SMALLER, HEIGHTS) if spec.view.free_space else [(ORBIT, HEIGHTS[0])]:
         views = _ellipse(spec, frames, size, height)
-        if next(_obstacles(spec, views, modification), None) is None:
+        if next(find_obstacles(spec, views, standing), None) is None:
             return views
     raise SpecError(
         f"{spec.name}: no orbit keeps clear of what stands there, by view.free_space; give a camera path of your own, "
@@ -104,23 +103,13 @@ def check_clear(spec: SceneSpec, views: list[View], modification: Modification) 
 
     Free space is known in the box of origins alone; beyond it, only the movable groups are looked at.
     """
-    for frame, what in _obstacles(spec, views, modification):
+    for frame, what in find_obstacles(spec, views, modification):
         x, y, z = views[frame].origin.tolist()
         raise SpecError(
             f"camera path: in frame {frame} the camera at ({x:.3g}, {y:.3g}, {z:.3g}) stands {what}; lead the path "
             "around it, or take view.free_space out of the spec"
         )
     return views
-
-
-def _obstacles(spec: SceneSpec, views: list[View], modification: Modification | None) -> Iterator[tuple[int, str]]:
-    """The frames whose cameras are not in free space, each with what they stand in."""
-    vectors = (rest(spec) if modification is None else modification).vector[None].repeat(len(views), axis=0)
-    origins = np.stack([view.origin for view in views])
-    around = {group.name: are_in_group(spec, g, origins, vectors) for g, group in enumerate(spec.groups)}
-    for frame in np.flatnonzero(~are_in_free_space(spec, origins, vectors)).tolist():
-        names = [name for name, holds in around.items() if holds[frame]]
-        yield frame, f"in the box around {names[0]!r}" if names else "in a solid of the scene, or close to one"
 
 
 def _ellipse(spec: SceneSpec, frames: int, size: float, height: float) -> list[View]:

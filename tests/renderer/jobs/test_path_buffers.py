@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,10 +13,11 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.core.records import arrays_of
 from photonfarm.plan.request import Request
-from photonfarm.renderer.jobs.path_buffers import find_configuration, frames_of
+from photonfarm.renderer.jobs.path_buffers import find_views, frames_of
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.scene.camera_path import Frames
+from photonfarm.scene.arrangement import Arrangement
+from photonfarm.scene.camera_path import CameraPath, Frames
 from photonfarm.scene.modification import rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -71,7 +73,7 @@ def test_the_verb_writes_a_path_and_leaves_the_store_as_it_is(tmp_path: Path, sp
         assert (
             "one of --camera-path and --orbit is required" in CliRunner().invoke(umbrella, [*place, *arguments]).output
         )
-    result = CliRunner().invoke(umbrella, [*place, "--orbit", "3", "--modification", "0 0 0 1"])
+    result = CliRunner().invoke(umbrella, [*place, "--orbit", "3", "--without", "piano"])
     assert isinstance(result.exception, SpecError)
 
 
@@ -97,15 +99,24 @@ def test_buffers_that_are_not_finite_are_not_written(spec: SceneSpec, room: Load
         frames_of(spec, rest(spec), [somewhere], load=lambda _: Broken())
 
 
-def test_a_configuration_is_a_vector_the_key_of_a_planned_one_or_the_scene_at_rest(tmp_path: Path) -> None:
+def test_a_configuration_begins_with_a_key_a_row_or_the_scene_at_rest_then_the_path_changes_it_and_then_the_user(
+    tmp_path: Path,
+) -> None:
     store, spec = Store(tmp_path / "store", create=True), load_spec("room")
     scene = store.scene(store.plan(spec, Request(modifications=3), shard_rows=8).scene_id)
-    planned = sample_modification(spec, 0, 1)
+    planned, nothing = sample_modification(spec, 0, 1), Arrangement()
+    views = [{"origin": [2, 1.5, 1.5], "look_at": [0, 0.5, 0]}]
+    path = CameraPath.of(frames=1, views=views, without=["vase"], place={"sofa": (1, 0, 0)})
+
+    def find(asked: Arrangement, **how: Any) -> np.ndarray:
+        return find_views(store.root, scene.scene_id, asked, path, **how)[1].vector
+
     key = planned.key(spec.radiance_id).hex()
-    vector = " ".join(map(str, planned.vector.ravel()))
-    for text, wanted in ((key, planned), (vector, planned), (None, rest(spec))):
-        np.testing.assert_array_equal(find_configuration(store, scene, text).vector, wanted.vector)
-    with pytest.raises(SpecError):
-        find_configuration(store, scene, "0 0 0 1")
+    wanted = path.apply(spec, planned).vector
+    np.testing.assert_array_equal(find(nothing, like=key), wanted)
+    np.testing.assert_array_equal(find(nothing, row=1), wanted)
+    np.testing.assert_array_equal(find(nothing), path.apply(spec).vector)
+    moved = find(Arrangement.of(place={"sofa": (1, 0, 0.5)}))
+    np.testing.assert_allclose((moved - path.apply(spec).vector)[3], [0, 0, 0.5, 0], atol=1e-6)
     with pytest.raises(StoreError):
-        find_configuration(store, scene, "0" * 32)
+        find(nothing, like="0" * 32)

@@ -131,10 +131,6 @@ def test_a_row_that_is_not_there_is_told_from_one_that_is_not_complete(
         with pytest.raises(PhotonfarmError, match=said) as caught:
             infer.show_sample(store, run, row, tmp_path / "out")
         assert caught.value.exit_code == code
-    incomplete = Store(store).scene(scene.scene_id).job_rows(1).views
-    with pytest.raises(PhotonfarmError, match="wait for the workers") as caught:
-        infer.find_row(store, run, None, " ".join(map(str, incomplete[max(incomplete)].vector)))
-    assert caught.value.exit_code == 7
     assert not (tmp_path / "out").exists()
 
 
@@ -194,13 +190,12 @@ def test_what_cannot_be_shown_is_refused(
     assert not (tmp_path / "out").exists()
 
 
-def test_the_verb_shows_a_row_a_view_or_a_file_of_buffers(
+def test_the_verb_shows_a_row_or_a_file_of_buffers(
     store: Path, scene: SceneStore, trained, frames, tmp_path: Path
 ) -> None:
     run = trained()
     reader = SceneReader(store, scene.scene_id)
     reader.refresh()
-    view, modification = reader.view_key(7).hex(), reader.modification_key(7).hex()
 
     def shown(*arguments: str) -> bytes:
         place = ["infer", "--store", str(store), "--run", str(run.folder), "--out", str(tmp_path / "out")]
@@ -209,25 +204,26 @@ def test_the_verb_shows_a_row_a_view_or_a_file_of_buffers(
         return Path(result.stdout.splitlines()[0]).read_bytes()
 
     wanted = shown("--row", "7")
-    assert shown("--view", view) == wanted
-    assert shown("--view", " ".join(map(str, reader.read(7).view.vector)), "--modification", modification) == wanted
-    assert shown("--modification", modification) == shown("--row", "6") != wanted
+    assert shown("--row", "6") != wanted
     frames(reader.read(7).modification, orbit(scene.spec, 2)).write(tmp_path / "buffers.npz")
     assert shown("--buffers", str(tmp_path / "buffers.npz"))
-    with pytest.raises(StoreError, match="nearest"):
-        infer.find_row(store, run, None, "0 0 0 1 1 1")
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "--camera-path"),
-        (["--row", "1", "--orbit", "3"], "--row and --orbit"),
-        (["--row", "1", "--modification", "0 0 0 1"], "--modification"),
+        (["--camera-path", __file__, "--orbit", "3"], "--camera-path and --orbit"),
+        (["--orbit", "3", "--truth", "8"], "--orbit and --truth"),
+        (["--buffers", __file__, "--without", "sofa"], "--buffers and what stands where"),
         (["--orbit", "0"], "'--orbit'"),
+        (["--place", "sofa"], "NAME=X,Y,Z"),
+        (["--place", "sofa=1,0,0", "--place", "sofa=2,0,0"], "each name once"),
+        (["--camera", "1,nan,0"], "three finite numbers"),
+        (["--move", "sofa=1,0"], "three finite numbers"),
+        (["--fov", "171"], "'--fov'"),
     ],
 )
-def test_the_verb_refuses_none_or_several_things_to_show(arguments: list[str], said: str) -> None:
+def test_the_verb_refuses_what_excludes_each_other_and_what_is_no_point(arguments: list[str], said: str) -> None:
     result = CliRunner().invoke(umbrella, ["infer", *arguments])
     assert result.exit_code == 2
     assert said in result.stderr

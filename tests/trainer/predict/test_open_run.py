@@ -1,5 +1,6 @@
 """The frame call: a network's image of a configuration and a view, inputs rendered in the same process."""
 
+import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,24 +9,29 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from click.testing import CliRunner
 
+from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.pictures import display
+from photonfarm.core.statistics import block_z_test, clean_error
 from photonfarm.farm.devices import Card
 from photonfarm.plan.request import Request
 from photonfarm.predict import infer, open_run
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.scene.arrangement import Shot
 from photonfarm.scene.modification import rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import View, sample_view
 from photonfarm.store import SceneReader, Store
+from photonfarm.store.read.find import find_start
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
 from photonfarm.trainer.training.loop import train
 
-PAGE = Path(__file__).resolve().parents[3] / "docs/training.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs/what-if.md"
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +76,7 @@ def test_a_frame_is_the_image_of_the_stored_sample_of_its_configuration_and_view
     sample = reader.read(2)
     with torch.no_grad():
         opened.predict(rest(opened.spec), sample.view)  # the scene comes from another configuration
-        image = opened.predict(sample.modification, sample.view)
+        image = opened.predict(sample.modification, sample.view).radiance
     assert image.shape == (16, 24, 3)
     infer.show_sample(store, infer.TrainedRun.load(run), 2, tmp_path / "sample")
     wanted = infer.Image.open(tmp_path / "sample/prediction.png").resize((24, 16), infer.Image.Resampling.NEAREST)
@@ -129,7 +135,7 @@ def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_pat
     opened = open_run(trained(store, tmp_path / "run", "denoise_4"), store)
     view = sample_view(opened.spec, b"view of a test..", 0, 0)
     with torch.no_grad():
-        one, again = (opened.predict(rest(opened.spec), view) for _ in range(2))
+        one, again = (opened.predict(view=view).radiance for _ in range(2))
     torch.testing.assert_close(one, again, rtol=0, atol=0)
     noisy = opened._noisy(view)
     assert int(noisy.kept.sum()) == 24 * 16 // 4
@@ -157,7 +163,7 @@ def test_a_frame_from_a_noisy_half_goes_from_one_pass_to_several_and_to_two_halv
     view, at = sample_view(opened.spec, b"view of a test..", 0, 0), rest(opened.spec)
     with torch.no_grad():
         one, several, both = (
-            opened.predict(at, view, **how) for how in ({}, {"passes": 3}, {"passes": 3, "both": True})
+            opened.predict(at, view, **how).radiance for how in ({}, {"passes": 3}, {"passes": 3, "both": True})
         )
     three, others = opened._noisy(view, 3), opened._noisy(view, 3, other=True)
     assert three.variance is not None
@@ -184,11 +190,12 @@ def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_i
     opened = open_run(trained(store, tmp_path / "run", "guided_transport"), store)
     view = View(np.array([1.9, 1.6, 1.7], np.float32), np.array([-0.7, 0.6, -0.5], np.float32))
     configuration = rest(opened.spec)
-    image = opened.predict(configuration, view)
+    image = opened.predict(configuration, view).radiance
     image.mean().backward()
+    assert all(weights.grad is not None for weights in opened.network.parameters())
     configuration.present[:] = False
     with torch.no_grad():
-        empty = opened.predict(configuration, view)
+        empty = opened.predict(configuration, view).radiance
     assert float((empty - image.detach()).abs().mean()) > 0.01
 
 
@@ -200,7 +207,89 @@ def test_a_frame_that_is_not_finite_is_refused_with_its_number(store: Path, tmp_
         infer.show_path(opened, rest(opened.spec), [broken, view], tmp_path / "out")
 
 
-def test_the_lines_of_the_training_page_make_a_frame(
+def test_a_frame_is_asked_for_by_names_and_says_what_the_network_never_saw(store: Path, tmp_path: Path) -> None:
+    opened = open_run(trained(store, tmp_path / "run", "guided"), store)
+    asked = {"place": {"sofa": (0.9, 0, -0.5)}, "without": ["vase"], "camera": (-1.9, 1.6, 1.7), "look_at": (0, 1, 0)}
+    configuration = rest(opened.spec)
+    groups = [group.name for group in opened.spec.groups]
+    configuration.translation[groups.index("sofa")] = np.array([0.9, 0, -0.5]) - np.array([1.85, 0, 0.3])
+    configuration.present[groups.index("vase")] = False
+    view = View(np.float32([-1.9, 1.6, 1.7]), np.float32([0, 1, 0]))
+    with torch.no_grad():
+        frame, same = opened.predict(**asked), opened.predict(configuration, view)
+        other = opened.predict(**asked | {"place": {"sofa": (0.9, 0, 3)}})
+    np.testing.assert_array_equal(frame.configuration.vector, configuration.vector)
+    assert torch.equal(frame.radiance, same.radiance)
+    assert frame.inputs.depth.shape == (1, 16, 24)
+    assert set(frame.seconds) == {"edit", "inputs", "network"}
+    assert not frame.doubts
+    assert ["sofa stands at 0.9,0,3, outside its box" in doubt for doubt in other.doubts] == [True]
+    (closer,) = opened.look_closer(**asked | {"place": {"sofa": (0.9, 0, 3)}})
+    assert closer.startswith("sofa reaches beyond all that never moves")
+    with pytest.raises(SpecError, match="one of spp and seconds"):
+        opened.truth(**asked)
+
+
+def test_a_truth_is_unbiased_and_the_error_of_an_image_has_an_interval_that_holds_the_true_one(
+    store: Path, tmp_path: Path
+) -> None:
+    """The true error is that against another truth of many samples, less the noise of that."""
+    opened = open_run(trained(store, tmp_path / "run", "cnn"), store)
+    asked: dict[str, Any] = {"without": ["table"], "camera": (-1.9, 1.6, 1.7), "look_at": (0.7, 0.6, -0.5)}
+    with torch.no_grad():
+        image = opened.predict(**asked).radiance.numpy()
+    truth, view = opened.truth(**asked, spp=96), View(np.float32(asked["camera"]), np.float32(asked["look_at"]))
+    assert (truth.spp, truth.parts.shape) == (96, (16, 2, 16, 24, 3))
+    halves = [opened._scene.render_halves(view, (seed, 1000 + seed), 16) for seed in range(12)]
+    test = block_z_test(truth.parts.reshape(32, 16, 24, 3), np.concatenate(halves), blocks=4)
+    assert test.passed
+    a, b = np.mean(halves, axis=0) * opened.spec.exposure
+    low, high = truth.error(image).interval or (0, 0)
+    assert 0 < low < clean_error(image * np.float32(opened.spec.exposure), a, b) < high < 3 * low
+    timed = opened.truth(**asked, seconds=1e-3)
+    assert timed.spp == 2 * 2
+
+
+def test_another_field_of_view_is_that_of_inputs_network_and_sensor(store: Path, tmp_path: Path) -> None:
+    run = trained(store, tmp_path / "run", "light_transport")
+    wide, usual = open_run(run, store, fov=100), open_run(run, store)
+    camera = {"camera": (-1.9, 1.6, 1.7), "look_at": (0.7, 0.6, -0.5)}
+    with torch.no_grad():
+        frames = [opened.predict(**camera) for opened in (wide, usual)]
+    assert float(frames[0].inputs.depth[0, 8, 0]) != pytest.approx(float(frames[1].inputs.depth[0, 8, 0]), rel=0.05)
+    assert wide.network.optics.focal_px == pytest.approx(12 / np.tan(np.radians(50)))
+    assert [len(frame.doubts) for frame in frames] == [1, 0]
+    import mitsuba as mi
+
+    assert float(mi.traverse(wide._scene._sensor.aim(frames[0].view))["x_fov"][0]) == pytest.approx(100)
+    with pytest.raises(SpecError, match="fov_deg = 190"):
+        open_run(run, store, fov=190)
+
+
+def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store: Path, tmp_path: Path) -> None:
+    run = trained(store, tmp_path / "run", "guided")
+    place = ["infer", "--store", str(store), "--run", str(run), "--out", str(tmp_path / "out")]
+    asked = ["--row", "1", "--without", "vase", "--camera", "-1.9,1.6,1.7", "--truth", "8"]
+    done = CliRunner().invoke(umbrella, [*place, *asked], catch_exceptions=False)
+    assert done.exit_code == 0
+    names = {"prediction.png", "truth.png", "difference.png", "frame.exr", "frame.npz", "frame.json"}
+    assert {Path(line).name for line in done.stdout.split()} == names
+    said = json.loads((tmp_path / "out/frame.json").read_text())
+    (scene_id,) = Store(store).scene_ids()
+    start, view = find_start(Store(store), scene_id, 1, None) or pytest.fail("row 1 is planned")
+    assert "vase" in said["without"]
+    assert said["camera"] == [-1.9, 1.6, 1.7]
+    np.testing.assert_allclose(said["look_at"], view.target, rtol=1e-6)
+    asked_again = Shot.of(place=said["place"], without=said["without"]).apply(spec_of(store))
+    np.testing.assert_array_equal(asked_again.vector, Shot.of(without=["vase"]).apply(spec_of(store), start).vector)
+    assert said["interval"][0] < said["squared_error"] < said["interval"][1]
+    with np.load(tmp_path / "out/frame.npz") as layers:
+        truth = (layers["A"] + layers["B"]) / 2
+        np.testing.assert_allclose(layers["truth"], truth, rtol=1e-6)
+        np.testing.assert_allclose(layers["difference"], layers["prediction"] - truth, atol=1e-6)
+
+
+def test_the_lines_of_the_page_make_a_frame_and_its_truth(
     store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (lines,) = [
@@ -210,7 +299,7 @@ def test_the_lines_of_the_training_page_make_a_frame(
     trained(store, tmp_path / "run", "guided")
     (tmp_path / "store").symlink_to(store)
     monkeypatch.chdir(tmp_path)
-    left: dict[str, torch.Tensor] = {}
-    exec(lines, left)
-    assert left["image"].shape == (16, 24, 3)
-    assert bool(torch.isfinite(left["image"]).all())
+    left: dict[str, Any] = {}
+    exec(lines.replace("spp=256", "spp=8"), left)
+    assert left["frame"].radiance.shape == left["truth"].radiance.shape == (16, 24, 3)
+    assert left["error"].mean > 0

@@ -12,8 +12,12 @@ if TYPE_CHECKING:
     from photonfarm.predict.opened_run import OpenRun
 
 
-def open_run(run: str | Path, store: str | Path = "store", device: str = "auto") -> OpenRun:
+def open_run(
+    run: str | Path, store: str | Path = "store", device: str = "auto", *, fov: float | None = None
+) -> OpenRun:
     """Load the network of a run folder, and from a store the scene that it was trained on.
+
+    `fov` is the cameras' field of view along the width in degrees, if not the spec's.
 
     The renderer uses the card if there is one, else the processor, as PHOTONFARM_DEVICE says. Unless a `device` is
     named, the network uses the same, or the processor where torch cannot use that card.
@@ -25,7 +29,7 @@ def open_run(run: str | Path, store: str | Path = "store", device: str = "auto")
     from photonfarm.predict.opened_run import OpenRun
     from photonfarm.trainer.predictors.trained import TrainedRun
 
-    return OpenRun(TrainedRun.load(Path(run)), store, device)
+    return OpenRun(TrainedRun.load(Path(run)), store, device, fov)
 
 
 __all__ = ["open_run"]

@@ -1,4 +1,4 @@
-"""`photonfarm infer`: a trained network's image of a sample, or of a camera path.
+"""`photonfarm infer`: a trained network's image of any configuration and view, of a sample, or of a camera path.
 
 The views of a path are in no store. Their inputs are rendered here where the renderer is installed, or `photonfarm
 buffers` has written them to a file.
@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -25,12 +26,13 @@ from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.predict.opened_run import OpenRun
+from photonfarm.renderer.jobs.truth import Amount, write_beside
+from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot
 from photonfarm.scene.camera_path import Frames
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import Sample, SceneReader, Store
-from photonfarm.store.read.find import Query, find_samples
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import require
@@ -44,34 +46,59 @@ FFMPEG = "imageio_ffmpeg"
 
 @dataclass(frozen=True, slots=True)
 class InferResult:
-    """The files that were written, and a sentence on the error or the time."""
+    """The files that were written, a sentence on the error or the time, and what the network never saw."""
 
     files: tuple[Path, ...]
     sentence: str
+    doubts: tuple[str, ...] = ()
+
+
+# ----------------------------------------------------------------------------------------------- any configuration
+
+
+def show_frame(
+    opened: OpenRun,
+    asked: Shot,
+    start: tuple[Modification, View] | None,
+    out: Path,
+    amount: Amount | None,
+    load_s: float,
+) -> InferResult:
+    """Write the network's image of what is asked for, and with an `amount` the truth beside it: as `write_beside`.
+
+    frame.json says what stands where, by names, what the network never saw, seconds, and the error with its interval.
+    `load_s` is what loading took.
+    """
+    with torch.no_grad():
+        frame = opened.predict(*(start or (None, None)), **dict(asked))
+    image = frame.radiance.cpu().numpy()
+    if not np.isfinite(image).all():
+        raise IncompleteError("the image came out non-finite; move the camera a little")
+    shot, seconds = (opened.spec, frame.configuration, frame.view), {"load": load_s, **frame.seconds}
+    about: dict[str, Any] = {
+        "scene": opened.scene_id,
+        **list_shot(*shot),
+        "doubts": [*frame.doubts, *opened.look_closer(frame.configuration, frame.view)],
+        "seconds": seconds,
+    }
+    said = [describe_shot(*shot)]
+    truth = None
+    if amount is not None:
+        truth = opened.truth(frame.configuration, frame.view, spp=amount.spp, seconds=amount.seconds)
+        error, power, seconds["truth"] = truth.error(image), truth.power(), truth.seconds
+        about |= {"spp": truth.spp, "squared_error": error.mean, "interval": error.interval, "mean_square": power}
+        low, high = error.interval or (error.mean, error.mean)
+        share = f"{100 * error.mean / power:.2g} % of the image's mean square" if power > 0 else "of a black image"
+        said.append(
+            f"squared error {error.mean:.5f}, with probability 0.95 from {low:.5f} to {high:.5f}: {share}; truth of "
+            f"{truth.spp} samples per pixel"
+        )
+    said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
+    files = write_beside(out, image, truth, opened.spec.exposure, about)
+    return InferResult(tuple(files), "\n".join(said), tuple(about["doubts"]))
 
 
 # ---------------------------------------------------------------------------------------------------- a stored sample
-
-
-def find_row(store: str | Path, run: TrainedRun, modification: str | None, view: str | None) -> int:
-    """The first complete sample of a configuration and a view, as `store find` takes them.
-
-    Raises IncompleteError if such samples are planned and none is complete, StoreError if none is planned.
-    """
-    rows = find_samples(Store(store), [run.scene_id], Query.of(modification=modification, view=view))
-    row = next((sample.row for sample in rows.samples if sample.complete), None)
-    if row is None and rows.count:
-        raise IncompleteError(
-            f"{store}: {rows.count} samples of this configuration and view are planned, and none is complete; wait "
-            "for the workers"
-        )
-    if row is None:
-        nearest = "" if rows.nearest is None else f"; the nearest one is {rows.nearest:.3g} scene units away"
-        raise StoreError(
-            f"{store}: no sample of this configuration and view is planned{nearest}. Any view can be shown with "
-            "--camera-path, for which the renderer makes the buffers"
-        )
-    return row
 
 
 def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> InferResult:
@@ -133,8 +160,11 @@ def show_path(
     Raises IncompleteError for an image that is not finite.
     """
     with torch.no_grad():
-        images = ((opened.predict(modification, view) * opened.spec.exposure).cpu().numpy() for view in views)
-        return _show_images(images, len(views), out, fps, "for what the network reads and the network")
+        images = ((opened.predict(modification, view).radiance * opened.spec.exposure).cpu().numpy() for view in views)
+        shown = _show_images(images, len(views), out, fps, "for what the network reads and the network")
+    stands = Arrangement.from_modification(opened.spec, modification)
+    doubts = find_doubts(opened.spec, modification)
+    return InferResult(shown.files, f"{stands.describe() or 'at rest'}: {shown.sentence}", tuple(doubts))
 
 
 def _show_images(images: Iterator[F32], count: int, out: Path, fps: float, what: str) -> InferResult:

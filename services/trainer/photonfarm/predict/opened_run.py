@@ -9,7 +9,9 @@ Shape letters: H W image, P points, K photon slots.
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +25,7 @@ from photonfarm.core.processes import can_render
 from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
 from photonfarm.farm.devices import AUTO, CPU
+from photonfarm.scene.arrangement import Shot, find_doubts, with_fov
 from photonfarm.scene.modification import Modification, rebuild, rest
 from photonfarm.scene.spec import WITHOUT_SHADOWS
 from photonfarm.scene.view import Camera, View
@@ -42,6 +45,7 @@ from photonfarm.trainer.runs.run_folder import make_environment
 
 if TYPE_CHECKING:
     from photonfarm.core.records import Photons
+    from photonfarm.renderer.jobs.truth import Truth
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
 
@@ -56,43 +60,110 @@ def require_renderer(run: TrainedRun) -> None:
     os.environ.update(make_environment(run.folder))
 
 
-class OpenRun:
-    """A trained network and its scene. Not thread-safe: the scene is in one configuration at a time."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Frame:
+    """A network's image of a configuration from a view, and what it was made from."""
 
-    def __init__(self, run: TrainedRun, store: str | Path, device: str = "auto") -> None:
+    radiance: Tensor  # (H, W, 3) linear, on the network's device; differentiable with respect to the weights
+    inputs: Inputs  # a batch of one, light × exposure
+    configuration: Modification
+    view: View
+    seconds: Mapping[str, float]  # of the scene's edit, of the inputs, of the network; on a card, of the host alone
+    doubts: tuple[str, ...]  # what the network never saw, each a sentence; `OpenRun.look_closer` finds more
+
+
+class OpenRun:
+    """A trained network and its scene. Not thread-safe: the scene is in one configuration at a time.
+
+    `spec` is the scene's, with the field of view; `network` holds the weights.
+    """
+
+    def __init__(self, run: TrainedRun, store: str | Path, device: str = "auto", fov: float | None = None) -> None:
         """Load both, as `open_run` does; the network's device is by default the one that renders."""
         require_renderer(run)
         from photonfarm.renderer.jobs.render import load_scene, locate
         from photonfarm.renderer.scene import backend
 
-        source = run.source(Store(store).root)
-        self.spec = source.spec
+        self.store = Store(store)
+        source = run.source(self.store.root)
+        self.spec, self.scene_id = with_fov(locate(source.spec), fov), run.scene_id
         geometry, self._cloud = source.base()
-        self._scene: LoadedScene = load_scene(locate(source.spec))
+        self._scene: LoadedScene = load_scene(self.spec)
         torch.set_num_threads(run.settings.threads)
         self._run, self._needs, self._exposure = run, run.needs, self.spec.exposure
+        self._trained_fov = source.spec.view.fov_deg
         if device == AUTO and backend.device().card is None:
             device = CPU
         predictor = run.predictor(self.spec, (geometry, self._cloud), device)
-        self._images, self._device = predictor.images, predictor.device
+        self._images, self._device, self.network = predictor.images, predictor.device, predictor.network
         self._apply(rest(self.spec))
 
-    def predict(self, modification: Modification, view: View, *, passes: int = 1, both: bool = False) -> Tensor:
-        """The network's image of a configuration from a view, (H, W, 3), linear radiance, on the network's device.
+    def predict(
+        self,
+        configuration: Modification | None = None,
+        view: View | None = None,
+        *,
+        passes: int = 1,
+        both: bool = False,
+        **asked: Any,
+    ) -> Frame:
+        """The network's image of a configuration from a view.
 
-        It can be differentiated with respect to the network's weights. A network that is given a noisy half gets one
-        rendered, and guided_denoise the mean over `passes` of them; with `both`, the image is the mean of two, each
-        from a half of its own. Raises SpecError where the network is not given what is asked for, IncompleteError where
-        photons or halves stay non-finite with other seeds.
+        Both may be a sample's; by default they are the scene at rest and its first view. What is `asked` changes them:
+        `place`, `move` and `without` by groups' names, `camera` and `look_at`, as a `Shot` has them. A network that is
+        given a noisy half gets one rendered, and guided_denoise the mean over `passes` of them; with `both`, the image
+        is the mean of two, each from a half of its own. Raises SpecError for what is impossible, IncompleteError where
+        photons or halves stay non-finite.
         """
         self._check_halves(passes, both=both)
-        if not np.array_equal(modification.vector, self._modification.vector):
-            self._apply(Modification.from_vector(modification.vector))  # the caller may change theirs
+        began = time.perf_counter()
+        configuration, view = self._stage(configuration, view, asked)
+        staged = time.perf_counter()
         inputs = self._inputs(view)
-        if not self._needs.kept:
-            return self._images(inputs)[0] / self._exposure
-        halves = [self._noisy(view, passes, other=other) for other in (False, True)[: 1 + both]]
-        return torch.stack([self._images(replace(inputs, noisy=half))[0] for half in halves]).mean(0) / self._exposure
+        halves = [self._noisy(view, passes, other=other) for other in (False, True)[: 1 + both] if self._needs.kept]
+        given = time.perf_counter()
+        of_half = [replace(inputs, noisy=half) for half in halves] or [inputs]
+        images = [self._images(each)[0] for each in of_half]
+        radiance = (images[0] if len(images) == 1 else torch.stack(images).mean(0)) / self._exposure
+        seconds = {"edit": staged - began, "inputs": given - staged, "network": time.perf_counter() - given}
+        doubts = find_doubts(self.spec, configuration, view, self._trained_fov)
+        return Frame(radiance, of_half[0], configuration, view, seconds, tuple(doubts))
+
+    def truth(
+        self,
+        configuration: Modification | None = None,
+        view: View | None = None,
+        *,
+        spp: int | None = None,
+        seconds: float | None = None,
+        **asked: Any,
+    ) -> Truth:
+        """The image of the same by `bdpt`, with so many samples per pixel or for so many seconds; else as `predict`."""
+        from photonfarm.renderer.jobs.truth import Amount, render_truth
+
+        if (spp is None) == (seconds is None):
+            raise SpecError("truth: one of spp and seconds is required")
+        _, view = self._stage(configuration, view, asked)
+        return render_truth(self._scene, view_key(self._key, view.vector), view, Amount(spp, seconds))
+
+    def look_closer(
+        self, configuration: Modification | None = None, view: View | None = None, **asked: Any
+    ) -> list[str]:
+        """What stands in walls, or beyond them, and what the camera is inside of, each as a sentence; as `predict`."""
+        from photonfarm.renderer.scene.surroundings import look_closer
+
+        configuration, view = self._stage(configuration, view, asked)
+        return look_closer(self._scene, configuration, view)
+
+    def _stage(
+        self, configuration: Modification | None, view: View | None, asked: Mapping[str, Any]
+    ) -> tuple[Modification, View]:
+        """Bring the scene into the configuration that is asked for; returns that and the view."""
+        shot = Shot.of(**asked)
+        wanted, seen = shot.apply(self.spec, configuration), shot.view(self.spec, view)
+        if not np.array_equal(wanted.vector, self._modification.vector):
+            self._apply(wanted)
+        return wanted, seen
 
     def _check_halves(self, passes: int, *, both: bool) -> None:
         """Raise SpecError where the network cannot be given so many passes, or both halves."""

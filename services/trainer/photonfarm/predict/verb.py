@@ -2,26 +2,32 @@
 
 from __future__ import annotations
 
+import time
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from photonfarm.cli.options import store_option
+from photonfarm.cli.options import arrangement_options, fov_option, start_options, store_option
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.trainer.cli.evaluation_verbs import device_option
 from photonfarm.trainer.cli.train_verb import run_option
+
+if TYPE_CHECKING:
+    from photonfarm.scene.arrangement import Shot
 
 
 @click.command()
 @store_option
 @run_option
-@click.option("--row", type=click.IntRange(0), help="The sample in a row of the store.")
-@click.option("--view", metavar="VECTOR|KEY", help="The sample of this view, as `store find` takes it.")
+@start_options
+@arrangement_options()
+@fov_option
 @click.option(
-    "--modification",
-    metavar="VECTOR|KEY",
-    help="And of this configuration; of a path its configuration, which otherwise is the scene at rest.",
+    "--truth",
+    metavar="SPP|SECONDSs",
+    help="Render it by bdpt beside the network's image, with so many samples per pixel (256) or for so long (20s).",
 )
 @click.option(
     "--camera-path",
@@ -44,8 +50,10 @@ def infer(
     store: str | Path,
     run: Path,
     row: int | None,
-    view: str | None,
-    modification: str | None,
+    like: str | None,
+    asked: Shot,
+    fov: float | None,
+    truth: str | None,
     path: Path | None,
     orbit: int | None,
     buffers: Path | None,
@@ -53,38 +61,57 @@ def infer(
     out: Path,
     device: str,
 ) -> None:
-    """Show a trained network's image of one sample, or of a camera path: PNG, GIF and, with its extra, MP4.
+    """Show a trained network's image of any configuration and camera, of a stored sample, or along a camera path.
 
-    The views of a path are in no store: their inputs are rendered, where the renderer is installed, or a file has them.
+    What stands where is said by names; all others stay at rest, or as --row or --like has them. --row alone shows the
+    sample that is stored. Inputs are rendered where the renderer is installed; for a path, a file may have them. PNG,
+    NPZ, JSON and, with the package OpenEXR, EXR; of a path PNG, GIF and, with the extra `video`, MP4.
     """
     from photonfarm.predict import infer as shows
     from photonfarm.predict.opened_run import OpenRun, require_renderer
+    from photonfarm.renderer.jobs.truth import Amount
+    from photonfarm.scene.arrangement import Arrangement, Shot
     from photonfarm.scene.camera_path import CameraPath, Frames
+    from photonfarm.store import Store
+    from photonfarm.store.read.find import find_start
     from photonfarm.trainer.predictors.trained import TrainedRun
 
-    kinds = {"--row": row, "--view": view, "--camera-path": path, "--orbit": orbit, "--buffers": buffers}
+    began = time.perf_counter()
+    kinds = {"--camera-path": path, "--orbit": orbit, "--buffers": buffers}
     given = [name for name, value in kinds.items() if value is not None]
-    if len(given) > 1 or not (given or modification):
-        several = f"; {' and '.join(given)} exclude each other" if given else ""
-        raise click.UsageError(f"name what to show by one of {', '.join(kinds)}, or by --modification{several}")
-    if modification and given in (["--row"], ["--buffers"]):
-        raise click.UsageError(f"{given[0]} has a configuration; --modification cannot give it another one")
+    of_frame = {"--camera": asked.camera, "--look-at": asked.look_at, "--truth": truth, "--fov": fov}
+    alone = [name for name, value in of_frame.items() if value is not None]
+    arranged = like is not None or asked != Shot() or bool(alone)
+    if len(given) > 1 or (given and alone) or (buffers is not None and (arranged or row is not None)):
+        others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
+        raise click.UsageError(f"{' and '.join(others)} exclude each other")
+    amount = None if truth is None else Amount.parse(truth)
     along = orbit or (CameraPath.load(path) if path else None)
     if isinstance(along, CameraPath):
         along.sample()  # a faulty one is refused before anything is loaded
     trained = TrainedRun.load(run)
+    say = partial(click.echo, err=True)
     if along is not None:
         require_renderer(trained)
         from photonfarm.renderer.jobs.path_buffers import find_views
 
-        _, configuration, views = find_views(store, trained.scene_id, modification, along)
-        with tell_waiting(partial(click.echo, err=True), f"rendering {len(views)} frames of {trained.scene_id}"):
+        changes = Arrangement.of(**asked.model_dump(include=set(Arrangement.model_fields)))
+        _, configuration, views = find_views(store, trained.scene_id, changes, along, row, like)
+        with tell_waiting(say, f"rendering {len(views)} frames of {trained.scene_id}"):
             result = shows.show_path(OpenRun(trained, store, device), configuration, views, out, fps=fps)
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
+    elif row is not None and not arranged:
+        result = shows.show_sample(store, trained, row, out, device)
     else:
-        chosen = shows.find_row(store, trained, modification, view) if row is None else row
-        result = shows.show_sample(store, trained, chosen, out, device)
+        require_renderer(trained)
+        start = find_start(Store(store), trained.scene_id, row, like)
+        asked.apply(trained.source(store).spec)  # a wrong name is refused before anything is loaded
+        with tell_waiting(say, f"rendering {trained.scene_id}"):
+            opened = OpenRun(trained, store, device, fov)
+            result = shows.show_frame(opened, asked, start, out, amount, time.perf_counter() - began)
+    for doubt in result.doubts:
+        say(f"warning: {doubt}")
     for file in result.files:
         click.echo(file)
-    click.echo(result.sentence, err=True)
+    say(result.sentence)

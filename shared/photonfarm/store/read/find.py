@@ -1,8 +1,8 @@
-"""`photonfarm store find`: samples by their content (modification, view, keys), or by row and job; and scenes by name.
+"""`photonfarm store find`: samples by what stands where, by camera, key, row and job; and scenes by name.
 
 Where a store does not have the scene of a spec, the messages here say which scenes it has, and how they differ.
 
-Shape letters: R rows of a scene, N rows that match, G movable groups.
+Shape letters: R rows of a scene, N rows that match.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import CorruptError, SpecError, StoreError
 from photonfarm.core.keys import Key, view_key
 from photonfarm.core.models import differing
-from photonfarm.core.records import F32
-from photonfarm.plan.request import UNUSED
-from photonfarm.scene.modification import modification_keys
+from photonfarm.plan.request import UNUSED, PlannedContent
+from photonfarm.scene.arrangement import Shot, describe_shot
+from photonfarm.scene.modification import Modification, modification_keys
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
-from photonfarm.scene.view import view_keys
+from photonfarm.scene.view import View, view_keys
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import Shard
 from photonfarm.store.io.storage import look_into
@@ -39,39 +39,19 @@ _KEY = re.compile(r"[0-9a-fA-F]{32}")
 class Query:
     """The conditions on samples; None stands for any value."""
 
-    modification: F32 | Key | None = None  # a vector (4·G,) or (G, 4), or a content key
-    view: F32 | Key | None = None  # a vector (6,), or a content key, which implies the modification
+    asked: Shot | None = None  # what stands where, of the groups that it names, and the camera
+    like: Key | None = None  # the content key of a configuration, a view or a sample
     sample: Key | None = None
     row: int | None = None
     job: int | None = None
     tolerance: float = 1e-3  # of positions, in scene units; 0: equal bit by bit
 
     @classmethod
-    def of(
-        cls, *, modification: str | None = None, view: str | None = None, sample: str | None = None, **others: Any
-    ) -> Query:
-        """The query of the command line's options; raises SpecError for text that is neither key nor vector."""
-        if sample is not None and not _KEY.fullmatch(sample):
-            raise SpecError(f"--sample {sample!r}: a key of 32 hexadecimal digits is required")
-        wanted = _parse_key_or_vector("--modification", modification, 4), _parse_key_or_vector("--view", view, 6)
-        return cls(*wanted, None if sample is None else bytes.fromhex(sample), **others)
-
-
-def _parse_key_or_vector(option: str, text: str | None, multiple: int) -> F32 | Key | None:
-    """A content key in hexadecimal digits, or a vector: six numbers of a view, a multiple of four of a modification."""
-    if text is None:
-        return None
-    if _KEY.fullmatch(text.strip()):
-        return bytes.fromhex(text.strip())
-    words = text.replace(",", " ").replace("[", " ").replace("]", " ").split()
-    try:
-        vector = np.array([float(word) for word in words], np.float32)
-    except ValueError as error:
-        raise SpecError(f"{option} {text!r}: neither a key of 32 hexadecimal digits nor numbers") from error
-    if len(vector) % multiple or not np.isfinite(vector).all() or (multiple == 6 and len(vector) != 6):
-        rule = "six finite ones" if multiple == 6 else "four finite ones for each movable group"
-        raise SpecError(f"{option}: has {len(vector)} numbers; {rule} are required")
-    return vector
+    def of(cls, *, like: str | None = None, **others: Any) -> Query:
+        """The query of the command line's options; raises SpecError for text that is no key."""
+        if like is not None and not _KEY.fullmatch(like.strip()):
+            raise SpecError(f"--like {like!r}: a key of 32 hexadecimal digits is required")
+        return cls(like=None if like is None else bytes.fromhex(like.strip()), **others)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,9 +98,16 @@ def scene_or_spec(store: Store, named: str) -> SceneStore:
 def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit: int = 20) -> Matches:
     """The samples of some scenes that match a query, described for the first `limit` of them.
 
-    A scene whose number of movable groups differs from the query's vector has no match. Raises StoreError.
+    A scene without a group that the query names has no match. Raises StoreError, and SpecError where all lack it.
     """
-    matches = [(index, SceneMatch(store.scene(scene_id), query)) for index, scene_id in enumerate(scene_ids)]
+    matches, refused = [], None
+    for index, scene_id in enumerate(scene_ids):
+        try:
+            matches.append((index, SceneMatch(store.scene(scene_id), query)))
+        except SpecError as error:
+            refused = error
+    if refused is not None and not matches:
+        raise refused
     order = sorted(
         (
             (float(d), index, int(row), match)
@@ -132,6 +119,21 @@ def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit:
     nearest = [match.nearest for _, match in matches if match.nearest is not None]
     described = tuple(match.describe(row, distance) for distance, _, row, match in order[:limit])
     return Matches(sum(len(match.rows) for _, match in matches), described, min(nearest, default=None))
+
+
+def find_start(store: Store, scene_id: str, row: int | None, like: str | None) -> tuple[Modification, View] | None:
+    """What the sample in a row shows, or the first one of a configuration's, a view's or a sample's key; None for none.
+
+    Raises StoreError if no plan of the scene has it, SpecError for text that is no key.
+    """
+    if row is None and like is None:
+        return None
+    found = find_samples(store, [scene_id], Query.of(row=row, like=like), limit=1).samples
+    if not found:
+        named = " and ".join([f"--row {row}"] * (row is not None) + [f"--like {like}"] * (like is not None))
+        raise StoreError(f"{named}: no plan of scene {scene_id} has such a sample; `photonfarm store find` shows them")
+    vector = np.array(found[0].modification, np.float32).reshape(-1, 4)
+    return Modification.from_vector(vector), View.from_vector(np.array(found[0].view, np.float32))
 
 
 F64 = NDArray[np.float64]
@@ -160,6 +162,7 @@ class FoundSample:
     modification_row: int
     modification_key: str
     modification: tuple[tuple[float, ...], ...]  # G times x, y, z, present
+    shot: str  # configuration and view by names, as options of the command line
     view_row: int
     view_key: str
     view: tuple[float, ...]  # camera position, look-at point
@@ -201,40 +204,41 @@ class SceneMatch:
         if query.job is not None:
             rows = rows[rows // self._plans[0].shard_rows == query.job]
         if query.sample is not None:
-            wanted = np.frombuffer(query.sample, "<u8")  # a key as two numbers, which are compared at once
-            rows = rows[(inputs.column("sample_key")[rows].view("<u8") == wanted).all(axis=1)]
+            rows = rows[_have_key(inputs.column("sample_key")[rows], query.sample)]
+        if query.like is not None and len(rows):
+            rows = self._choose_like(inputs, rows, query.like)
         distance = np.zeros(len(rows))
-        if query.modification is not None and len(rows):
+        if (asked := query.asked) is not None:
             distinct, place = np.unique(modification[rows], return_inverse=True)
-            vectors = inputs.vectors("modification", distinct)
-            distance = self._modification_distances(vectors, query.modification)[place]
-        if query.view is not None and len(rows):
-            _, first, place = np.unique(view[rows], return_index=True, return_inverse=True)
-            one_each = rows[first]  # one sample of each view
-            vectors = inputs.vectors("view", view[one_each])
-            if isinstance(query.view, bytes):
-                modifications = inputs.vectors("modification", modification[one_each])
-                keys = view_keys(modification_keys(self._scene.spec.radiance_id, modifications), vectors)
-                of_views = _key_distances(keys, query.view)
-            else:  # the larger of the distances of position and look-at point
-                offsets = (vectors - query.view.astype(np.float64)).reshape(-1, 2, 3)
-                of_views = np.linalg.norm(offsets, axis=-1).max(axis=1)
-            distance = np.maximum(distance, of_views[place])
+            distance = asked.fits(self._scene.spec, inputs.vectors("modification", distinct))[place]
+            distinct, place = np.unique(view[rows], return_inverse=True)
+            vectors = inputs.vectors("view", distinct).astype(np.float64)
+            for wanted, columns in ((asked.camera, slice(0, 3)), (asked.look_at, slice(3, 6))):
+                if wanted is not None:
+                    off = np.linalg.norm(vectors[:, columns] - np.array(wanted, np.float32), axis=1)
+                    distance = np.maximum(distance, off[place])
         if np.isfinite(distance).any():
             self.nearest = float(distance.min())
         fits = distance <= query.tolerance
         order = np.argsort(distance[fits], kind="stable")
         self.rows, self.distance = rows[fits][order], distance[fits][order]
 
-    def _modification_distances(self, vectors: F32, wanted: F32 | Key) -> F64:
-        """How far the farthest group of each, (N, G, 4), is from its wanted place; infinite if others are present."""
-        if isinstance(wanted, bytes):
-            return _key_distances(modification_keys(self._scene.spec.radiance_id, vectors), wanted)
-        if wanted.size != vectors[0].size:
-            return np.full(len(vectors), np.inf)
-        target = wanted.reshape(vectors.shape[1:])
-        distance = np.linalg.norm(vectors[..., :3].astype(np.float64) - target[:, :3], axis=-1).max(axis=1, initial=0)
-        return np.where(((vectors[..., 3] != 0) == (target[:, 3] != 0)).all(axis=1), distance, np.inf)
+    def _choose_like(self, inputs: PlannedContent, rows: NDArray[np.int64], key: Key) -> NDArray[np.int64]:
+        """Those of some rows whose sample has a key or, if none has, whose configuration, or else whose view."""
+        like = _have_key(inputs.column("sample_key")[rows], key)
+        if not like.any():
+            distinct, place = np.unique(inputs.column("sample_modification")[rows], return_inverse=True)
+            keys = modification_keys(self._scene.spec.radiance_id, inputs.vectors("modification", distinct))
+            like = np.array([each == key for each in keys], np.bool_)[place]
+        if not like.any():
+            of_modification = dict(zip(distinct.tolist(), keys, strict=True))
+            distinct, first, place = np.unique(
+                inputs.column("sample_view")[rows], return_index=True, return_inverse=True
+            )
+            owners = inputs.column("sample_modification")[rows[first]].tolist()
+            keys = view_keys([of_modification[row] for row in owners], inputs.vectors("view", distinct))
+            like = np.array([each == key for each in keys], np.bool_)[place]
+        return rows[like]
 
     # ------------------------------------------------------------------------------------------------------- describing
 
@@ -260,6 +264,7 @@ class SceneMatch:
             modification_row=sample.modification_row,
             modification_key=key.hex(),
             modification=tuple(tuple(map(float, group)) for group in modification.vector),
+            shot=describe_shot(self._scene.spec, modification, view),
             view_row=sample.view_row,
             view_key=view_key(key, view.vector).hex(),
             view=tuple(map(float, view.vector)),
@@ -296,9 +301,10 @@ class SceneMatch:
             return False
 
 
-def _key_distances(keys: Sequence[Key], wanted: Key) -> F64:
-    """Distances of keys, as those of vectors: 0 of an equal key, and infinite of any other, (N,)."""
-    return np.where([key == wanted for key in keys], 0.0, np.inf)
+def _have_key(keys: NDArray[np.uint8], wanted: Key) -> NDArray[np.bool_]:
+    """Whether keys (N, 16) are the wanted one, (N,): each as two numbers, which are compared at once."""
+    equal: NDArray[np.bool_] = (keys.view("<u8") == np.frombuffer(wanted, "<u8")).all(axis=1)
+    return equal
 
 
 MOST_DIFFERENCES = 4

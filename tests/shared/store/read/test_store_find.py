@@ -17,6 +17,8 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import arrays_of
 from photonfarm.plan.request import Request
+from photonfarm.scene.arrangement import Arrangement, Shot
+from photonfarm.scene.modification import Modification
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.read.find import Matches, Query, find_samples, scene_named
 
@@ -43,8 +45,10 @@ def rows(matches: Matches) -> list[int]:
     return [sample.row for sample in matches.samples]
 
 
-def text(vector: np.ndarray) -> str:
-    return ", ".join(repr(float(value)) for value in vector.reshape(-1))
+def shown(scene: SceneStore, row: int) -> Shot:
+    """What stands where in a modification's row, by names."""
+    modification = Modification.from_vector(scene.plans()[0].rows.modification[row])
+    return Shot.of(**Arrangement.from_modification(scene.spec, modification).model_dump())
 
 
 def present(scene: SceneStore) -> int:
@@ -53,10 +57,11 @@ def present(scene: SceneStore) -> int:
     return int(np.flatnonzero(vectors[:, 0, 3] == 1)[-1])
 
 
-def test_a_modification_is_found_by_its_vector_with_all_its_views_and_passes(store: Store, scene: SceneStore) -> None:
+def test_a_modification_is_found_by_what_stands_where_with_all_its_views_and_passes(
+    store: Store, scene: SceneStore
+) -> None:
     row = present(scene)
-    vector = scene.plans()[0].rows.modification[row]
-    matches = find(store, modification=text(vector), tolerance=0)
+    matches = find(store, asked=shown(scene, row), tolerance=0)
     assert {s.modification_row for s in matches.samples} == {row}
     assert sorted({(s.view_row, s.pass_) for s in matches.samples}) == sorted(
         (view, pass_) for view in {s.view_row for s in matches.samples} for pass_ in (0, 1)
@@ -65,26 +70,33 @@ def test_a_modification_is_found_by_its_vector_with_all_its_views_and_passes(sto
     assert all(s.distance == 0 for s in matches.samples)
 
 
-def test_a_rounded_vector_finds_within_the_tolerance_and_the_nearest_comes_first(
+def test_a_rounded_place_finds_within_the_tolerance_and_the_nearest_comes_first(
     store: Store, scene: SceneStore
 ) -> None:
     row = present(scene)
-    vector = scene.plans()[0].rows.modification[row].copy()
-    vector[0, 0] += np.float32(0.25)
-    assert find(store, modification=text(vector)).count == 0
-    assert find(store, modification=text(vector)).nearest <= 0.25 + 1e-6
-    matches = find(store, modification=text(vector), tolerance=10)
+    ((name, (x, y, z)),) = shown(scene, row).place.items()
+    asked = Shot.of(place={name: (x + 0.25, y, z)})
+    assert find(store, asked=asked).count == 0
+    assert find(store, asked=asked).nearest <= 0.25 + 1e-6
+    matches = find(store, asked=asked, tolerance=10)
     distances = [s.distance for s in matches.samples]
     assert distances == sorted(distances)
     assert matches.samples[0].distance == pytest.approx(matches.nearest)
     assert row in {s.modification_row for s in matches.samples if s.distance <= 0.25 + 1e-6}
 
 
-def test_a_removed_object_is_never_near_one_that_is_there(store: Store, scene: SceneStore) -> None:
-    vector = scene.plans()[0].rows.modification[present(scene)].copy()
-    vector[0, 3] = 0
-    matches = find(store, modification=text(vector), tolerance=100)
-    assert all(s.modification[0][3] == 0 for s in matches.samples)
+def test_a_removed_object_is_never_near_one_that_is_there_and_one_that_is_not_named_is_anywhere(
+    store: Store, scene: SceneStore
+) -> None:
+    (name,) = shown(scene, present(scene)).place
+    vectors = scene.plans()[0].rows.modification
+    for asked, there in ((Shot.of(without=[name]), 0), (Shot.of(move={name: (0, 0, 0)}), 1)):
+        matches = find(store, asked=asked, tolerance=100)
+        assert {s.modification[0][3] for s in matches.samples} <= {there}
+        assert matches.count == 4 * int((vectors[:, 0, 3] == there).sum())
+    assert find(store, asked=Shot()).count == 24
+    with pytest.raises(SpecError, match=f"nearest: {name}"):
+        find(store, asked=Shot.of(without=[f"{name}s"]))
 
 
 def test_samples_are_found_by_each_of_their_keys(store: Store, scene: SceneStore) -> None:
@@ -93,20 +105,21 @@ def test_samples_are_found_by_each_of_their_keys(store: Store, scene: SceneStore
         (sample,) = find(store, row=row).samples
         assert sample.modification_key == reader.modification_key(row).hex()
         assert sample.view_key == reader.view_key(row).hex()
-        assert rows(find(store, sample=sample.key)) == [row]
-        assert row in rows(find(store, modification=sample.modification_key))
-        of_view = find(store, view=sample.view_key)
+        assert rows(find(store, like=sample.key)) == [row]
+        assert row in rows(find(store, like=sample.modification_key))
+        of_view = find(store, like=sample.view_key)
         assert {(s.view_row, s.pass_) for s in of_view.samples} == {(sample.view_row, 0), (sample.view_row, 1)}
-    assert find(store, sample="0" * 32).count == 0
+    assert find(store, like="0" * 32).count == 0
 
 
-def test_a_view_is_found_by_its_vector_and_conditions_narrow_each_other(store: Store, scene: SceneStore) -> None:
+def test_a_view_is_found_by_its_camera_and_conditions_narrow_each_other(store: Store, scene: SceneStore) -> None:
     view = scene.plans()[0].rows.view[3]
-    matches = find(store, view=text(view), tolerance=0)
+    asked = Shot.of(camera=view[:3], look_at=view[3:])
+    matches = find(store, asked=asked, tolerance=0)
     assert {s.view_row for s in matches.samples} == {3}
     assert matches.count == 2
     job = matches.samples[1].jobs[0]
-    assert find(store, view=text(view), job=job).count == 1
+    assert find(store, asked=asked, job=job).count == 1
     assert rows(find(store, job=2)) == [8, 9, 10, 11]
 
 
@@ -157,21 +170,9 @@ def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene:
     assert find_samples(store, [other.scene_id], Query()).count == 0
 
 
-@pytest.mark.parametrize(
-    "query",
-    [
-        {"modification": "left"},
-        {"modification": "1 2 3"},
-        {"modification": "1,2,3"},
-        {"view": "1 2 3"},
-        {"view": "1,2,3"},
-        {"view": "nan " * 6},
-        {"sample": "12"},
-    ],
-)
-def test_what_is_neither_key_nor_vector_is_refused(query: dict[str, str]) -> None:
-    with pytest.raises(SpecError, match=f"--{next(iter(query))}"):
-        Query.of(**query)
+def test_what_is_no_key_is_refused() -> None:
+    with pytest.raises(SpecError, match="--like"):
+        Query.of(like="12")
 
 
 def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: SceneStore) -> None:
@@ -193,4 +194,8 @@ def test_the_command_prints_what_it_finds_and_what_to_run(store: Store, scene: S
     looked = subprocess.run([sys.executable, *words], capture_output=True, text=True)
     assert looked.returncode == 0, looked.stderr
     assert looked.stdout.startswith("[[[[")
-    assert "the nearest is" in run("--modification", "9 9 9 1").stderr
+    (name,) = shown(scene, present(scene)).place
+    assert "the nearest is" in run("--place", f"{name}=9,9,9").stderr
+    like = run("--like", printed["samples"][0]["key"], "--json")
+    words = shlex.split(json.loads(like.stdout)["samples"][0]["shot"])
+    assert run(*words, "--tolerance", "0", "--row", "0").stdout.startswith("small ")

@@ -7,12 +7,23 @@ import math
 import sys
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from photonfarm.cli.options import device_option, json_option, store_option
+from photonfarm.cli.options import (
+    arrangement_options,
+    device_option,
+    fov_option,
+    json_option,
+    start_options,
+    store_option,
+)
 from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import tell_waiting
+
+if TYPE_CHECKING:
+    from photonfarm.scene.arrangement import Arrangement, Shot
 
 
 @click.command()
@@ -39,9 +50,8 @@ def preview(scene: str, store: str | Path, count: int, out: Path) -> None:
 @click.command()
 @store_option
 @click.option("--scene", required=True, metavar="ID", help="A scene of the store: its id, how it begins, or its name.")
-@click.option(
-    "--modification", metavar="VECTOR|KEY", help="The configuration, as `store find` takes it.  [default: at rest]"
-)
+@start_options
+@arrangement_options(camera=False)
 @click.option(
     "--camera-path",
     "path",
@@ -54,20 +64,30 @@ def preview(scene: str, store: str | Path, count: int, out: Path) -> None:
 @device_option
 @end_on_ctrl_c()
 def buffers(
-    store: str | Path, scene: str, modification: str | None, path: Path | None, orbit: int | None, out: Path
+    store: str | Path,
+    scene: str,
+    row: int | None,
+    like: str | None,
+    asked: Arrangement,
+    path: Path | None,
+    orbit: int | None,
+    out: Path,
 ) -> None:
     """Write the buffers of views along a camera path, and the photons: what `photonfarm infer --buffers` shows.
 
     Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
     """
-    from photonfarm.renderer.jobs.path_buffers import render_path
+    from photonfarm.renderer.jobs.path_buffers import find_views, frames_of
+    from photonfarm.renderer.jobs.render import locate
     from photonfarm.scene.camera_path import CameraPath
 
     if (path is None) == (orbit is None):
         raise click.UsageError("one of --camera-path and --orbit is required")
     along = orbit or CameraPath.load(path or Path())
     with tell_waiting(partial(click.echo, err=True), f"rendering buffers of {scene}"):
-        frames = render_path(store, scene, modification, along)
+        stored, configuration, views = find_views(store, scene, asked, along, row, like)
+        cloud = stored.base()[1] if stored.has_base() else None
+        frames = frames_of(locate(stored.spec), configuration, views, cloud)
         frames.write(out)
     click.echo(f"{out}: {len(frames)} frames")
 
@@ -152,39 +172,73 @@ def measure_frames(
 @click.command()
 @click.argument("scene", metavar="SPEC_OR_SCENE")
 @store_option
-@click.option("--row", type=click.IntRange(0), required=True, help="A sample, by its row in the store.")
+@start_options
+@arrangement_options()
+@fov_option
+@click.option(
+    "--spp",
+    metavar="SPP|SECONDSs",
+    help="Samples per pixel (256), or for how long to render (20s).  [default: 64]",
+)
 @click.option(
     "--pass",
     "pass_number",
     type=click.IntRange(0),
     metavar="P",
-    help="Another pass of its view, stored or not.  [default: that of the row]",
+    help="With --row alone, another pass of its view, stored or not.  [default: that of the row]",
 )
 @click.option(
     "--out",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Also write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.",
+    help="Write A and B to FILE.npz or FILE.exr, or a picture of their mean to FILE.png.",
 )
 @device_option
 @json_option
 @end_on_ctrl_c()
-def render(scene: str, store: str | Path, row: int, pass_number: int | None, out: Path | None, as_json: bool) -> None:
-    """Render a sample again, from its seeds, and compare it with the stored one; the store stays as it is.
+def render(
+    scene: str,
+    store: str | Path,
+    row: int | None,
+    like: str | None,
+    asked: Shot,
+    fov: float | None,
+    spp: str | None,
+    pass_number: int | None,
+    out: Path | None,
+    as_json: bool,
+) -> None:
+    """Render any configuration from any camera by bdpt, or a stored sample again; the store stays as it is.
 
-    On the same kind of processor, with the same versions, it is equal to the bit. Elsewhere it differs by rounding.
-    What a card rendered, or renders here, is equal in distribution alone.
+    What stands where is said by names; all others stay at rest, or as --row or --like has them.
 
-    Exit codes: 0 equal to the bit, or the store does not have this pass; 1 it differs, by no more than chance (a block
-    z-test); 4 it differs by more.
+    With --row alone, the sample is rendered again from its seeds, and compared with the stored one. On the same kind of
+    processor, with the same versions, it is equal to the bit. Elsewhere it differs by rounding. What a card rendered,
+    or renders here, is equal in distribution alone. Exit codes: 0 equal to the bit, or the store does not have this
+    pass; 1 it differs, by no more than chance (a block z-test); 4 it differs by more.
     """
-    from photonfarm.renderer.jobs.repeat import check_suffix, repeat
+    from photonfarm.renderer.jobs import truth
+    from photonfarm.renderer.jobs.repeat import repeat
+    from photonfarm.scene.arrangement import Shot
 
+    say = partial(click.echo, err=True)
+    again = row is not None and (like, asked, fov, spp) == (None, Shot(), None, None)
+    if not again and pass_number is not None:
+        raise click.UsageError("--pass: is of a stored sample, which --row alone renders again")
     if out is not None:
-        check_suffix(out)
-    repeated = repeat(store, scene, row, pass_number, partial(click.echo, err=True))
-    if out is not None:
-        repeated.write(out)
-        click.echo(f"written to {out}", err=True)
-    click.echo(json.dumps(repeated.document(), indent=1) if as_json else repeated.line())
-    sys.exit(repeated.exit_code)
+        truth.check_suffix(out)
+    if again:
+        repeated = repeat(store, scene, row or 0, pass_number, say)
+        if out is not None:
+            repeated.write(out)
+            say(f"written to {out}")
+        click.echo(json.dumps(repeated.document(), indent=1) if as_json else repeated.line())
+        sys.exit(repeated.exit_code)
+    amount = truth.Amount.parse(spp or "64")
+    with tell_waiting(say, f"rendering {scene}"):
+        image = truth.render_asked(store, scene, asked, row, like, fov, amount)
+    for doubt in image.doubts:
+        say(f"warning: {doubt}")
+    image.write(file := out or Path("render.png"))
+    say(f"written to {file}")
+    click.echo(json.dumps(image.document(), indent=1) if as_json else image.line())

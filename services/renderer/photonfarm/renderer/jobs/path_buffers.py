@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.core.errors import IncompleteError, SpecError, StoreError
+from photonfarm.core.errors import IncompleteError
 from photonfarm.core.keys import view_key
 from photonfarm.core.records import BasePointCloud, Guides, ViewBuffers, Visibility, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
@@ -17,62 +17,40 @@ from photonfarm.renderer.jobs.render import (
     SceneLoader,
     lit_points,
     load_scene,
-    locate,
     visibility_of,
 )
+from photonfarm.scene.arrangement import Arrangement
 from photonfarm.scene.camera_path import CameraPath, Frames, check_clear, orbit
-from photonfarm.scene.modification import Modification, rebuild, rest
+from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import SceneStore, Store
-from photonfarm.store.read.find import Query, find_samples, scene_named
-
-
-def render_path(store: str | Path, scene: str, modification: str | None, path: CameraPath | int) -> Frames:
-    """The buffers of a camera path, or of an orbit of so many frames.
-
-    Raises as `find_views` does, and SceneNotHereError if the scene's files are not on this machine.
-    """
-    stored, configuration, views = find_views(store, scene, modification, path)
-    cloud = stored.base()[1] if stored.has_base() else None
-    return frames_of(locate(stored.spec), configuration, views, cloud)
+from photonfarm.store.read.find import find_start, scene_named
 
 
 def find_views(
-    store: str | Path, scene: str, modification: str | None, path: CameraPath | int
+    store: str | Path,
+    scene: str,
+    asked: Arrangement,
+    path: CameraPath | int,
+    row: int | None = None,
+    like: str | None = None,
 ) -> tuple[SceneStore, Modification, list[View]]:
-    """The scene in the store, the configuration, by default that at rest, and the views of a path or of an orbit.
+    """The scene in the store, the configuration, and the views of a path or of an orbit of so many frames.
 
-    Raises StoreError for a scene that the store does not hold, SpecError for an impossible configuration or path.
+    The configuration begins with that of `find_start`, then a path's file changes it, and then what is `asked`. Raises
+    StoreError for a scene or a start that the store does not hold, SpecError for an impossible configuration or path.
     """
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
-    configuration = find_configuration(opened, stored, modification)
+    start = find_start(opened, stored.scene_id, row, like)
+    configuration = start[0] if start else None
+    if isinstance(path, CameraPath):
+        configuration = path.apply(stored.spec, configuration)
+    configuration = asked.apply(stored.spec, configuration)
     if isinstance(path, int):
         return stored, configuration, orbit(stored.spec, path, configuration)
     return stored, configuration, check_clear(stored.spec, path.sample(), configuration)
-
-
-def find_configuration(store: Store, scene: SceneStore, text: str | None) -> Modification:
-    """The configuration of `--modification VECTOR|KEY`, as `store find` takes it; without a text, the scene at rest.
-
-    Raises SpecError for a vector of another number of groups, StoreError for a key that is in no plan.
-    """
-    if text is None:
-        return rest(scene.spec)
-    query = Query.of(modification=text)
-    wanted, groups = query.modification, len(scene.spec.groups)
-    if isinstance(wanted, np.ndarray):
-        if wanted.size != 4 * groups:
-            raise SpecError(
-                f"--modification: has {wanted.size} numbers; {4 * groups} are required, 4 for each of the "
-                f"{groups} movable groups of {scene.spec.name}"
-            )
-        return Modification.from_vector(wanted.reshape(groups, 4))
-    samples = find_samples(store, [scene.scene_id], query, limit=1).samples
-    if not samples:
-        raise StoreError(f"--modification {text}: no plan of scene {scene.scene_id} has a configuration of this key")
-    return Modification.from_vector(np.array(samples[0].modification, np.float32).reshape(groups, 4))
 
 
 def frames_of(

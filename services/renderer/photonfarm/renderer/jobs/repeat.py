@@ -11,10 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from photonfarm.core import pictures
-from photonfarm.core.archives import write_arrays, write_layers
-from photonfarm.core.errors import SpecError, StoreError, store_errors
-from photonfarm.core.files import whole_file
+from photonfarm.core.errors import StoreError
 from photonfarm.core.keys import Key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import block_z_test
@@ -22,6 +19,7 @@ from photonfarm.core.waiting import Log, tell_waiting
 from photonfarm.plan.request import sample_key
 from photonfarm.renderer.jobs.estimates import halves_of
 from photonfarm.renderer.jobs.render import SceneLoader, load_scene, locate, versions
+from photonfarm.renderer.jobs.truth import write_halves
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
@@ -31,9 +29,6 @@ from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers
 from photonfarm.store.format.shards import round_as_stored
 from photonfarm.store.read.find import Query, SceneMatch, is_spec_file, scene_or_spec
-
-SUFFIXES = (".npz", ".exr", ".png")
-"""The kinds of files that a pass is written as."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,23 +101,9 @@ class Repeated:
         return f"row {self.row}, pass {self.pass_number}: {self.comparison.line()}"
 
     def write(self, file: Path) -> None:
-        """Write the pass as an archive or as an image with layers; as a PNG, its mean as a display shows it.
-
-        Raises StoreError if the disk refuses or OpenEXR is missing.
-        """
-        mean = (self.halves[0] + self.halves[1]) / np.float32(2)
+        """Write the pass, as `write_halves` does."""
         about = {"scene": self.scene_id, "key": self.key, "pass": self.pass_number}
-        if file.suffix == ".npz":
-            arrays = {name: np.asarray(value) for name, value in about.items()}
-            write_arrays(file, {"A": self.halves[0], "B": self.halves[1], **arrays}, "rendered pass")
-        elif file.suffix == ".exr":
-            said = {name: str(value) for name, value in about.items()}
-            write_layers(file, {"": mean, "A": self.halves[0], "B": self.halves[1]}, said)
-        else:
-            from PIL import Image
-
-            with store_errors("write a picture", file), whole_file(file) as part:
-                Image.fromarray(pictures.display(mean, self.exposure)).save(part, "PNG")
+        write_halves(file, self.halves, self.exposure, about)
 
 
 def repeat(
@@ -222,9 +203,3 @@ def _interleave(images: F32) -> F32:
     count, height, width, channels = images.shape
     small = images.reshape(count, height // 4, 4, width // 4, 4, channels).transpose(0, 2, 4, 1, 3, 5)
     return small.reshape(16 * count, height // 4, width // 4, channels)
-
-
-def check_suffix(file: Path) -> None:
-    """Raise SpecError for a name that is of no kind of file that a pass is written as."""
-    if file.suffix not in SUFFIXES:
-        raise SpecError(f"--out {file}: names of {', '.join(SUFFIXES)} files are allowed")

@@ -23,7 +23,7 @@ Shape letters: N points, R rays, S shapes.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mitsuba as mi
 import numpy as np
@@ -31,6 +31,13 @@ from numpy.typing import NDArray
 
 from photonfarm.core.records import F32
 from photonfarm.renderer.scene.arrays import points as mi_points
+from photonfarm.scene.arrangement import NEVER_SEEN
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import shape_ids
+from photonfarm.scene.view import View
+
+if TYPE_CHECKING:
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
 
 DIRECTIONS = 64
 
@@ -95,6 +102,41 @@ def hollow_boxes(boxes: F32) -> NDArray[np.bool_]:
     others = (above & below).all(axis=2).sum(axis=1) - 1
     hollow: NDArray[np.bool_] = (2 * others > len(boxes) - 1) | (len(boxes) == 1)
     return hollow
+
+
+PARTLY = 0.2
+"""The share of a group's box from which on it stands in something."""
+
+
+def look_closer(loaded: LoadedScene, modification: Modification, view: View) -> list[str]:
+    """What the present configuration puts into walls, or outside, each as a sentence: groups not at rest, the camera.
+
+    A group's points are 27 in the box around it. Groups that meet are nothing special: placements are drawn so.
+    """
+    shapes, spec = loaded.scene.shapes(), loaded.spec
+    boxes, at_rest, found = boxes_of(shapes), rest(spec).vector, []
+    room = boxes[loaded.still]
+    low, high = (room[:, 0].min(axis=0), room[:, 1].max(axis=0)) if len(room) else (-np.inf, np.inf)
+    slack = 0.01 * np.max(high - low)
+    for group, now, before in zip(spec.groups, modification.vector, at_rest, strict=True):
+        if np.array_equal(now, before) or not now[3]:
+            continue
+        own = boxes[[shape.id() in shape_ids(group) for shape in shapes]]
+        corners = own[:, 0].min(axis=0), own[:, 1].max(axis=0)
+        if (corners[0] < low - slack).any() or (corners[1] > high + slack).any():
+            found.append(f"{group.name} reaches beyond all that never moves")
+            continue
+        grid = np.stack(np.meshgrid(*[[1 / 6, 1 / 2, 5 / 6]] * 3), axis=-1).reshape(-1, 3)
+        solid = loaded.surroundings((corners[0] + grid * (corners[1] - corners[0])).astype(np.float32)).solid
+        within = [number for number in solid.tolist() if number != NONE and loaded.still[number]]
+        if len(within) > PARTLY * len(solid):
+            found.append(f"{group.name} stands in {shapes[max(within, key=within.count)].id()!r}")
+    number = int(loaded.surroundings(view.origin[None]).solid[0])
+    if number != NONE:
+        found.append(f"the camera is inside {shapes[number].id()!r}")
+    elif (view.origin < low - slack).any() or (view.origin > high + slack).any():
+        found.append("the camera is beyond all that never moves")
+    return [f"{sentence}: {NEVER_SEEN}" for sentence in found]
 
 
 def directions() -> F32:

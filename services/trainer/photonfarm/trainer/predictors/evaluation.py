@@ -61,6 +61,7 @@ class DevicePredictor:
 
     images: Callable[[Inputs], Tensor]  # (B, H, W, 3), linear radiance × exposure
     device: torch.device
+    network: Network | None = None  # that makes them, if one does
 
     @torch.no_grad()
     def __call__(self, batch: TrainingBatch) -> F32:
@@ -116,7 +117,7 @@ def read_in_turn(
 
 def make_network_predictor(network: Network) -> DevicePredictor:
     """The network as a predictor, on the device of its parameters."""
-    return DevicePredictor(partial(predict_image, network), next(network.parameters()).device)
+    return DevicePredictor(partial(predict_image, network), next(network.parameters()).device, network)
 
 
 def average_colours(samples: Iterable[F32]) -> tuple[F32, F32]:

@@ -1,0 +1,254 @@
+"""The truth of any configuration and view: an image by `bdpt` in two independent halves, as good as one has time for.
+
+No store has a part in it. Shape letters: N parts, H W image.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.core import pictures
+from photonfarm.core.archives import write_arrays, write_layers
+from photonfarm.core.errors import SpecError, StoreError, store_errors
+from photonfarm.core.files import whole_file
+from photonfarm.core.keys import Key, make_key, view_key
+from photonfarm.core.records import F32
+from photonfarm.core.statistics import Estimate, clean_error, jackknife
+from photonfarm.renderer.jobs.estimates import halves_of
+from photonfarm.scene.arrangement import Shot, describe_shot, find_doubts, list_shot, with_fov
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import find_spec, load_spec, scene_folder
+from photonfarm.scene.view import View
+from photonfarm.store import Store
+from photonfarm.store.read.find import find_start, is_spec_file, scene_or_spec
+
+if TYPE_CHECKING:
+    from photonfarm.renderer.scene.loaded_scene import LoadedScene
+
+PARTS = 16
+"""The parts that passes are dealt out to: from their spread follows how well an error is known."""
+
+LEAST_PASSES = 2
+
+SUFFIXES = (".npz", ".exr", ".png")
+"""The kinds of files that an image in two halves is written as."""
+
+
+@dataclass(frozen=True, slots=True)
+class Amount:
+    """How much to render: so many samples per pixel, both halves together, or so many seconds."""
+
+    spp: int | None = None
+    seconds: float | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Self:
+        """The amount in a text such as 256 or 20s; raises SpecError for another one."""
+        if re.fullmatch(r"[1-9]\d{0,7}", text):
+            return cls(spp=int(text))
+        if (found := re.fullmatch(r"(\d{1,6}|\d{0,6}\.\d{1,6})s", text)) and float(found[1]) > 0:
+            return cls(seconds=float(found[1]))
+        raise SpecError(f"{text!r}: samples per pixel are required, such as 256, or a time, such as 20s")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """An image without bias, and what noise it has."""
+
+    parts: NDArray[np.float64]  # (N, 2, H, W, 3) linear radiance: means of both halves over the passes of each part
+    passes: NDArray[np.int64]  # (N,) of each part
+    spp: int  # samples per pixel of all passes, both halves together
+    seconds: float
+    exposure: float
+
+    @property
+    def halves(self) -> F32:
+        """A and B, (2, H, W, 3), linear radiance: independent of each other."""
+        mean: F32 = np.average(self.parts, axis=0, weights=self.passes).astype(np.float32)
+        return mean
+
+    @property
+    def radiance(self) -> F32:
+        """The mean of both, (H, W, 3)."""
+        return self.halves.mean(axis=0)
+
+    def error(self, radiance: F32) -> Estimate:
+        """The mean squared error of an image against the clean one, radiance × exposure, the noise taken out.
+
+        The image must not have seen the truth. The standard error is that of the truth's noise, by the jackknife over
+        its parts.
+        """
+        image, parts = radiance * np.float32(self.exposure), self.parts * self.exposure
+        total = np.tensordot(self.passes, parts, 1)
+
+        def measure(left: NDArray[np.float64], passes: int) -> float:
+            return clean_error(image, *(left / passes).astype(np.float32))
+
+        count = int(self.passes.sum())
+        without = [
+            measure(total - own * part, count - own) for own, part in zip(self.passes.tolist(), parts, strict=True)
+        ]
+        return jackknife(measure(total, count), np.array(without), self.passes)
+
+    def power(self) -> float:
+        """The mean square of the clean image, radiance × exposure: the error of a black image."""
+        return self.error(np.zeros_like(self.radiance)).mean
+
+
+def render_truth(scene: LoadedScene, key: Key, view: View, amount: Amount) -> Truth:
+    """The truth of the scene's present configuration from a view, by the view's content key.
+
+    At least two passes are rendered, and a pass is whole. Seeds follow from the key, and are those of no sample. Raises
+    IncompleteError if halves stay non-finite.
+    """
+    began, each, done = time.perf_counter(), 2 * scene.spec.transport.half_spp, 0
+    size = scene.spec.film.height, scene.spec.film.width, 3
+    sums, passes = np.zeros((PARTS, 2, *size)), np.zeros(PARTS, np.int64)
+    while True:
+        left = LEAST_PASSES - done
+        if amount.spp is not None:
+            left = max(left, -(-amount.spp // each) - done)
+        elif time.perf_counter() - began < (amount.seconds or 0):
+            left = max(left, 1)
+        if left <= 0:
+            break
+        numbers = range(done, done + (min(left, scene.samples_at_once) if amount.spp else 1))
+        for halves, _ in halves_of(scene, [(make_key("truth", key, number), view) for number in numbers]):
+            sums[done % PARTS] += halves
+            passes[done % PARTS] += 1
+            done += 1
+    used = min(done, PARTS)
+    means = sums[:used] / passes[:used, None, None, None, None]
+    return Truth(means, passes[:used], done * each, time.perf_counter() - began, scene.spec.exposure)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RenderedImage:
+    """The truth of a configuration and a view that somebody asked for."""
+
+    spec: SceneSpec
+    configuration: Modification
+    view: View
+    truth: Truth
+    doubts: tuple[str, ...]  # what no sample of the spec shows, each a sentence
+
+    def document(self) -> dict[str, Any]:
+        """What was rendered, for JSON; what stands where is said by names."""
+        effort = {"spp": self.truth.spp, "seconds": self.truth.seconds, "doubts": list(self.doubts)}
+        return {"scene": self.spec.name, **list_shot(self.spec, self.configuration, self.view), **effort}
+
+    def line(self) -> str:
+        """What was rendered, in words."""
+        noise = f"{self.truth.spp} samples per pixel in {self.truth.seconds:.3g} s"
+        return f"{describe_shot(self.spec, self.configuration, self.view)}: {noise}"
+
+    def write(self, file: Path) -> None:
+        """Write it, as `write_halves` does."""
+        write_halves(file, self.truth.halves, self.spec.exposure, {"about": json.dumps(self.document())})
+
+
+def render_asked(
+    store: str | Path, named: str, asked: Shot, row: int | None, like: str | None, fov: float | None, amount: Amount
+) -> RenderedImage:
+    """Render what is asked for of a spec, or of a scene of the store, which only has to be there for the latter.
+
+    The configuration begins with that of `find_start`. Raises SpecError for what is impossible, StoreError for a start
+    that the store does not hold, BackendError if the scene's files are not on this machine.
+    """
+    from photonfarm.renderer.jobs.render import load_scene, locate
+    from photonfarm.renderer.scene.surroundings import look_closer
+
+    start, stored = None, None
+    if row is not None or like is not None:
+        opened = Store(store)
+        stored = scene_or_spec(opened, named)
+        start = find_start(opened, stored.scene_id, row, like)
+    spec = with_fov(load_named(store, named) if stored is None else locate(stored.spec), fov)
+    configuration, view = start or (None, None)
+    configuration, view = asked.apply(spec, configuration), asked.view(spec, view)
+    scene = load_scene(spec)
+    scene.apply(configuration)
+    doubts = [*find_doubts(spec, configuration, view), *look_closer(scene, configuration, view)]
+    key = view_key(configuration.key(spec.radiance_id), view.vector)
+    return RenderedImage(spec, configuration, view, render_truth(scene, key, view, amount), tuple(doubts))
+
+
+def load_named(store: str | Path, named: str) -> SceneSpec:
+    """The spec of a scene of the store, if it has one of this name, or else the spec of this name or file."""
+    from photonfarm.renderer.jobs.render import locate
+
+    if not is_spec_file(named):
+        try:
+            return locate(scene_or_spec(Store(store), named).spec)
+        except StoreError as missing:
+            try:
+                find_spec(named)
+            except SpecError:
+                raise missing from None
+    spec = load_spec(named)
+    folder = scene_folder(named, spec)
+    if folder is None:
+        return spec
+    return spec.model_copy(update={"scene": spec.scene.model_copy(update={"file": str(folder / str(spec.scene.file))})})
+
+
+def check_suffix(file: Path) -> None:
+    """Raise SpecError for a name that is of no kind of file that an image is written as."""
+    if file.suffix not in SUFFIXES:
+        raise SpecError(f"--out {file}: names of {', '.join(SUFFIXES)} files are allowed")
+
+
+def write_halves(file: Path, halves: F32, exposure: float, about: dict[str, Any]) -> None:
+    """Write A and B, (2, H, W, 3), as an archive or an image with layers; as a PNG, their mean as a display shows it.
+
+    Raises StoreError if the disk refuses or OpenEXR is missing.
+    """
+    mean = (halves[0] + halves[1]) / np.float32(2)
+    if file.suffix == ".npz":
+        arrays = {name: np.asarray(value) for name, value in about.items()}
+        write_arrays(file, {"A": halves[0], "B": halves[1], **arrays}, "rendered pass")
+    elif file.suffix == ".exr":
+        said = {name: str(value) for name, value in about.items()}
+        write_layers(file, {"": mean, "A": halves[0], "B": halves[1]}, said)
+    else:
+        from PIL import Image
+
+        with store_errors("write a picture", file), whole_file(file) as part:
+            Image.fromarray(pictures.display(mean, exposure)).save(part, "PNG")
+
+
+def write_beside(out: Path, prediction: F32, truth: Truth | None, exposure: float, about: dict[str, Any]) -> list[Path]:
+    """Write a network's image, (H, W, 3), linear radiance, and the truth beside it, into a folder; returns the files.
+
+    Pictures are as a display shows them, and of the difference red where the network is too bright, blue where it is
+    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance; frame.json is `about`.
+    """
+    layers = {"prediction": prediction}
+    shown = {"prediction": pictures.enlarge(prediction * np.float32(exposure))}
+    if truth is not None:
+        clean = truth.radiance
+        layers |= {"truth": clean, "A": truth.halves[0], "B": truth.halves[1], "difference": prediction - clean}
+        shown["truth"] = pictures.enlarge(clean * np.float32(exposure))
+        shown["difference"] = pictures.draw_difference(*(image * np.float32(exposure) for image in (prediction, clean)))
+    with store_errors("make the folder of the pictures", out):
+        out.mkdir(parents=True, exist_ok=True)
+    files = [out / f"{name}.png" for name in shown]
+    for file, picture in zip(files, shown.values(), strict=True):
+        pictures.write_png(picture, file)
+    write_arrays(out / "frame.npz", layers, "frame")
+    if importlib.util.find_spec("OpenEXR") is not None:
+        write_layers(out / "frame.exr", {"": prediction, **layers}, {})
+        files.append(out / "frame.exr")
+    with store_errors("write the figures", out / "frame.json"), whole_file(out / "frame.json") as part:
+        part.write_text(json.dumps(about, indent=1) + "\n")
+    return [*files, out / "frame.npz", out / "frame.json"]

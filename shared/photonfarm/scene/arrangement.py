@@ -1,0 +1,218 @@
+"""Configurations and cameras as people say them: by the names of groups, and where each stands.
+
+This module alone turns names into modification vectors, and back. The command line, the files of camera paths and
+`photonfarm.predict` all give an `Arrangement`. What else may change of a group is one more field of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Annotated, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, FiniteFloat, ValidationError
+
+from photonfarm.core.errors import SpecError
+from photonfarm.core.models import Frozen, nearest, sentences
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import Box, SceneSpec, ViewSpec
+from photonfarm.scene.view import View, are_in_free_space, are_in_group, sample_view
+
+NEVER_SEEN = "the network never saw that"
+SLACK = 1e-4
+"""How far beyond a box nothing is said, in scene units: float32 has no more digits."""
+
+
+def _as_list(value: Any) -> Any:
+    """Arrays of numpy's and of torch's as lists."""
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+Point = Annotated[tuple[FiniteFloat, FiniteFloat, FiniteFloat], BeforeValidator(_as_list)]
+
+
+class Arrangement(Frozen):
+    """What is changed of a configuration, by the names of groups; all others stay."""
+
+    place: dict[str, Point] = Field(default_factory=dict)  # where a group's `at` shall stand, scene units
+    move: dict[str, Point] = Field(default_factory=dict)  # by how much it goes from where it stands
+    without: tuple[str, ...] = ()  # groups that are removed
+
+    @classmethod
+    def of(cls, **values: Any) -> Self:
+        """The checked values; raises SpecError with a sentence for each that is impossible."""
+        try:
+            return cls(**values)
+        except ValidationError as error:
+            raise SpecError("; ".join(sentences(error, cls.model_fields))) from error
+
+    @classmethod
+    def from_modification(cls, spec: SceneSpec, modification: Modification) -> Self:
+        """What a configuration changes of the scene at rest."""
+        places: dict[str, Any] = {}
+        without = []
+        for group, there, moved in zip(spec.groups, modification.present, modification.translation, strict=True):
+            if not there:
+                without.append(group.name)
+            elif moved.any():
+                places[group.name] = tuple(map(_round_position, group.at, moved))
+        return cls(place=places, without=tuple(without))
+
+    def apply(self, spec: SceneSpec, start: Modification | None = None) -> Modification:
+        """The configuration that this makes of another one, by default of the scene at rest.
+
+        A group that is placed or moved is there, even if it was removed. Raises SpecError for a name that no group has,
+        and for a group that is named twice.
+        """
+        of, before = {group.name: g for g, group in enumerate(spec.groups)}, rest(spec) if start is None else start
+        made = replace(before, translation=before.translation.copy(), present=before.present.copy())
+        names = [*self.place, *self.move, *self.without]
+        for name in names:
+            if name not in of:
+                raise SpecError(f"{name!r} is no movable group of {spec.name}; nearest: {nearest(name, of)}")
+            if names.count(name) > 1:
+                raise SpecError(f"{name!r} is named twice; place it, move it or leave it out")
+        for name, position in self.place.items():
+            made.translation[of[name]] = np.array(position) - np.array(spec.groups[of[name]].at)
+        for name, step in self.move.items():
+            made.translation[of[name]] += np.array(step, np.float32)
+        for name in (*self.place, *self.move):
+            made.present[of[name]] = True
+        for name in self.without:  # zeroed, so that equal configurations have equal keys
+            made.translation[of[name]], made.present[of[name]] = 0, False
+        return made
+
+    def fits(self, spec: SceneSpec, modifications: NDArray[np.float32]) -> NDArray[np.float64]:
+        """How far configurations (N, G, 4) are from this, by the farthest named group, (N,); inf if one is not there.
+
+        Groups that are not named may be anywhere. Raises SpecError as `apply` does.
+        """
+        wanted, of = self.apply(spec), {group.name: g for g, group in enumerate(spec.groups)}
+        named = [of[name] for name in (*self.place, *self.move, *self.without)]
+        off = modifications[:, named, :3].astype(np.float64) - wanted.translation[named]
+        distance: NDArray[np.float64] = np.linalg.norm(off, axis=-1).max(axis=1, initial=0)
+        there = ((modifications[:, named, 3] != 0) == wanted.present[named]).all(axis=1)
+        return np.where(there, distance, np.inf)
+
+    def describe(self) -> str:
+        """The arrangement as options of the command line; "" if nothing is changed."""
+        placed = [f"--{key} {name}={_text(point)}" for key in ("place", "move") for name, point in self._of(key)]
+        return " ".join([*placed, *(f"--without {name}" for name in self.without)])
+
+    def _of(self, key: str) -> Iterator[tuple[str, tuple[float, ...]]]:
+        values: Mapping[str, tuple[float, ...]] = getattr(self, key)
+        yield from values.items()
+
+
+class Shot(Arrangement):
+    """An arrangement, and the camera that looks at it."""
+
+    camera: Point | None = None  # where it stands, scene units
+    look_at: Point | None = None  # the point that it looks at
+
+    def view(self, spec: SceneSpec, start: View | None = None) -> View:
+        """The view that this makes of another one, by default of the scene's first one at rest.
+
+        A camera without a point to look at looks at the middle of the spec's box, unless there is a start. Raises
+        SpecError for a camera that would look at itself.
+        """
+        view = start or sample_view(spec, rest(spec).key(spec.radiance_id), 0, 0)
+        target = view.target
+        if self.look_at is not None:
+            target = np.array(self.look_at, np.float32)
+        elif start is None and self.camera is not None:
+            target = (0.5 * (spec.view.look_at.low + spec.view.look_at.high)).astype(np.float32)
+        made = View(view.origin if self.camera is None else np.array(self.camera, np.float32), target)
+        if np.array_equal(made.origin, made.target):
+            raise SpecError(f"camera = {_text(_shorten(made.origin))}: is where it looks at; give another look_at")
+        return made
+
+
+def describe_shot(spec: SceneSpec, modification: Modification, view: View) -> str:
+    """A configuration and a view as options of the command line."""
+    stands = Arrangement.from_modification(spec, modification).describe()
+    camera = f"--camera {_text(_shorten(view.origin))} --look-at {_text(_shorten(view.target))}"
+    return f"{stands} {camera}".lstrip()
+
+
+def list_shot(spec: SceneSpec, modification: Modification, view: View) -> dict[str, Any]:
+    """A configuration and a view by names, for JSON."""
+    stands = Arrangement.from_modification(spec, modification).model_dump(mode="json", exclude={"move"})
+    return {**stands, "camera": _shorten(view.origin), "look_at": _shorten(view.target), "fov": spec.view.fov_deg}
+
+
+def _shorten(point: NDArray[np.float32]) -> list[float]:
+    """The numbers of fewest digits that are these in float32."""
+    return [float(str(value)) for value in point]
+
+
+def _round_position(at: float, moved: np.float32) -> float:
+    """A position with as few digits as it can have, and still be so far from `at` in float32."""
+    position = at + float(moved)
+    rounded = (round(position, digits) + 0.0 for digits in range(3, 10))  # never −0
+    return next((short for short in rounded if np.float32(short - at) == moved), position)
+
+
+def _text(point: Any) -> str:
+    return ",".join(f"{value:.9g}" for value in point)
+
+
+def with_fov(spec: SceneSpec, fov_deg: float | None) -> SceneSpec:
+    """The spec with another field of view; as it is for None. Raises SpecError for one that no camera has."""
+    if fov_deg is None:
+        return spec
+    view = spec.view.model_dump() | {"fov_deg": fov_deg}
+    try:
+        return spec.model_copy(update={"view": ViewSpec.model_validate(view)})
+    except ValidationError as error:
+        raise SpecError("; ".join(sentences(error))) from error
+
+
+def find_doubts(
+    spec: SceneSpec, modification: Modification, view: View | None = None, trained_fov_deg: float | None = None
+) -> list[str]:
+    """What no sample of a spec shows: groups beyond their boxes, groups that are never removed, cameras elsewhere.
+
+    Each is a sentence. The renderer's `look_closer` finds what needs the scene's surfaces.
+    """
+    doubts = []
+    for group, there, moved in zip(spec.groups, modification.present, modification.translation, strict=True):
+        position = tuple(map(_round_position, group.at, moved))
+        if not there and group.removal_probability == 0:
+            doubts.append(f"{group.name} is removed, and in the spec it never is: {NEVER_SEEN}")
+        elif there and group.removal_probability == 1:
+            doubts.append(f"{group.name} is there, and in the spec it never is: {NEVER_SEEN}")
+        elif there and moved.any() and not _holds(group.box, position):
+            doubts.append(f"{group.name} stands at {_text(position)}, outside its box {_span(group.box)}: {NEVER_SEEN}")
+    if trained_fov_deg not in (None, spec.view.fov_deg):
+        doubts.append(f"the field of view is {spec.view.fov_deg:g}°, not {trained_fov_deg:g}°: {NEVER_SEEN}")
+    if view is None:
+        return doubts
+    for what, point, box in (
+        ("the camera stands", view.origin, spec.view.origin),
+        ("the camera looks", view.target, spec.view.look_at),
+    ):
+        if not _holds(box, point):
+            doubts.append(f"{what} at {_text(_shorten(point))}, outside the spec's box {_span(box)}: {NEVER_SEEN}")
+    obstacle = next(find_obstacles(spec, [view], modification), None)
+    return doubts if obstacle is None else [*doubts, f"the camera stands {obstacle[1]}: {NEVER_SEEN}"]
+
+
+def _holds(box: Box, point: Any) -> bool:
+    return bool(((np.array(point) >= box.low - SLACK) & (np.array(point) <= box.high + SLACK)).all())
+
+
+def _span(box: Box) -> str:
+    return f"from {_text(box.low)} to {_text(box.high)}"
+
+
+def find_obstacles(spec: SceneSpec, views: list[View], modification: Modification) -> Iterator[tuple[int, str]]:
+    """The views whose cameras are not in free space, by number, each with what they stand in; none is known without."""
+    vectors = modification.vector[None].repeat(len(views), axis=0)
+    origins = np.stack([view.origin for view in views])
+    around = {group.name: are_in_group(spec, g, origins, vectors) for g, group in enumerate(spec.groups)}
+    for number in np.flatnonzero(~are_in_free_space(spec, origins, vectors)).tolist():
+        names = [name for name, holds in around.items() if holds[number]]
+        yield number, f"in the box around {names[0]!r}" if names else "in a solid of the scene, or close to one"

@@ -1,0 +1,97 @@
+"""`photonfarm render` of what is asked for by names, and what it warns of."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.plan.request import Request
+from photonfarm.renderer.jobs.truth import Amount
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import look_closer
+from photonfarm.scene.arrangement import Shot
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import View
+from photonfarm.store import Store
+
+
+def test_amounts_are_samples_or_seconds() -> None:
+    assert [Amount.parse(text) for text in ("256", "20s", ".5s")] == [Amount(256), Amount(None, 20), Amount(None, 0.5)]
+    for text in ("0", "-1", "s", "0s", "1e3", "20 s", "2m", "inf"):
+        with pytest.raises(SpecError, match="samples per pixel"):
+            Amount.parse(text)
+
+
+def test_what_stands_in_a_wall_or_beyond_and_a_camera_inside_of_something_are_said(
+    room: LoadedScene, somewhere: View
+) -> None:
+    def look(view: View = somewhere, **asked: Any) -> list[str]:
+        configuration = Shot.of(**asked).apply(room.spec)
+        room.apply(configuration)
+        return [doubt.partition(":")[0] for doubt in look_closer(room, configuration, view)]
+
+    assert look() == look(place={"sofa": (0.9, 0, -0.5)}, without=["vase"]) == []
+    assert look(move={"lamp": (2, 0, 0)}) == ["lamp reaches beyond all that never moves"]
+    assert look(View(np.float32([0, 9, 0]), somewhere.target)) == ["the camera is beyond all that never moves"]
+    inside = View(np.float32([-2.1, 0.4, -1.35]), somewhere.target)
+    assert look(inside) == ["the camera is inside 'pedestal-stone'"]
+    assert look(inside, without=["pedestal"]) == []
+
+
+def test_a_group_in_a_solid_that_never_moves_is_said(file_scene: Any, tmp_path: Path) -> None:
+    pillar, ball = (
+        f'<shape type="cube" id="{name}"><transform name="to_world"><scale value="{size}"/>'
+        f'<translate x="{x}" y="{size}" z="0"/></transform></shape>'
+        for name, size, x in (("Pillar", 1, -2), ("Block", 0.25, 2))
+    )
+    lamp = '<shape type="sphere" id="Lamp"><point name="center" x="0" y="2.5" z="0"/><float name="radius" value="0.1"/>'
+    lamp += '<emitter type="area"/></shape>'
+    box = {"min": [-4, 0, -4], "max": [4, 0, 4]}
+    block = {"name": "block", "shapes": ["Block"], "at": [2, 0, 0], "box": box}
+    scene = file_scene(tmp_path, pillar + ball + lamp, objects=[block])
+    view = View(np.float32([0, 1, 3]), np.float32([0, 1, 0]))
+    for x, said in ((-2, ["block stands in 'Pillar'"]), (0, [])):
+        configuration = Shot.of(place={"block": (x, 0, 0)}).apply(scene.spec)
+        scene.apply(configuration)
+        assert [doubt.partition(":")[0] for doubt in look_closer(scene, configuration, view)] == said
+
+
+def test_an_image_is_rendered_of_a_spec_without_a_store_and_of_a_scene_of_a_store(
+    tmp_path: Path, small: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def run(*arguments: str, code: int = 0) -> Result:
+        done = CliRunner().invoke(umbrella, ["render", *arguments, "--json"])
+        assert done.exit_code == code, done.output
+        return done
+
+    Path("tiny.json").write_text(small(load_spec("room")).model_dump_json(exclude={"content"}))
+    asked = ("--without", "sofa", "--place", "vase=0,0,0", "--camera", "1.9,1.6,1.7", "--spp", "8")
+    found = run("tiny.json", *asked, "--out", "a.npz")
+    said = json.loads(found.stdout)
+    assert (said["without"], said["place"], said["spp"]) == (["sofa"], {"vase": [0, 0, 0]}, 8)
+    with np.load("a.npz") as image:
+        assert image["A"].shape == image["B"].shape == (16, 24, 3)
+        assert not np.array_equal(image["A"], image["B"])
+    store = Store(tmp_path / "store", create=True)
+    store.plan(small(load_spec("room")), Request(modifications=2), shard_rows=2)
+    before = sorted(tmp_path.rglob("*"))
+    of_row = json.loads(run("room", "--row", "1", "--without", "vase", "--spp", "8", "--out", "b.png").stdout)
+    assert "vase" in of_row["without"]
+    assert len(of_row["place"]) > 3
+    assert {*tmp_path.rglob("*")} - {*before} == {tmp_path / "b.png"}
+    for arguments, kind in (
+        (("cornel", "--spp", "8"), StoreError),
+        (("room", "--like", "0" * 32), StoreError),
+        (("room", "--without", "piano"), SpecError),
+        (("room", "--spp", "soon"), SpecError),
+        (("room", "--without", "sofa", "--out", "a.jpg"), SpecError),
+    ):
+        assert isinstance(run(*arguments, code=1).exception, kind)
+    run("room", "--without", "sofa", "--pass", "1", code=2)

@@ -1,0 +1,109 @@
+"""Configurations by names: what they make of the vector, how they are said, what they refuse and what they doubt."""
+
+import numpy as np
+import pytest
+
+from photonfarm.core.errors import SpecError
+from photonfarm.core.statistics import Estimate, jackknife
+from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot, with_fov
+from photonfarm.scene.modification import rest, sample_modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import View, sample_view
+
+
+@pytest.fixture(scope="module")
+def spec() -> SceneSpec:
+    return load_spec("room")
+
+
+def number(spec: SceneSpec, name: str) -> int:
+    return [group.name for group in spec.groups].index(name)
+
+
+def test_a_group_is_placed_by_its_at_moved_from_where_it_stands_and_left_out(spec: SceneSpec) -> None:
+    sofa, lamp, vase = (number(spec, name) for name in ("sofa", "lamp", "vase"))
+    made = Arrangement.of(place={"sofa": np.array([-1, 0, 3])}, move={"lamp": [0.5, 0, 0]}, without=["vase"]).apply(
+        spec
+    )
+    np.testing.assert_allclose(made.translation[sofa] + spec.groups[sofa].at, [-1, 0, 3], atol=1e-6)
+    np.testing.assert_array_equal(made.translation[lamp], [0.5, 0, 0])
+    assert not made.present[vase]
+    again = Arrangement.of(move={"lamp": [0.5, 0, 0], "vase": [0, 0, 1]}, without=["sofa"]).apply(spec, made)
+    np.testing.assert_array_equal(again.translation[[sofa, lamp, vase]], [[0, 0, 0], [1, 0, 0], [0, 0, 1]])
+    np.testing.assert_array_equal(again.present[[sofa, lamp, vase]], [False, True, True])
+    others = np.delete(made.vector, [sofa, lamp, vase], axis=0)
+    np.testing.assert_array_equal(others, np.delete(rest(spec).vector, [sofa, lamp, vase], axis=0))
+
+
+def test_every_configuration_is_said_by_names_so_that_the_same_bits_come_of_it(spec: SceneSpec) -> None:
+    for index in range(200):
+        modification = sample_modification(spec, 3, index)
+        view = sample_view(spec, modification.key(spec.radiance_id), 0, 0, modification)
+        said = list_shot(spec, modification, view)
+        assert said.pop("fov") == spec.view.fov_deg
+        shot = Shot.of(**said)
+        np.testing.assert_array_equal(shot.apply(spec).vector, modification.vector)
+        np.testing.assert_array_equal(shot.view(spec).vector, view.vector)
+    placed = Shot.of(place={"sofa": (0.9, 0, -0.5)}, without=["vase"], camera=(1.6, 1, 1), look_at=(0, 0.1, 0))
+    words = "--place sofa=0.9,0,-0.5 --without vase --camera 1.6,1,1 --look-at 0,0.1,0"
+    assert describe_shot(spec, placed.apply(spec), placed.view(spec)) == words
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"place": {"soffa": (0, 0, 0)}}, "'soffa' is no movable group of room; nearest: sofa"),
+        ({"place": {"sofa": (0, 0, 0)}, "without": ["sofa"]}, "'sofa' is named twice"),
+        ({"place": {"sofa": (0, 0)}}, "place.sofa"),
+        ({"place": {"sofa": (0, 0, np.nan)}}, "finite number"),
+        ({"without": "sofa"}, "a list is required"),
+        ({"plaace": {}}, "unknown key; nearest: place"),
+        ({"camera": (1, 1, 1), "look_at": (1, 1, 1)}, "is where it looks at"),
+    ],
+)
+def test_what_is_impossible_is_refused(spec: SceneSpec, asked: dict[str, object], said: str) -> None:
+    def stage() -> None:
+        shot = Shot.of(**asked)
+        shot.apply(spec)
+        shot.view(spec)
+
+    with pytest.raises(SpecError, match=said):
+        stage()
+
+
+def test_what_no_sample_shows_is_doubted_and_what_any_sample_may_show_is_not(spec: SceneSpec) -> None:
+    for index in range(50):
+        modification = sample_modification(spec, 5, index)
+        view = sample_view(spec, modification.key(spec.radiance_id), 0, 0, modification)
+        assert not find_doubts(spec, modification, view)
+    wrong = Shot.of(place={"sofa": (0, 1, 0)}, without=["ceiling-light-1"], camera=(9, 1, 1), look_at=(0, 5, 0))
+    doubts = find_doubts(with_fov(spec, 50), wrong.apply(spec), wrong.view(spec), spec.view.fov_deg)
+    beginnings = [
+        "sofa stands at 0,1,0, outside",
+        "ceiling-light-1 is removed",
+        "the field of view is 50°, not 70°",
+        "the camera stands at 9,1,1",
+        "the camera looks at 0,5,0",
+    ]
+    assert len(doubts) == len(beginnings)
+    assert all(any(doubt.startswith(words) for doubt in doubts) for words in beginnings)
+    corner = View(np.float32([9, 1, 1]), np.float32([0, 1, 0]))
+    assert len(find_doubts(spec, rest(spec), corner)) == 1
+
+
+def test_the_jackknife_of_a_mean_is_its_standard_error_and_its_interval_holds_it_as_often_as_it_says() -> None:
+    random = np.random.default_rng(1)
+    values = random.normal(size=7)
+    others = (values.sum() - values) / 6
+    found, plain = jackknife(float(values.mean()), others, np.ones(7, np.int64)), Estimate.of(values)
+    assert found.standard_error == pytest.approx(plain.standard_error)
+    held = 0
+    for _ in range(2000):  # parts of unequal weight: means of so many values
+        weights = np.array([3, 3, 2, 2, 2])
+        means = random.normal(size=5) / np.sqrt(weights)
+        total = float(weights @ means)
+        without = (total - weights * means) / (12 - weights)
+        low, high = jackknife(total / 12, without, weights).interval or (0, 0)
+        held += low < 0 < high
+    assert held / 2000 == pytest.approx(0.95, abs=0.02)

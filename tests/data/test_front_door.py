@@ -1,6 +1,6 @@
 """`photonfarm.data`: a scene of a store in a folder or a bucket, from the first five lines to two spawned processes.
 
-And the public names of all three packages.
+And the public names of all four packages.
 """
 
 import pickle
@@ -19,6 +19,7 @@ import store_samples as samples
 import torch
 
 import photonfarm.data
+import photonfarm.predict
 import photonfarm.renderer
 import photonfarm.trainer
 from photonfarm.core.errors import SpecError, StoreError
@@ -54,6 +55,7 @@ def scene(tmp_path: Path) -> Scene:
     ("package", "names"),
     [
         (photonfarm.data, ["PointCloud", "Sample", "Scene", "open_scene"]),
+        (photonfarm.predict, ["open_run"]),
         (photonfarm.renderer, ["load_mitsuba"]),
         (photonfarm.trainer, ["train"]),
     ],
@@ -67,6 +69,7 @@ def test_public_names(package: ModuleType, names: list[str]) -> None:
     ("function", "parameters"),
     [
         (photonfarm.data.open_scene, "store, scene, *, guides=True"),
+        (photonfarm.predict.open_run, "run, store='store', device='auto', *, fov=None"),
         (photonfarm.renderer.load_mitsuba, "threads=None"),
         (
             photonfarm.trainer.train,

@@ -10,14 +10,16 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.statistics import block_z_test
 from photonfarm.plan.request import Request
-from photonfarm.renderer.jobs.truth import Amount
+from photonfarm.renderer.jobs.render import ShardRenderer
+from photonfarm.renderer.jobs.truth import Amount, render_asked
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import look_closer
 from photonfarm.scene.arrangement import Shot
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import View
-from photonfarm.store import Store
+from photonfarm.store import SceneReader, Store
 
 
 def test_amounts_are_samples_or_seconds() -> None:
@@ -59,6 +61,22 @@ def test_a_group_in_a_solid_that_never_moves_is_said(file_scene: Any, tmp_path: 
         configuration = Shot.of(place={"block": (x, 0, 0)}).apply(scene.spec)
         scene.apply(configuration)
         assert [doubt.partition(":")[0] for doubt in look_closer(scene, configuration, view)] == said
+
+
+def test_the_truth_of_a_stored_view_has_the_mean_of_its_passes_and_other_seeds(tmp_path: Path, small: Any) -> None:
+    store = Store(tmp_path / "store", create=True)
+    spec = small(load_spec("room"))
+    scene_id = store.plan(spec, Request(modifications=1, passes=32), shard_rows=32).scene_id
+    assert ShardRenderer(store, worker="test", load=LoadedScene.load).render(scene_id, 0)
+    reader = SceneReader(store.root, scene_id)
+    stored = np.stack([reader.read(int(row)).radiance for row in reader.refresh()]).reshape(64, 16, 24, 3)
+    truth = render_asked(store.root, "room", Shot(), 0, None, None, Amount(spp=128)).truth
+    assert (truth.spp, len(truth.parts)) == (128, 16)
+    test = block_z_test(truth.parts.reshape(32, 16, 24, 3), stored, blocks=4)
+    assert test.passed, test
+    assert abs(test.mean_ratio - 1) < 4 * test.mean_ratio_standard_error < 0.1
+    brighter = block_z_test(1.15 * truth.parts.reshape(32, 16, 24, 3), stored, blocks=4)
+    assert not brighter.passed, "so much would have been found"
 
 
 def test_an_image_is_rendered_of_a_spec_without_a_store_and_of_a_scene_of_a_store(

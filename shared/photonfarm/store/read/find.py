@@ -132,7 +132,8 @@ def find_start(store: Store, scene_id: str, row: int | None, like: str | None) -
     if not found:
         named = " and ".join([f"--row {row}"] * (row is not None) + [f"--like {like}"] * (like is not None))
         raise StoreError(f"{named}: no plan of scene {scene_id} has such a sample; `photonfarm store find` shows them")
-    vector = np.array(found[0].modification, np.float32).reshape(-1, 4)
+    groups = found[0].modification
+    vector = np.array(groups, np.float32) if groups else np.zeros((0, 4), np.float32)
     return Modification.from_vector(vector), View.from_vector(np.array(found[0].view, np.float32))
 
 

@@ -14,7 +14,8 @@ from rich.table import Table
 
 from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import format_span
-from photonfarm.scene.spec import SceneSpec, Transport, shape_ids
+from photonfarm.scene.groups import shape_ids
+from photonfarm.scene.spec import SceneSpec, Transport
 
 if TYPE_CHECKING:
     from photonfarm.farm.dry_run import DryRun
@@ -71,12 +72,15 @@ def print_scene(spec: SceneSpec, as_json: bool) -> None:
     )
     if spec.groups:
         click.echo()
+        head = ("movable", "shapes", "removed", "positions", "changes")[: 4 + spec.further_changes]
         print_table(
             (
-                (g.name, str(len(shape_ids(g))), f"{g.removal_probability:g}", _box(g.box.min, g.box.max))
+                (g.name, str(len(shape_ids(g))), f"{g.removal_probability:g}", _box(g.box.min, g.box.max), g.changes)[
+                    : len(head)
+                ]
                 for g in spec.groups
             ),
-            ("movable", "shapes", "removed", "positions"),
+            head,
         )
 
 

@@ -41,6 +41,14 @@ class Geometry:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Pivots:
+    """What the groups of a scene turn about: the axis `up` through each group's `at`."""
+
+    at: NDArray[np.float64]  # (G, 3)
+    up: NDArray[np.float64]  # (3,) unit, along one axis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class BasePointCloud:
     """The point cloud sampled once per scene; every sample's cloud is this one, modified [supplement 2.1]."""
 
@@ -50,6 +58,7 @@ class BasePointCloud:
     emission: F32  # (P, 3) radiance leaving along the normal
     group: NDArray[np.int16]  # (P,) movable group, or STATIC
     face: NDArray[np.uint32]  # (P,) triangle of `Geometry` that the point lies in
+    pivots: Pivots | None = None  # of the spec, and not stored; None: nothing turns
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,4 +126,5 @@ def arrays_of(
     record: Geometry | BasePointCloud | ViewBuffers | Guides | Photons | Visibility,
 ) -> dict[str, NDArray[np.generic]]:
     """The record's arrays by name, in the order of its fields."""
-    return {field.name: getattr(record, field.name) for field in fields(record)}
+    values = {field.name: getattr(record, field.name) for field in fields(record)}
+    return {name: value for name, value in values.items() if name != "pivots"}

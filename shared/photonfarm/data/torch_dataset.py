@@ -17,6 +17,7 @@ from torch.utils.data import Dataset
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.records import Guides, Photons
+from photonfarm.scene.modification import columns
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera
 from photonfarm.store.format.schema import output_arrays
@@ -34,6 +35,9 @@ OF_LIGHT = ("radiance", "emission", "direct", "gloss", "point_light")
 """The fields in units of radiance, or of irradiance, which are therefore exposed."""
 
 POINTS = ("point_position", "point_present", "point_seen")
+
+POINT_SURFACES = ("point_normal", "point_emission")
+"""What configurations change of the points in scenes whose groups turn or emit otherwise."""
 
 PHOTONS = tuple(f"photon_{field.name}" for field in dataclass_fields(Photons))
 
@@ -60,16 +64,21 @@ class SampleTensors:
     """Samples as tensors, float32 unless they are flags: which there are, their memory, and how it is filled.
 
     By name, as `Sample` has them: `radiance` (2, H, W, 3), `albedo` (H, W, 3), `normal` (H, W, 3), `depth` (H, W), and
-    the guides; `modification` (G, 4), the translation of each group and 1 if it is present; `view` (6,), the camera's
-    origin and target; `world_to_camera` (3, 4); the points of the configuration, `point_position` (P, 3),
-    `point_present` and `point_seen` (P,); and its photons, `photon_position` (K, 3) and so on to `photon_seen` (K,).
+    the guides; `modification` (G, C), the translation of each group, 1 if it is present, and `modification.FURTHER`;
+    `view` (6,), the camera's origin and target; `world_to_camera` (3, 4); the points of the configuration,
+    `point_position`, `point_normal`, `point_emission` (P, 3), `point_present` and `point_seen` (P,); and its photons,
+    `photon_position` (K, 3) and so on to `photon_seen` (K,).
     """
 
     def __init__(
         self, spec: SceneSpec, fields: Sequence[str] = DEFAULT, *, exposure: float = 1.0, points: int | None = None
     ) -> None:
-        """Take the names; light is multiplied by `exposure`, and of the scene's points there are the first `points`."""
-        self._spec, self.fields, self._exposure = spec, tuple(fields), exposure
+        """Take the names; light is multiplied by `exposure`, and of the scene's points there are the first `points`.
+
+        All of `POINTS` come with `POINT_SURFACES` in a scene whose configurations change these.
+        """
+        surfaces = POINT_SURFACES if spec.further_changes and {*POINTS} <= {*fields} else ()
+        self._spec, self.fields, self._exposure = spec, tuple(dict.fromkeys([*fields, *surfaces])), exposure
         self._points = spec.points if points is None else min(points, spec.points)
 
     def empty(self, size: int, *, pinned: bool = False) -> dict[str, Tensor]:
@@ -97,7 +106,7 @@ class SampleTensors:
             return np.ascontiguousarray(getattr(sample, name).vector, np.float32)
         if name == "world_to_camera":
             return Camera.of(sample.view, self._spec).world_to_camera
-        if name in POINTS:
+        if name in (*POINTS, *POINT_SURFACES):
             points: NDArray[Any] = getattr(sample.point_cloud, name.removeprefix("point_"))
             return points[: self._points]
         if name == "photon_seen":
@@ -108,8 +117,9 @@ class SampleTensors:
 
     def _shape(self, name: str) -> tuple[int, ...]:
         points, photons = (self._points,), (self._spec.photons.slots,)
-        shapes: dict[str, tuple[int, ...]] = {"modification": (len(self._spec.groups), 4), "view": (6,)}
-        shapes |= {"world_to_camera": (3, 4), "point_position": (*points, 3)}
+        shapes: dict[str, tuple[int, ...]] = {"view": (6,)}
+        shapes["modification"] = len(self._spec.groups), columns(self._spec)
+        shapes |= {"world_to_camera": (3, 4)} | dict.fromkeys(("point_position", *POINT_SURFACES), (*points, 3))
         shapes |= {"point_present": points, "point_seen": points, "photon_seen": photons, "photon_bounce": photons}
         shapes |= {name: (*photons, 3) for name in PHOTONS if name not in shapes}
         return shapes[name] if name in shapes else output_arrays(self._spec)[name].shape
@@ -127,7 +137,9 @@ class SceneDataset(Dataset[dict[str, Any]]):
         """
         without = () if getattr(samples, "has_guides", True) else GUIDES
         exist = [
-            name for name in (*DEFAULT, "world_to_camera", *POINTS, *PHOTONS, "photon_seen") if name not in without
+            name
+            for name in (*DEFAULT, "world_to_camera", *POINTS, *POINT_SURFACES, *PHOTONS, "photon_seen")
+            if name not in without
         ]
         chosen = tuple([name for name in DEFAULT if name in exist] if fields is None else fields)
         if unknown := [name for name in chosen if name not in exist]:

@@ -20,7 +20,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.records import Guides
 from photonfarm.data import Sample
 from photonfarm.plan.hold_out import are_held_out, units_of
-from photonfarm.scene.modification import Modification
+from photonfarm.scene.modification import Modification, columns
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import SceneReader, SceneStore
@@ -120,7 +120,10 @@ def _list_facts(spec: SceneSpec) -> list[Column]:
     moved = (
         "of each movable group, in the order of the spec: translation from rest along x, y, z, then 1: present or 0: "
         "removed"
+        + "; then the turn in degrees, and factors on its light: power, red, green, blue"
+        * spec.further_changes
     )
+    unit = "scene units; the fourth: 1" if spec.further_changes else "scene units; the last: 1"
     camera = "columns: the camera's right, up and backward, and where it stands (the convention of NeRF and OpenGL)"
     facts: list[tuple[str, str, tuple[int, ...], str, str]] = [
         ("row", "int64", (), "1", "the sample's row in the store"),
@@ -129,7 +132,7 @@ def _list_facts(spec: SceneSpec) -> list[Column]:
         ("pass", "int64", (), "1", "number of the noisy pass of this view, from 0"),
         ("configuration_key", "str", (), "", "content key of the configuration: equal for all its views"),
         ("view_key", "str", (), "", "content key of configuration and view: equal for all its passes"),
-        *([("modification", "float32", (groups, 4), "scene units; the last: 1", moved)] if groups else []),
+        *([("modification", "float32", (groups, columns(spec)), unit, moved)] if groups else []),
         ("origin", "float32", (3,), "scene units", "where the camera stands, world coordinates"),
         ("target", "float32", (3,), "scene units", "the point that it looks at, world coordinates"),
         ("camera_to_world", "float64", (4, 4), "scene units", camera),

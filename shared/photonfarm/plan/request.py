@@ -1,6 +1,7 @@
 """A request for samples, expanded into rows and jobs, without what is planned already; and samples of another store.
 
-Shape letters: R rows of a plan, G movable groups. J is `shard_rows`, the samples of one job.
+Shape letters: R rows of a plan, G movable groups, C columns of the scene's modification vectors. J is `shard_rows`, the
+samples of one job.
 
 A request names every combination of its modifications, of `views_per_modification` views of each, and of `passes` noisy
 passes of each view. Configurations that come out equal (both objects removed, say) are one modification, which gets the
@@ -29,7 +30,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import KEY_BYTES, Key, make_key
 from photonfarm.core.models import Frozen, sentences
 from photonfarm.core.records import F32
-from photonfarm.scene.modification import Modification, modification_keys, rest, sample_modifications
+from photonfarm.scene.modification import FIELDS, Modification, modification_keys, rest, sample_modifications
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import sample_views
 
@@ -93,7 +94,7 @@ class Request(Frozen):
 class PlannedRows:
     """The inputs of a plan, R rows each; row numbers run through all plans of a scene."""
 
-    modification: F32  # (R, G, 4) modification vectors; NaN where no modification has its row
+    modification: F32  # (R, G, C) modification vectors; NaN where no modification has its row
     view: F32  # (R, 6) origin and look-at point; NaN where no view has its row
     sample_modification: NDArray[np.int64]  # (R,) row of the sample's modification, or UNUSED
     sample_view: NDArray[np.int64]  # (R,) row of the sample's view, or UNUSED
@@ -103,10 +104,10 @@ class PlannedRows:
     view_density: F32  # (R,) likewise of the view, given the configuration
 
     @classmethod
-    def empty(cls, rows: int, groups: int) -> PlannedRows:
+    def empty(cls, rows: int, groups: int, columns: int = len(FIELDS)) -> PlannedRows:
         """Rows that hold nothing yet."""
         return cls(
-            np.full((rows, groups, 4), np.nan, np.float32),
+            np.full((rows, groups, columns), np.nan, np.float32),
             np.full((rows, 6), np.nan, np.float32),
             np.full(rows, UNUSED, np.int64),
             np.full(rows, UNUSED, np.int64),
@@ -120,7 +121,7 @@ class PlannedRows:
         """The same rows, but for some spans, which hold nothing."""
         left = PlannedRows(*(getattr(self, each.name).copy() for each in fields(self)))
         for span in spans:
-            nothing = PlannedRows.empty(len(span), self.modification.shape[1])
+            nothing = PlannedRows.empty(len(span), *self.modification.shape[1:])
             for each in fields(self):
                 getattr(left, each.name)[span.start : span.stop] = getattr(nothing, each.name)
         return left
@@ -174,7 +175,7 @@ class PlannedContent:
         return uniform
 
     def vectors(self, kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
-        """The vectors in some rows of modifications, (N, G, 4), or of views, (N, 6)."""
+        """The vectors in some rows of modifications, (N, G, C), or of views, (N, 6)."""
         first_rows = np.array([first_row for first_row, _ in self.plans])
         of_row = np.searchsorted(first_rows, rows, side="right") - 1
         vectors = np.empty((len(rows), *getattr(self.plans[0][1], kind).shape[1:]), np.float32)
@@ -213,7 +214,7 @@ def view_contents(modification_rows: NDArray[np.int64], views: F32) -> list[byte
 class SamplesToPlan:
     """Samples to plan, ordered by modification, view and pass; M modifications, V views, S samples."""
 
-    modification: F32  # (M, G, 4)
+    modification: F32  # (M, G, C)
     modification_row: NDArray[np.int64]  # (M,) the row of one that is planned already, or UNUSED
     view: F32  # (V, 6)
     view_row: NDArray[np.int64]  # (V,) the row of one that is planned already, or UNUSED
@@ -270,7 +271,7 @@ def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_jo
 
 
 def sample_keys(radiance_id: str, modifications: F32, views: F32, passes: Iterable[int]) -> list[Key]:
-    """The content keys of samples of configurations (N, G, 4) and views (N, 6), by the numbers of their passes (N,)."""
+    """The content keys of samples of configurations (N, G, C) and views (N, 6), by the numbers of their passes (N,)."""
     samples = zip(modifications, views, passes, strict=True)
     return [make_key("sample", radiance_id, modification, view, int(pass_)) for modification, view, pass_ in samples]
 
@@ -286,7 +287,7 @@ def contents(array: F32) -> list[bytes]:
 
 
 def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.int64]]:
-    """The distinct configurations of a request in order of appearance (M, G, 4), each with its number of views (M,).
+    """The distinct configurations of a request in order of appearance (M, G, C), each with its number of views (M,).
 
     The n-th appearance of a configuration stands for views n·V … n·V + V − 1 of it.
     """
@@ -295,7 +296,7 @@ def _configurations(spec: SceneSpec, request: Request) -> tuple[F32, NDArray[np.
         return rest(spec).vector[None], np.array([request.modifications * each])
     vectors = sample_modifications(spec, request.seed, range(request.modifications))
     counts = Counter(contents(vectors))
-    distinct = np.frombuffer(b"".join(counts), "<f4").reshape(-1, len(spec.groups), 4)
+    distinct = np.frombuffer(b"".join(counts), "<f4").reshape(-1, *vectors.shape[1:])
     return distinct.astype(np.float32), each * np.array(list(counts.values()), np.int64)
 
 
@@ -308,7 +309,7 @@ def expand_samples(samples: SamplesToPlan, *, first_job: int, shard_rows: int, k
     count, first_row = len(samples.sample_pass), first_job * shard_rows
     if not count:
         return Expansion(None, 0, known, Extent())
-    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, samples.modification.shape[1])
+    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, *samples.modification.shape[1:])
     modification_row, modified = _place(samples.sample_modification, samples.modification_row, first_row, shard_rows)
     rows.modification[modification_row[modified] - first_row] = samples.modification[modified]
     density = samples.modification_density

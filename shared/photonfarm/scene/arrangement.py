@@ -16,8 +16,9 @@ from pydantic import BeforeValidator, Field, FiniteFloat, ValidationError
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Frozen, nearest, sentences
+from photonfarm.scene.groups import Box
 from photonfarm.scene.modification import Modification, rest
-from photonfarm.scene.spec import Box, SceneSpec, ViewSpec
+from photonfarm.scene.spec import SceneSpec, ViewSpec
 from photonfarm.scene.view import View, are_in_free_space, are_in_group, sample_view
 
 NEVER_SEEN = "the network never saw that"
@@ -85,7 +86,7 @@ class Arrangement(Frozen):
         return made
 
     def fits(self, spec: SceneSpec, modifications: NDArray[np.float32]) -> NDArray[np.float64]:
-        """How far configurations (N, G, 4) are from this, by the farthest named group, (N,); inf if one is not there.
+        """How far configurations (N, G, C) are from this, by the farthest named group, (N,); inf if one is not there.
 
         Groups that are not named may be anywhere. Raises SpecError as `apply` does.
         """

@@ -3,20 +3,37 @@
 The base cloud is sampled once per scene, and rebuilt for every configuration from its modification alone.
 
 Shape letters: N configurations; G movable groups of a scene, its objects first and then its lights, in the order of
-the spec; P points, F triangles, S shapes.
+the spec; C `columns` of a scene; P points, F triangles, S shapes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.keys import Key, Stream, make_key, uniform_of
 from photonfarm.core.records import F32, STATIC, BasePointCloud, Geometry
+from photonfarm.scene.groups import Light
 from photonfarm.scene.spec import SceneSpec
+
+FIELDS = ("x", "y", "z", "present")
+"""The columns of every modification vector."""
+
+FURTHER = {"turn": 0.0, "power": 1.0, "red": 1.0, "green": 1.0, "blue": 1.0}
+"""The columns that follow in a scene in which groups turn or change what they emit, and their values at rest."""
+
+AT_REST = np.array([*FURTHER.values()], np.float32)
+
+COLUMNS = len(FIELDS), len(FIELDS) + len(FURTHER)
+"""The lengths that a group's part of the vector may have."""
+
+
+def columns(spec: SceneSpec) -> int:
+    """The number of columns of a scene's modification vectors, C."""
+    return COLUMNS[spec.further_changes]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -25,16 +42,50 @@ class Modification:
 
     translation: NDArray[np.float32]  # (G, 3) from the rest position, scene units
     present: NDArray[np.bool_]  # (G,) False: removed
+    further: F32 | None = None  # (G, 5) by `FURTHER`; None: a scene without these columns
 
     @property
     def vector(self) -> NDArray[np.float32]:
-        """The modification as one array (G, 4): translation, then 1 if present, else 0."""
-        return np.concatenate([self.translation, self.present[:, None].astype(np.float32)], axis=1)
+        """The modification as one array (G, C): translation, then 1 if present, else 0; and what is further."""
+        parts = [self.translation, self.present[:, None].astype(np.float32)]
+        return np.concatenate(parts if self.further is None else [*parts, self.further], axis=1)
 
     @classmethod
     def from_vector(cls, vector: NDArray[np.float32]) -> Modification:
-        """The inverse of `vector`; (G, 4)."""
-        return cls(np.ascontiguousarray(vector[:, :3], np.float32), vector[:, 3] != 0)
+        """The inverse of `vector`; (G, C)."""
+        further = np.ascontiguousarray(vector[:, 4:], np.float32) if vector.shape[1] > len(FIELDS) else None
+        return cls(np.ascontiguousarray(vector[:, :3], np.float32), vector[:, 3] != 0, further)
+
+    @property
+    def turn(self) -> F32:
+        """The angle of each group about the up axis through its `at`, in degrees, (G,)."""
+        return np.zeros(len(self.present), np.float32) if self.further is None else self.further[:, 0]
+
+    @property
+    def power(self) -> F32:
+        """The factor on what each group emits, (G,)."""
+        return np.ones(len(self.present), np.float32) if self.further is None else self.further[:, 1]
+
+    @property
+    def colour(self) -> F32:
+        """Further factors on the red, green and blue that each group emits, (G, 3)."""
+        return np.ones((len(self.present), 3), np.float32) if self.further is None else self.further[:, 2:]
+
+    @property
+    def light(self) -> F32:
+        """The factors on the red, green and blue that each group emits: power × colour, (G, 3)."""
+        return self.power[:, None] * self.colour
+
+    def describe_further(self, g: int) -> str:
+        """How a group stands and shines beside its place, in words; empty if as it was modelled."""
+        turn = f"turned by {self.turn[g]:.3g}°" if self.turn[g] else ""
+        red, green, blue = (f"{factor:.3g}" for factor in self.light[g])
+        light = f"light × {red}" if red == green == blue else f"light × ({red}, {green}, {blue})"
+        return ", ".join(filter(None, (turn, light if (self.light[g] != 1).any() else "")))
+
+    def without_groups(self) -> Modification:
+        """The same, with every group removed."""
+        return replace(self, present=np.zeros_like(self.present))
 
     def key(self, radiance_id: str) -> Key:
         """The content key of this configuration of that scene."""
@@ -43,26 +94,45 @@ class Modification:
 
 def rest(spec: SceneSpec) -> Modification:
     """The scene as it was modelled: nothing moved, nothing removed."""
-    return Modification(np.zeros((len(spec.groups), 3), np.float32), np.ones(len(spec.groups), np.bool_))
+    count = len(spec.groups)
+    further = np.tile(AT_REST, (count, 1)) if spec.further_changes else None
+    return Modification(np.zeros((count, 3), np.float32), np.ones(count, np.bool_), further)
 
 
 def sample_modifications(spec: SceneSpec, seed: int, indices: Iterable[int]) -> F32:
-    """The random configurations of a scene with these numbers under a master seed, as vectors (N, G, 4).
+    """The random configurations of a scene with these numbers under a master seed, as vectors (N, G, C).
 
     Each group's position is uniform in its box and independent of the others; each is removed independently with its
-    own probability; intersecting or unrealistic placements are not rejected [supplement 2.4]. A static scene gives the
-    rest state. The position of a removed group is zeroed, so that equal configurations have equal keys.
+    own probability; intersecting or unrealistic placements are not rejected [supplement 2.4]. Angles and powers are
+    uniform between their limits, and each colour is as likely as the others. A static scene gives the rest state. A
+    removed group is at rest otherwise, so that equal configurations have equal keys.
     """
     radiance_id, count = spec.radiance_id, len(spec.groups)
     keys = [make_key("modification", radiance_id, seed, index) for index in indices]
     uniform = uniform_of(keys, "placement", 4 * count).reshape(len(keys), count, 4)
-    vectors = np.zeros(uniform.shape, np.float32)
+    vectors = np.zeros((*uniform.shape[:2], columns(spec)), np.float32)
     for g, group in enumerate(spec.groups):
         position = group.box.low + uniform[:, g, :3] * (group.box.high - group.box.low)
         present = uniform[:, g, 3] >= group.removal_probability
         vectors[:, g, :3] = np.where(present[:, None], position - np.array(group.at), 0.0)
         vectors[:, g, 3] = present
+    if spec.further_changes:
+        chosen = _choose_further(spec, uniform_of(keys, "turn and light", 3 * count).reshape(len(keys), count, 3))
+        vectors[..., 4:] = np.where(vectors[..., 3:4] != 0, chosen, AT_REST)
     return vectors
+
+
+def _choose_further(spec: SceneSpec, uniform: NDArray[np.float64]) -> F32:
+    """The columns of `FURTHER` by uniform numbers (N, G, 3) of each group, (N, G, 5)."""
+    further = np.tile(AT_REST, (*uniform.shape[:2], 1))
+    for g, group in enumerate(spec.groups):
+        ranges = group.turn, group.power if isinstance(group, Light) else None
+        for column, limits in enumerate(ranges):
+            if limits is not None:
+                further[:, g, column] = limits.min + uniform[:, g, column] * (limits.max - limits.min)
+        if isinstance(group, Light) and group.colour:
+            further[:, g, 2:] = np.array(group.colour)[(uniform[:, g, 2] * len(group.colour)).astype(np.int64)]
+    return further
 
 
 def sample_modification(spec: SceneSpec, seed: int, index: int) -> Modification:
@@ -71,7 +141,7 @@ def sample_modification(spec: SceneSpec, seed: int, index: int) -> Modification:
 
 
 def modification_keys(radiance_id: str, vectors: F32) -> list[Key]:
-    """The content keys of configurations (N, G, 4) of a scene."""
+    """The content keys of configurations (N, G, C) of a scene."""
     return [make_key("modification", radiance_id, vector) for vector in vectors]
 
 
@@ -111,12 +181,50 @@ def _barycentric(u: NDArray[np.float64]) -> NDArray[np.float64]:
 def rebuild(base: BasePointCloud, modification: Modification) -> tuple[F32, NDArray[np.bool_]]:
     """The position (P, 3) of each point in one configuration, and whether it is present (P,) [supplement 1.1, 2.1].
 
-    Points of a moved group move by its translation, in float32; points of a removed group stay where they are and are
-    not present, so that P is constant.
+    Points of a moved group turn about its `at`, and then move by its translation, in float32; points of a removed group
+    stay where they are and are not present, so that P is constant.
     """
     moves = base.group != STATIC
     group = np.where(moves, base.group, 0)
     if not len(modification.present):
         return base.position, np.ones(len(base.position), np.bool_)
+    position = base.position
+    if base.pivots is not None:
+        position = position.copy()
+        for g in np.flatnonzero(modification.turn):
+            own = base.group == g
+            position[own] = turn_about(base.position[own], modification.turn[g], base.pivots.up, base.pivots.at[g])
     shift = np.where(moves[:, None], modification.translation[group], np.float32(0))
-    return base.position + shift, ~moves | modification.present[group]
+    return position + shift, ~moves | modification.present[group]
+
+
+def rebuild_surfaces(base: BasePointCloud, modification: Modification) -> tuple[F32, F32]:
+    """The normal and the emission of each point in one configuration, (P, 3) each: the base's own where none changes.
+
+    Normals turn with their groups; of a light that is there, emission has its power and colour.
+    """
+    normal, emission = base.normal, base.emission
+    if base.pivots is not None and modification.turn.any():
+        normal = normal.copy()
+        for g in np.flatnonzero(modification.turn):
+            normal[base.group == g] = turn_about(base.normal[base.group == g], modification.turn[g], base.pivots.up)
+    if (modification.light != 1).any():
+        factors = np.concatenate([modification.light, np.ones((1, 3), np.float32)])  # STATIC is the last one
+        emission = emission * factors[base.group]
+    return normal, emission
+
+
+def turn_matrix(degrees: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotation (3, 3) by an angle about the unit vector `up`, counter-clockwise as seen from above (Rodrigues)."""
+    angle, cross = np.radians(float(degrees)), np.cross(np.eye(3), up)
+    turned: NDArray[np.float64] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+    return turned
+
+
+def turn_about(
+    rows: F32, degrees: float, up: NDArray[np.float64], at: NDArray[np.float64] | None = None
+) -> NDArray[np.float32]:
+    """Points (N, 3) turned about `up` through `at`, or directions; in float64, rounded to float32."""
+    centre = np.zeros(3) if at is None else at
+    turned = (rows.astype(np.float64) - centre) @ turn_matrix(degrees, up).T + centre
+    return turned.astype(np.float32)

@@ -9,7 +9,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from photonfarm.scene.spec import Box, SceneSpec
+from photonfarm.scene.groups import Box
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec, SpecLines
 
 USUAL_FOV = (10.0, 130.0)
@@ -57,7 +58,8 @@ def _check_view(spec: SceneSpec) -> Iterator[Doubt]:
     if view.fov_deg > wide:
         yield "view.fov_deg", f"fov_deg = {view.fov_deg:g} stretches what is near the image's edges; {usual}"
     gap = _gap(view.origin, view.look_at)
-    spread = float(np.linalg.norm(np.ptp([group.at for group in spec.groups], axis=0))) if spec.groups else 0.0
+    places = [group.at for group in spec.groups if not group.stays]
+    spread = float(np.linalg.norm(np.ptp(places, axis=0))) if places else 0.0
     scale = max(_size(view.origin), _size(view.look_at), spread)
     if gap >= view.far:
         away = f"which is {gap:.3g} away from origin: nothing there is seen"

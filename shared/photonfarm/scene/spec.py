@@ -11,82 +11,15 @@ from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from photonfarm.core.keys import make_key
-from photonfarm.core.models import Factor, Frozen, Name, Positive, Probability
+from photonfarm.core.models import Factor, Frozen, Name, Positive
+from photonfarm.core.records import Pivots
 from photonfarm.scene.free_space import FreeSpace
-
-Vector = tuple[float, float, float]
+from photonfarm.scene.groups import Box, Light, Movable, Vector, shape_ids
 
 BUILTIN_ROOMS = ("cornell", "room")
-
-
-class Box(Frozen):
-    """An axis-aligned box; it may be flat in any axis."""
-
-    min: Vector
-    max: Vector
-
-    @model_validator(mode="after")
-    def _is_not_inverted(self) -> Self:
-        for axis, low, high in zip("xyz", self.min, self.max, strict=True):
-            if low > high:
-                raise ValueError(f"is inverted along {axis}: min {low} is above max {high}; min ≤ max is required")
-        return self
-
-    @property
-    def low(self) -> NDArray[np.float64]:
-        """The lower corner, (3,)."""
-        return np.array(self.min)
-
-    @property
-    def high(self) -> NDArray[np.float64]:
-        """The upper corner, (3,)."""
-        return np.array(self.max)
-
-
-class Movable(Frozen):
-    """Shapes that move and vanish as one: `at` is a fixed point of them, placed uniformly in `box`."""
-
-    name: Name
-    shapes: tuple[str, ...] = Field(min_length=1)
-    at: Vector  # where the reference point stands in the scene as modelled
-    box: Box  # where the reference point may stand
-    removal_probability: Probability = 0.2
-
-
-class Rectangle(Frozen):
-    """A rectangular ceiling light that the spec adds to the scene, facing down the world's up axis."""
-
-    size: tuple[Positive, Positive]  # along the two horizontal axes, in their order
-    radiance: tuple[float, float, float]
-
-    @model_validator(mode="after")
-    def _emits(self) -> Self:
-        if min(self.radiance) < 0 or max(self.radiance) == 0:
-            raise ValueError(f"has radiance {self.radiance}; all ≥ 0 and one > 0 are required")
-        return self
-
-
-class Light(Movable):
-    """A movable light: emitting shapes of the scene, or a rectangle that the spec adds."""
-
-    shapes: tuple[str, ...] = ()
-    rectangle: Rectangle | None = None
-    removal_probability: Probability = 0.0
-
-    @model_validator(mode="after")
-    def _is_one_or_the_other(self) -> Self:
-        if bool(self.shapes) == (self.rectangle is not None):
-            raise ValueError("needs either shapes (of the scene) or a rectangle (to add), and not both")
-        return self
-
-    @property
-    def shape_ids(self) -> tuple[str, ...]:
-        """The ids of its shapes in the loaded scene."""
-        return self.shapes or (self.name,)
 
 
 class Source(Frozen):
@@ -274,6 +207,18 @@ class SceneSpec(Frozen):
         """Every movable group, objects before lights: the order of the modification vector."""
         return self.objects + self.lights
 
+    @property
+    def further_changes(self) -> bool:
+        """Whether any group turns, or changes what it emits: then configurations have `FURTHER` fields."""
+        return any(group.turn for group in self.groups) or any(light.power or light.colour for light in self.lights)
+
+    @property
+    def pivots(self) -> Pivots | None:
+        """What groups turn about; None if none does."""
+        if not any(group.turn for group in self.groups):
+            return None
+        return Pivots(np.array([group.at for group in self.groups]), np.array(self.view.up, np.float64))
+
     @cached_property
     def radiance_id(self) -> str:
         """32 hexadecimal digits: the digest of all that the mean of a sample and its size depend on.
@@ -331,11 +276,6 @@ class SceneSpec(Frozen):
     def radiance_exponent(self) -> int:
         """The power of two that stored radiance is multiplied by, so that values exposed as at first lie near 1."""
         return int(np.round(np.log2(self.exposure))) if self.stored_exponent is None else self.stored_exponent
-
-
-def shape_ids(group: Movable) -> tuple[str, ...]:
-    """The ids of a group's shapes in the loaded scene."""
-    return group.shape_ids if isinstance(group, Light) else group.shapes
 
 
 def _canonical(value: Any) -> str:

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ValidationError
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import nearest, sentences
 from photonfarm.scene.files import BUILTIN, SceneFile
+from photonfarm.scene.groups import Light
 from photonfarm.scene.spec import SceneSpec
 
 SCENES_VARIABLE = "PHOTONFARM_SCENES"
@@ -97,7 +98,12 @@ def _check_shapes(spec: SceneSpec, scene: SceneFile, where: str) -> None:
     """Raise SpecError for a group of shapes that the scene has not, and for a light of shapes that are none."""
     for group in spec.groups:
         for shape in group.shapes:
-            if shape not in scene.shape_ids:
+            if isinstance(group, Light) and shape in scene.shapeless:
+                if not group.stays:
+                    raise SpecError(
+                        f"{where}: {group.name}.shapes: {shape!r} has no shape to move; leave out at and box"
+                    )
+            elif shape not in scene.shape_ids:
                 fault = f"{where}: {group.name}.shapes: {shape!r} is not a shape id of the scene"
                 if not scene.shape_ids:
                     raise SpecError(f"{fault}: its shapes have no ids; `photonfarm scene import` makes a copy with ids")
@@ -105,7 +111,7 @@ def _check_shapes(spec: SceneSpec, scene: SceneFile, where: str) -> None:
     for light in spec.lights:
         if light.rectangle and light.name in scene.shape_ids:
             raise SpecError(f"{where}: light {light.name!r} adds a rectangle under an id that the scene already has")
-        if light.shapes and not scene.emitting.intersection(light.shapes):
+        if light.shapes and not (scene.emitting | scene.shapeless).intersection(light.shapes):
             raise SpecError(
                 f"{where}: {light.name}.shapes: none of {', '.join(light.shapes)} emits light in the scene; what only "
                 "moves belongs under [[objects]]"

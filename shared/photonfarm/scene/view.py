@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Key, make_key, uniform_of, view_key
 from photonfarm.core.records import F32
-from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.modification import FIELDS, Modification, rest, turn_matrix
 from photonfarm.scene.spec import SceneSpec, ViewSpec
 
 
@@ -96,7 +96,7 @@ MOST_DRAWS = 1000
 def sample_views(
     spec: SceneSpec, modification_keys: Sequence[Key], seed: int, indices: Sequence[int], modifications: F32
 ) -> F32:
-    """Random views of configurations (N, G, 4) with these keys, under a master seed, as vectors (N, 6).
+    """Random views of configurations (N, G, C) with these keys, under a master seed, as vectors (N, 6).
 
     `indices` (N,) are their numbers within each configuration. Origin and look-at point are uniform in their boxes and
     independent [supplement 2.2]. Both are drawn again where they are nearer to each other than 1e-4 of the boxes' joint
@@ -136,7 +136,7 @@ def view_keys(modification_keys: Iterable[Key], vectors: F32) -> list[Key]:
 
 
 def are_in_free_space(spec: SceneSpec, origins: F32, modifications: F32) -> NDArray[np.bool_]:
-    """Whether origins (N, 3) are in the open in configurations (N, G, 4), (N,): in free cells, in no group's box.
+    """Whether origins (N, 3) are in the open in configurations (N, G, C), (N,): in free cells, in no group's box.
 
     All are in a spec without free space.
     """
@@ -150,11 +150,15 @@ def are_in_free_space(spec: SceneSpec, origins: F32, modifications: F32) -> NDAr
 
 
 def are_in_group(spec: SceneSpec, g: int, origins: F32, modifications: F32) -> NDArray[np.bool_]:
-    """Whether origins (N, 3) are in the box around a group, where configurations (N, G, 4) put it, (N,)."""
+    """Whether origins (N, 3) are in the box around a group, where configurations (N, G, C) put it, (N,)."""
     space, group = spec.view.free_space, spec.groups[g]
     if space is None or group.name not in space.groups:
         return np.zeros(len(origins), np.bool_)
     low, high = np.array(space.groups[group.name])
     offset = origins.astype(np.float64) - (np.array(group.at) + modifications[:, g, :3])
+    if group.turn is not None:  # as seen from the group
+        up = np.array(spec.view.up, np.float64)
+        back = np.stack([turn_matrix(-degrees, up) for degrees in modifications[:, g, len(FIELDS)]])
+        offset = np.einsum("nij,nj->ni", back, offset)
     within: NDArray[np.bool_] = ((low <= offset) & (offset <= high)).all(axis=1) & (modifications[:, g, 3] != 0)
     return within

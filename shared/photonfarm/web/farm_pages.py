@@ -129,7 +129,7 @@ class SceneSamples:
     def about(self, row: int) -> dict[str, Any]:
         """What is known of a sample besides its images."""
         sample, spec = self._open(row), self._reader.spec
-        modification = sample.modification
+        modification, further = sample.modification, sample.modification.describe_further
         rows = self._reader.rows
         place = int(np.searchsorted(rows, row))
         return {
@@ -149,8 +149,10 @@ class SceneSamples:
             "size": [spec.film.width, spec.film.height],
             "noise": self._measure_noise(sample),
             "groups": [
-                {"name": group.name, "present": bool(there), "moved": moved.tolist()}
-                for group, there, moved in zip(spec.groups, modification.present, modification.translation, strict=True)
+                {"name": group.name, "present": bool(there), "moved": moved.tolist(), "further": further(g)}
+                for g, (group, there, moved) in enumerate(
+                    zip(spec.groups, modification.present, modification.translation, strict=True)
+                )
             ],
             "images": ["mean", "a", "b", "noise", *_list_images(sample)],
         }

@@ -9,7 +9,8 @@ mi = backend.load(threads=1)
 
 from photonfarm.renderer.strategy.candidates import GRID, PLAIN  # noqa: E402
 from photonfarm.renderer.strategy.content import LightReach, SceneContent, light_reach, recommend_photons  # noqa: E402
-from photonfarm.scene.spec import Box, PhotonSpec, ViewSpec  # noqa: E402
+from photonfarm.scene.groups import Box  # noqa: E402
+from photonfarm.scene.spec import PhotonSpec, ViewSpec  # noqa: E402
 from tests.stability.scenes.hard_scenes import HARD_SCENES  # noqa: E402 - after the variant is set
 
 MIRROR = {"type": "sphere", "bsdf": {"type": "conductor"}}

@@ -11,6 +11,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import make_key
 from photonfarm.scene.camera_path import CameraPath, check_clear, orbit
 from photonfarm.scene.free_space import FreeSpace, pack
+from photonfarm.scene.groups import Turn
 from photonfarm.scene.modification import (
     Modification,
     rest,
@@ -22,6 +23,7 @@ from photonfarm.scene.view import are_in_free_space, sample_view, sample_views
 BOX = {"min": [0.0, 0.0, 0.0], "max": [4.0, 1.0, 2.0]}
 FREE = np.ones((8, 2, 4), np.bool_)
 FREE[:3, :, 2:] = False  # a solid of 1.5 × 1 × 1 in a corner
+LONG = ((-0.9, -0.1, -0.2), (0.9, 2.0, 0.2))  # likewise
 TAKES = ((-0.5, -0.1, -0.5), (0.5, 2.0, 0.5))  # around the `at` of the only group
 
 
@@ -70,6 +72,21 @@ def test_cameras_are_uniform_in_what_is_free_of_their_configuration() -> None:
     gone = origins(spec, Modification(np.zeros((1, 3), np.float32), np.zeros(1, np.bool_)), 1000)
     assert not stands_in_the_open(gone, block).all(), "where the object is not, a camera may stand in its place"
     assert stands_in_the_open(gone, None).all()
+
+
+def test_the_box_around_a_group_turns_with_it() -> None:
+    """By a quarter of a turn, long across the room: no camera stands in it, but where it would be at rest."""
+    spec = with_space(np.ones_like(FREE))
+    turning = spec.objects[0].model_copy(update={"turn": Turn(min=-90, max=90)})
+    space = spec.view.free_space
+    assert space is not None
+    view = spec.view.model_copy(update={"free_space": space.model_copy(update={"groups": {"object": LONG}})})
+    spec = spec.model_copy(update={"objects": (turning,), "view": view})
+    standing = np.float32([[2, 0, 1, 1, 90, 1, 1, 1, 1]])
+    x, y, z = (origins(spec, Modification.from_vector(standing), 2000) - [2, 0, 1]).T
+    turned, at_rest = (abs(x) < 0.2) & (abs(z) < 0.9), (abs(z) < 0.2) & (abs(x) < 0.9)
+    assert not turned.any()
+    assert (at_rest & (y < 1)).any()
 
 
 def with_all_free(spec: SceneSpec) -> SceneSpec:

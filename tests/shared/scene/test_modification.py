@@ -4,7 +4,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from photonfarm.scene.modification import Modification, rest, sample_modification
+from photonfarm.scene.groups import Power, Turn
+from photonfarm.scene.modification import (
+    Modification,
+    modification_keys,
+    rest,
+    sample_modification,
+    sample_modifications,
+    turn_about,
+)
 from photonfarm.scene.spec import SceneSpec
 
 COUNT = 4000
@@ -68,3 +76,50 @@ def test_the_master_seed_and_the_index_choose_the_configuration(dynamic_spec: Sc
     assert len(keys) == 20
     again = sample_modification(dynamic_spec, 0, 3)
     assert again.key("id") == sample_modification(dynamic_spec, 0, 3).key("id")
+
+
+WARM, COLD = (1.0, 0.6, 0.3), (0.8, 0.9, 1.0)
+
+
+def changing(spec: SceneSpec) -> SceneSpec:
+    """The same scene, whose first object turns, and whose light has powers and two colours; no other object does."""
+    (light,) = spec.lights
+    turning = spec.objects[0].model_copy(update={"turn": Turn(min=-30, max=60)})
+    light = light.model_copy(update={"power": Power(min=0.5, max=2), "colour": (WARM, COLD)})
+    return spec.model_copy(update={"objects": (turning, *spec.objects[1:]), "lights": (light,)})
+
+
+def test_turns_and_powers_are_uniform_colours_are_as_likely_and_all_are_independent(dynamic_spec: SceneSpec) -> None:
+    spec = changing(dynamic_spec)
+    vectors = sample_modifications(spec, 0, range(COUNT))
+    assert vectors.shape == (COUNT, 4, 9)
+    present, turn, power = vectors[:, 0, 3] != 0, vectors[:, 0, 4], vectors[:, 3, 5]
+    assert stats.kstest(turn[present], "uniform", (-30, 90)).pvalue > 1e-4
+    assert stats.kstest(power, "uniform", (0.5, 1.5)).pvalue > 1e-4
+    is_warm = (vectors[:, 3, 6:] == np.float32(WARM)).all(axis=1)
+    assert (is_warm | (vectors[:, 3, 6:] == np.float32(COLD)).all(axis=1)).all()
+    assert stats.binomtest(int(is_warm.sum()), COUNT, 0.5).pvalue > 1e-4
+    columns = np.stack([turn, power, is_warm, vectors[:, 0, 0]])[:, present]
+    assert np.abs(np.corrcoef(columns) - np.eye(4)).max() * np.sqrt(present.sum()) < 4.5
+    at_rest = np.float32([0, 1, 1, 1, 1])
+    assert (vectors[~present][:, 0, 4:] == at_rest).all()
+    assert (vectors[:, 1:3, 4:] == at_rest).all()
+    assert Modification.from_vector(vectors[0]).key("id") == modification_keys("id", vectors[:1])[0]
+
+
+def test_a_scene_in_which_nothing_turns_or_shines_otherwise_has_the_vectors_that_it_always_had(
+    dynamic_spec: SceneSpec,
+) -> None:
+    described = dynamic_spec.model_dump(mode="json")
+    assert not {"turn", "power", "colour"} & {key for group in described["lights"] for key in group}
+    assert sample_modifications(dynamic_spec, 0, range(2)).shape == (2, 4, 4)
+    assert rest(dynamic_spec).further is None
+    assert changing(dynamic_spec).radiance_id != dynamic_spec.radiance_id
+
+
+@pytest.mark.parametrize(("up", "right"), [((0, 1, 0), (0, 0, -1)), ((0, 0, 1), (0, 1, 0)), ((0, 0, -1), (0, -1, 0))])
+def test_a_quarter_of_a_turn_is_counter_clockwise_from_above(up: tuple[float, ...], right: tuple[float, ...]) -> None:
+    """What lies along +x about `at` lies then where one turns to the left to."""
+    at = np.array([3.0, 2.0, 1.0])
+    turned = turn_about((at + np.eye(3)[:1]).astype(np.float32), 90, np.array(up, np.float64), at)
+    np.testing.assert_allclose(turned[0] - at, right, atol=1e-6)

@@ -4,7 +4,8 @@ from pathlib import Path
 import pytest
 
 from photonfarm.core.errors import SpecError
-from photonfarm.scene.spec import BUILTIN_ROOMS, Emitters, Light
+from photonfarm.scene.groups import Light
+from photonfarm.scene.spec import BUILTIN_ROOMS, Emitters
 from photonfarm.scene.spec_loading import SCENES_VARIABLE, load_spec
 
 ROOT = Path(__file__).parents[3]

@@ -26,7 +26,7 @@ from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
 from photonfarm.farm.devices import AUTO, CPU
 from photonfarm.scene.arrangement import Shot, find_doubts, with_fov
-from photonfarm.scene.modification import Modification, rebuild, rest
+from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces, rest
 from photonfarm.scene.spec import WITHOUT_SHADOWS
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import Store
@@ -187,6 +187,8 @@ class OpenRun:
         used = self._run.settings.network.points
         position, present = rebuild(self._cloud, modification)
         self._points = position[:used], present[:used]
+        surfaces = rebuild_surfaces(self._cloud, modification) if self.spec.further_changes else ()
+        self._surfaces = [values[:used] for values in surfaces]
 
     def _inputs(self, view: View) -> Inputs:
         """What the network reads of the present configuration from a view, a batch of one."""
@@ -221,7 +223,7 @@ class OpenRun:
     def _point_inputs(self, view: View) -> PointInputs:
         position, present = self._points
         seen = present & self._scene.sees([view], position)[0] if self._run.sees_points else present
-        return PointInputs(self._tensor(position), self._tensor(present), self._tensor(seen))
+        return PointInputs(*map(self._tensor, (position, present, seen, *self._surfaces)))
 
     def _photon_inputs(self, view: View, photons: Photons) -> PhotonInputs:
         present = photons.bounce >= 0

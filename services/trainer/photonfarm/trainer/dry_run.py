@@ -90,6 +90,8 @@ class MadeUpScene:
         if inputs.points is not None:
             inputs.points.position[:] = _repeat_rows(self.cloud.position, inputs.points.position.shape[1])
             inputs.points.present.fill_(True)
+            if inputs.points.normal is not None:
+                inputs.points.normal[:] = _repeat_rows(self.cloud.normal, inputs.points.normal.shape[1])
         if (photons := inputs.photons) is not None:
             photons.position[:] = _repeat_rows(self.cloud.position, photons.position.shape[1])
             photons.normal[:] = _repeat_rows(self.cloud.normal, photons.normal.shape[1])

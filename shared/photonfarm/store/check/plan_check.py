@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Set
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
@@ -20,7 +20,7 @@ from photonfarm.core.errors import CorruptError, StoreError
 from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.plan.request import UNUSED, PlannedContent, sample_keys
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store.format import markers, schema
+from photonfarm.store.format import declarations, markers, schema
 from photonfarm.store.io.storage import Storage
 from photonfarm.store.model import findings, plans
 from photonfarm.store.model.findings import Cause, Finding
@@ -206,14 +206,14 @@ def _check_arrays_of_base(scene: CheckedScene, folder: str) -> Iterator[Finding]
     from photonfarm.store.format.metadata import open_group
 
     is_whole = True
-    for part, record in (("geometry", Geometry), ("cloud", BasePointCloud)):
+    for part, arrays in declarations.BASE.items():
         try:
             parent = open_group(scene.storage, folder)[0][part]
         except (StoreError, *UNREADABLE) as error:
             is_whole = False
             yield scene.finding(Cause.BASE, f"cannot be read: {plans.reason(error)}", f"{folder}/{part}")
             continue
-        for each in fields(record):
+        for each in arrays:
             file = f"{folder}/{part}/{each.name}"
             if detail := _describe_damage(scene.storage, file, parent, each.name, may_be_nan=False):
                 is_whole = False

@@ -3,7 +3,7 @@
 docs/store-format.md repeats it for readers; a test compares the two, and every array carries it in its attributes.
 
 Shape letters: R rows of a plan, H W image, K photon slots, L lit points, G movable groups; of the base: P points,
-V vertices, F triangles, S shapes; ⌈P/8⌉ is P/8 rounded up.
+V vertices, F triangles, S shapes; ⌈P/8⌉ is P/8 rounded up; C fields of a modification.
 """
 
 from __future__ import annotations
@@ -178,7 +178,7 @@ photon_bounce: modification R, slot K; |i1; 1
 """The arrays that jobs produce. The first axis names what a row belongs to."""
 
 PLAN_INPUTS = _declare(f"""
-modification: modification R, group G, component 4; <f4; see fields
+modification: modification R, group G, component C; <f4; see fields
     what may change of each movable group, by the attributes groups and fields; NaN: unused row
 view: view R, component 6; <f4; see fields
     a camera in {_WORLD}, by the attribute fields; NaN: unused row
@@ -245,7 +245,22 @@ A field that a plan lacks is at `rest` in all of its rows; `zero` says what 0 me
 """
 
 
-def vector_attributes(name: str, groups: Sequence[str]) -> dict[str, Any]:
-    """The attributes that describe the columns of an array of inputs; empty for one that holds no vectors."""
-    described: dict[str, Any] = {"fields": list(FIELDS[name])} if name in FIELDS else {}
+FURTHER: dict[str, tuple[dict[str, Any], ...]] = {
+    "modification": (
+        {"name": "turn", "unit": "degrees", "rest": 0.0, "zero": "as the group was modelled"},
+        {"name": "power", "unit": "1", "rest": 1.0, "zero": "its lights are dark"},
+        *({"name": colour, "unit": "1", "rest": 1.0, "zero": "none is emitted"} for colour in ("red", "green", "blue")),
+    ),
+    "view": (),
+}
+"""What further columns hold, all of which a scene's vectors have if any of its groups changes so."""
+
+
+def vector_attributes(name: str, groups: Sequence[str], *, further: bool) -> dict[str, Any]:
+    """The attributes that describe the columns of an array of inputs, perhaps with `further` ones.
+
+    They are empty for an array that holds no vectors.
+    """
+    fields = [*FIELDS[name], *(FURTHER[name] if further else ())] if name in FIELDS else []
+    described: dict[str, Any] = {"fields": fields} if fields else {}
     return described | ({"groups": list(groups)} if name == "modification" else {})

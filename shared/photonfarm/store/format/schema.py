@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError
 from photonfarm.core.records import F32, LIT_POINTS
+from photonfarm.scene.modification import columns
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store.format.declarations import FIELDS, OUTPUTS, ArrayDeclaration
+from photonfarm.store.format.declarations import FIELDS, FURTHER, OUTPUTS, ArrayDeclaration
 
 if TYPE_CHECKING:
     import zarr
@@ -62,7 +63,7 @@ def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
 
 def bytes_of_rows(spec: SceneSpec) -> dict[RowKind, int]:
     """The stored bytes of one sample, one view and one modification, with inputs, uncompressed."""
-    row_bytes: dict[RowKind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * 4 * len(spec.groups)}
+    row_bytes: dict[RowKind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * columns(spec) * len(spec.groups)}
     for name, array in output_arrays(spec).items():
         if name != "radiance_wide":  # few rows need it
             row_bytes[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize
@@ -150,8 +151,13 @@ def read_input(storage: Storage, folder: str, array: Any) -> NDArray[Any]:
             raise CorruptError(f"{storage.where}/{folder}/{name}: is missing")
     try:
         values = np.asarray(array[...])
-        fields = FIELDS.get(folder.rpartition("/")[2])
-        return values if fields is None else select_by_name(values, [f["name"] for f in array.attrs["fields"]], fields)
+        kind = folder.rpartition("/")[2]
+        if kind not in FIELDS:
+            return values
+        stored, known = [field["name"] for field in array.attrs["fields"]], FIELDS[kind]
+        if not {*stored} <= {field["name"] for field in known}:
+            known += FURTHER[kind]
+        return select_by_name(values, stored, known)
     except (ValueError, KeyError, RuntimeError) as error:
         reason = str(error).partition(" Stored: b")[0].rstrip(".")  # bytes of checksums tell nobody anything
         raise ValueError(f"{array.path}: {reason}") from error

@@ -188,7 +188,8 @@ def build(
     }
     with new_group(part, attributes) as group:
         for declared in declarations.PLAN_INPUTS:
-            more = declarations.vector_attributes(declared.name, [each.name for each in spec.groups])
+            groups = [each.name for each in spec.groups]
+            more = declarations.vector_attributes(declared.name, groups, further=spec.further_changes)
             schema.create_input(group, declared, getattr(rows, declared.name), more)
         schema.create_outputs(group, spec, count, shard_rows)
 

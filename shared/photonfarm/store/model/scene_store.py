@@ -9,12 +9,11 @@ import contextlib
 import re
 import shutil
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from photonfarm.core.errors import CorruptError, SpecError, StoreError, store_errors
@@ -236,7 +235,8 @@ class SceneStore:
 
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud; raises StoreError while they are not there."""
-        return read_base(self.storage, self.name)
+        geometry, cloud = read_base(self.storage, self.name)
+        return geometry, replace(cloud, pivots=self.spec.pivots)
 
     def write_base(self, geometry: Geometry, cloud: BasePointCloud) -> None:
         """Store geometry and base point cloud; the first ones written stay."""
@@ -358,11 +358,11 @@ def read_base(storage: Storage, scene: str) -> tuple[Geometry, BasePointCloud]:
     try:
         root, _ = open_group(storage, folder)
 
-        def read_arrays(part: str, record: type[Geometry] | type[BasePointCloud]) -> dict[str, NDArray[Any]]:
-            names = [field.name for field in fields(record)]
+        def read_arrays(part: str) -> dict[str, Any]:
+            names = [declared.name for declared in declarations.BASE[part]]
             return {name: schema.read_input(storage, f"{folder}/{part}/{name}", root[part][name]) for name in names}
 
-        return Geometry(**read_arrays("geometry", Geometry)), BasePointCloud(**read_arrays("cloud", BasePointCloud))
+        return Geometry(**read_arrays("geometry")), BasePointCloud(**read_arrays("cloud"))
     except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, FileNotFoundError) as error:
         why = f"{error}; {findings.BASE_ASIDE}"
         raise CorruptError(f"{storage.where}/{folder}: is not what was committed: {why}") from error

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.keys import Key, seed_of
 from photonfarm.core.records import F32, BasePointCloud, Guides, Photons, ViewBuffers, Visibility, arrays_of
-from photonfarm.scene.modification import Modification, rebuild
+from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store.format import schema
@@ -60,7 +60,7 @@ class Sample:
 
     row: int  # in the store, which never changes
     key: Key  # the content key: 16 bytes, a hash of scene, modification, view and pass
-    modification: Modification  # the configuration: `translation` (G, 3) from rest, scene units, and `present` (G,)
+    modification: Modification  # the configuration: `translation` (G, 3) from rest, scene units, `present` (G,), …
     view: View  # the camera's origin and target, world coordinates in scene units
     pass_number: int  # of the noisy pass, from 0: passes of one view differ in their noise alone
     radiance: NDArray[Any]  # (2, H, W, 3) independent noisy estimates A and B of one image, times `scale` linear RGB
@@ -100,7 +100,8 @@ class Sample:
         """The scene's points as this configuration has them, and which of them the view sees."""
         base = self.read_cloud()
         position, present = rebuild(base, self.modification)
-        return PointCloud(position, base.normal, base.albedo, base.emission, present, self.visibility.points)
+        normal, emission = rebuild_surfaces(base, self.modification)
+        return PointCloud(position, normal, base.albedo, emission, present, self.visibility.points)
 
     @cached_property
     def photons(self) -> Photons:

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -289,7 +289,8 @@ class SceneReader:
     def base(self) -> tuple[Geometry, BasePointCloud]:
         """Geometry and base point cloud, read once; raises StoreError while they are not there."""
         if self._base is None:
-            self._base = read_base(self._storage, self._name)
+            geometry, cloud = read_base(self._storage, self._name)
+            self._base = geometry, replace(cloud, pivots=self.spec.pivots)
         return self._base
 
     # ----------------------------------------------------------------------------------------------------------- others

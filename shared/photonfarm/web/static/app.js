@@ -215,7 +215,7 @@ async function sample(scene, row) {
     ["samples per pixel", about.spp], ["noise", about.noise === null ? "the image is black" : `${(100 * about.noise).toFixed(1)} % of local brightness`],
     ["cost", about.core_s === null ? "not known" : `${about.core_s.toFixed(2)} core-seconds, its share of its job`],
     ["camera", numbers(about.origin)], ["looks at", numbers(about.target)], ["exposure", about.exposure],
-    ...about.groups.map((group) => [group.name, group.present ? `moved by ${numbers(group.moved)}` : "removed"]),
+    ...about.groups.map((group) => [group.name, group.present ? [`moved by ${numbers(group.moved)}`, ...(group.further ? [group.further] : [])].join(", ") : "removed"]),
   ];
   main.replaceChildren(
     h("section", {}, h("div", { class: "top" }, h("h2", {}, `${about.scene}, row ${about.row}`),

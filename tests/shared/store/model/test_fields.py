@@ -2,15 +2,20 @@
 
 from typing import Any
 
+import checked_store
 import numpy as np
 import pytest
 import store_samples as samples
 import zarr
 
 from photonfarm.core.errors import CorruptError
-from photonfarm.store import SceneStore
+from photonfarm.data import Scene
+from photonfarm.plan.request import Request
+from photonfarm.scene.modification import FIELDS, FURTHER, rebuild_surfaces, sample_modification
+from photonfarm.store import SceneStore, Store
 from photonfarm.store.format import declarations, schema
 from photonfarm.store.format.metadata import seal
+from photonfarm.store.read.find import Query, find_samples, find_start
 
 scene = samples.scene
 TURN = {"name": "turn", "unit": "degrees", "rest": 0.0, "zero": "as modelled"}
@@ -39,6 +44,38 @@ def test_a_plan_that_lacks_a_field_has_it_at_rest(scene: SceneStore, monkeypatch
     unused = np.isnan(before[..., 0])
     np.testing.assert_array_equal(after[~unused][:, 4:], np.broadcast_to(np.float32([0, -0.5]), (np.sum(~unused), 2)))
     assert np.isnan(after[unused]).all()
+
+
+def test_turns_and_light_are_stored_and_found(store: Store) -> None:
+    """By their names, in every reader; a reader of four columns alone would find these first."""
+    (block,) = samples.small_spec().model_dump(mode="json")["objects"]
+    sky = {"name": "lamp", "shapes": ["ceiling-light"], "power": {"min": 0.5, "max": 2}, "colour": [[1, 0.5, 0.25]]}
+    spec = samples.small_spec(objects=[{**block, "turn": {"min": -90, "max": 90}}], lights=[sky])
+    request = Request(modifications=5, views_per_modification=2)
+    scene = store.scene(store.plan(spec, request, shard_rows=4).scene_id)
+    scene.write_base(*samples.base())
+    samples.commit_all(scene)
+    assert store.plan(spec, request, shard_rows=4).new == 0
+    plan = zarr.open_group(scene.folder / "plans/000000", mode="r")
+    names = [field["name"] for field in plan["modification"].attrs["fields"]]
+    assert names == [*FIELDS, *FURTHER]
+    assert [field["rest"] for field in plan["modification"].attrs["fields"]][4:] == [*FURTHER.values()]
+    reader = samples.reader_of(scene)
+    sample = reader.read(0)
+    expected = sample_modification(reader.spec, 0, 0)
+    np.testing.assert_array_equal(sample.modification.vector, expected.vector)
+    assert expected.turn[0] != 0
+    cloud, base = sample.point_cloud, reader.base()[1]
+    np.testing.assert_array_equal(cloud.normal, rebuild_surfaces(base, expected)[0])
+    assert (cloud.normal != base.normal).any()
+    key = expected.key(scene.spec.radiance_id).hex()
+    assert find_samples(store, [scene.scene_id], Query.of(like=key)).count == 2
+    start = find_start(store, scene.scene_id, None, key)
+    assert start is not None
+    np.testing.assert_array_equal(start[0].vector, expected.vector)
+    assert checked_store.checked(store).exit_code == 0
+    dataset = Scene(store.root, scene.scene_id).torch(fields=["modification"])
+    np.testing.assert_array_equal(dataset[0]["modification"], expected.vector)
 
 
 def test_columns_are_found_by_name_in_any_order() -> None:

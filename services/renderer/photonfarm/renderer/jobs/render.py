@@ -31,7 +31,7 @@ from photonfarm.core.records import (
 )
 from photonfarm.renderer.jobs.estimates import halves_of, photons_of
 from photonfarm.renderer.scene import backend
-from photonfarm.scene.modification import Modification, rebuild
+from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces
 from photonfarm.scene.spec import SceneSpec, Transport
 from photonfarm.scene.spec_loading import parse_spec
 from photonfarm.scene.view import View
@@ -204,7 +204,8 @@ def versions() -> Mapping[str, str]:
 
 def lit_points(cloud: BasePointCloud, modification: Modification) -> tuple[F32, F32]:
     """Positions and normals (L, 3) of the points of a configuration whose irradiance is among the guides."""
-    return rebuild(cloud, modification)[0][:LIT_POINTS], cloud.normal[:LIT_POINTS]
+    position, normal = rebuild(cloud, modification)[0], rebuild_surfaces(cloud, modification)[0]
+    return position[:LIT_POINTS], normal[:LIT_POINTS]
 
 
 def visibility_of(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -14,8 +15,9 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Key, seed_of
 from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.renderer.scene import backend
+from photonfarm.scene.groups import shape_ids
 from photonfarm.scene.modification import Modification, rest
-from photonfarm.scene.spec import GuideSpec, SceneSpec, Transport, shape_ids
+from photonfarm.scene.spec import GuideSpec, SceneSpec, Transport
 from photonfarm.scene.view import View, sample_view
 
 if TYPE_CHECKING:
@@ -70,8 +72,7 @@ class LoadedScene:
         self._materials = Materials.of(scene)
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
-        by_id = {shape.id(): shape for shape in shapes}
-        self._groups = [MovableGroup(_find_shapes(by_id, shape_ids(group), group.name)) for group in spec.groups]
+        self._groups = [MovableGroup(scene, group, spec) for group in spec.groups]
         self.boxes = boxes_of(shapes)
         self.still = np.array([shape.id() not in self._group_of for shape in shapes], np.bool_)
         # The corner that removed groups are parked in: see `editing`
@@ -97,17 +98,20 @@ class LoadedScene:
         if spec.groups:
             expect_changes(loaded.scene)
         at_rest = rest(spec)
-        loaded.apply(Modification(at_rest.translation, np.zeros_like(at_rest.present)))
+        loaded.apply(at_rest.without_groups())
         loaded.apply(at_rest)
         return loaded
 
     def apply(self, modification: Modification) -> None:
         """Bring the scene from any configuration into this one; only groups that change are edited."""
+        before, turn, light = self._state, modification.turn, modification.light
         for i, group in enumerate(self._groups):
-            present, was_present = bool(modification.present[i]), bool(self._state.present[i])
-            translation = modification.translation[i]
-            if present and not (was_present and np.array_equal(translation, self._state.translation[i])):
-                group.move(translation, was_present=was_present)
+            present, was_present = bool(modification.present[i]), bool(before.present[i])
+            stays = np.array_equal(modification.translation[i], before.translation[i]) and turn[i] == before.turn[i]
+            if present and not (was_present and stays):
+                group.move(modification.translation[i], turn[i])
+            if present and not (was_present and np.array_equal(light[i], before.light[i])):
+                group.shine(light[i])
             elif was_present and not present:
                 group.park(self._parking)
         if not np.array_equal(modification.vector, self._state.vector):
@@ -246,7 +250,7 @@ class LoadedScene:
         geometry = geometry_of(self.scene.shapes(), self._group_of)
         cloud = cloud_of(self.scene, geometry, self.spec.points, self.spec.radiance_id)
         self.apply(before)
-        return geometry, cloud
+        return geometry, replace(cloud, pivots=self.spec.pivots)
 
 
 def _samples_at_once(spec: SceneSpec, paths_at_once: int | None) -> int:
@@ -273,10 +277,3 @@ def integrator_of(transport: Transport, paths_at_once: int | None = None) -> Any
         return mi.load_dict({"type": "bdpt", "record": True, **parameters})
     except (RuntimeError, ValueError) as error:
         raise SpecError(f"transport: {' '.join(str(error).split())}") from error
-
-
-def _find_shapes(by_id: dict[str, Any], wanted: tuple[str, ...], name: str) -> list[Any]:
-    missing = sorted(set(wanted) - set(by_id))
-    if missing:
-        raise SpecError(f"{name}.shapes: {missing[0]!r} is not a shape of the loaded scene")
-    return [by_id[shape] for shape in wanted]

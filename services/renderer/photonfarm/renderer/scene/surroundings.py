@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from photonfarm.core.records import F32
 from photonfarm.renderer.scene.arrays import points as mi_points
 from photonfarm.scene.arrangement import NEVER_SEEN
+from photonfarm.scene.groups import shape_ids
 from photonfarm.scene.modification import Modification, rest
-from photonfarm.scene.spec import shape_ids
 from photonfarm.scene.view import View
 
 if TYPE_CHECKING:
@@ -118,8 +118,8 @@ def look_closer(loaded: LoadedScene, modification: Modification, view: View) -> 
     room = boxes[loaded.still]
     low, high = (room[:, 0].min(axis=0), room[:, 1].max(axis=0)) if len(room) else (-np.inf, np.inf)
     slack = 0.01 * np.max(high - low)
-    for group, now, before in zip(spec.groups, modification.vector, at_rest, strict=True):
-        if np.array_equal(now, before) or not now[3]:
+    for group, now, before in zip(spec.groups, modification.vector[:, :5], at_rest[:, :5], strict=True):
+        if np.array_equal(now, before) or not now[3]:  # what it emits is in nothing's way
             continue
         own = boxes[[shape.id() in shape_ids(group) for shape in shapes]]
         corners = own[:, 0].min(axis=0), own[:, 1].max(axis=0)

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from photonfarm.core.pictures import Picture, data_uri
 from photonfarm.core.records import Geometry
-from photonfarm.scene.modification import Modification, rest
-from photonfarm.scene.spec import Box, SceneSpec
+from photonfarm.scene.groups import Box
+from photonfarm.scene.modification import Modification, rest, turn_about
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 
 F64 = NDArray[np.float64]
@@ -41,7 +42,9 @@ class Standing:
         """Where a group stands, or where it was modelled."""
         group, place = spec.groups[i], None
         if modification is None or modification.present[i]:
-            place = format_point(np.array(group.at) + (0 if modification is None else modification.translation[i]))
+            at = np.array(group.at) + (0 if modification is None else modification.translation[i])
+            further = "" if modification is None else modification.describe_further(i)
+            place = ", ".join(filter(None, ("" if group.stays else format_point(at), further))) or "as modelled"
         return cls(i + 1, group.name, i >= len(spec.objects), place)
 
 
@@ -69,7 +72,11 @@ class PlanView:
         footprints = np.array([_around(boxes[geometry.shape_group == g]) for g in range(len(spec.groups))])
         places = [(box.low, box.high) for box in (spec.view.origin, spec.view.look_at)]
         for group, corners in zip(spec.groups, footprints, strict=True):
+            if group.stays:
+                continue
             own = np.where(np.isfinite(corners), corners, group.at) - group.at
+            if group.turn is not None:
+                own = np.linalg.norm(own, axis=1).max() * np.array([[-1.0], [1.0]])
             places.append((group.box.low + np.minimum(own[0], 0), group.box.high + np.maximum(own[1], 0)))
         core = _around(np.array(places))
         reach = REACH * np.ptp(core, axis=0).max()
@@ -98,9 +105,9 @@ class PlanView:
     def places(self, about: str, behind: Picture | None = None) -> Markup:
         """The scene at rest, before a picture of it or its shell, and the boxes that all is placed in."""
         view, groups = self.spec.view, self.spec.groups
-        boxes = [self._rectangle(_corners(g.box), f"may hue{i}") for i, g in enumerate(groups)]
+        boxes = [self._rectangle(_corners(g.box), f"may hue{i}") for i, g in enumerate(groups) if not g.stays]
         boxes += [self._rectangle(_corners(view.look_at), "looked"), self._rectangle(_corners(view.origin), "origins")]
-        ats = [self._point(np.array(group.at), f"at hue{i}") for i, group in enumerate(groups)]
+        ats = [self._point(np.array(group.at), f"at hue{i}") for i, group in enumerate(groups) if not group.stays]
         return self._svg([*boxes, *self._groups(rest(self.spec)), *ats], about, behind)
 
     def configuration(self, modification: Modification, views: Sequence[View]) -> Markup:
@@ -114,12 +121,24 @@ class PlanView:
         for i, corners in enumerate(self.footprints):
             if not modification.present[i] or not np.isfinite(corners).all():
                 continue
-            corners = corners + modification.translation[i]
             kind = "light" if i >= len(self.spec.objects) else "thing"
-            x, y = self._at(corners.mean(axis=0))
-            drawn.append(self._rectangle(corners, f"{kind} hue{i}"))
+            if degrees := modification.turn[i]:
+                outline = self._turned(i, corners, degrees) + modification.translation[i]
+                drawn.append(self._polygon(outline, f"{kind} hue{i}"))
+            else:
+                outline = corners + modification.translation[i]
+                drawn.append(self._rectangle(outline, f"{kind} hue{i}"))
+            x, y = self._at(outline.mean(axis=0))
             drawn.append(Markup('<text x="{:.2f}" y="{:.2f}">{}</text>').format(x, y, i + 1))
         return drawn
+
+    def _turned(self, i: int, corners: F64, degrees: float) -> F64:
+        """The outline of a group's box (2, 3) from above, turned about its `at`, (4, 3)."""
+        flat = corners @ self.axes.T
+        outline = np.array([flat[[x, y], [0, 1]] for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]) @ self.axes
+        return turn_about(
+            outline.astype(np.float32), degrees, np.array(self.spec.view.up), np.array(self.spec.groups[i].at)
+        ).astype(np.float64)
 
     def _camera(self, view: View) -> list[Markup]:
         camera = Camera.of(view, self.spec)
@@ -128,9 +147,8 @@ class PlanView:
         rays = (camera.forward + side * half * camera.right for side in (-1, 1))
         corners = [self._at(camera.origin + far * ray) for ray in rays]
         eye, target = (self._at(point) for point in (camera.origin, view.target.astype(np.float64)))
-        wedge = " ".join(f"{x:.2f},{y:.2f}" for x, y in (eye, *corners))
         return [
-            Markup('<polygon class="sees" points="{}"/>').format(wedge),
+            _draw_polygon((eye, *corners), "sees"),
             Markup('<line class="sees" x1="{:.2f}" y1="{:.2f}" x2="{:.2f}" y2="{:.2f}"/>').format(*eye, *target),
             self._point(camera.origin, "eye"),
         ]
@@ -143,6 +161,10 @@ class PlanView:
 
     def _point(self, point: F64, kind: str) -> Markup:
         return Markup('<circle class="{}" cx="{:.2f}" cy="{:.2f}" r="1.5"/>').format(kind, *self._at(point))
+
+    def _polygon(self, points: F64, kind: str) -> Markup:
+        """The polygon of points (N, 3)."""
+        return _draw_polygon([self._at(point) for point in points], kind)
 
     def _rectangle(self, corners: F64, kind: str) -> Markup:
         """The rectangle around a box (2, 3)."""
@@ -160,6 +182,11 @@ class PlanView:
         return Markup('<svg class="plan" viewBox="0 0 {:.2f} {:.2f}" role="img" aria-label="{}">{}{}</svg>').format(
             WIDTH, self.height, about, shell, Markup("").join(parts)
         )
+
+
+def _draw_polygon(corners: Sequence[tuple[float, float]], kind: str) -> Markup:
+    around = " ".join(f"{x:.2f},{y:.2f}" for x, y in corners)
+    return Markup('<polygon class="{}" points="{}"/>').format(kind, around)
 
 
 def hue(group: int) -> float:

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.core.records import F32, BasePointCloud, Geometry
-from photonfarm.data.torch_dataset import GUIDES, IMAGES, PHOTONS, POINTS
+from photonfarm.data.torch_dataset import GUIDES, IMAGES, PHOTONS, POINT_SURFACES, POINTS
 from photonfarm.scene.poor_views import hand_of
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.trainer.networks.projection import Optics
@@ -48,15 +48,19 @@ class SceneFrame:
     max_depth: int  # edges of a path of the images; −1: no limit
     area: float  # of all surfaces, scene units²
     hand: float = 0.0  # within which a view is near (`poor_views.hand_of`), scene units
+    changes: bool = False  # whether configurations change normals and emission of points
+    emission_scales: tuple[float, ...] = (1.0,)  # by which emission is divided, and then log(1 + emission) if there is
 
     @classmethod
     def of(cls, spec: SceneSpec, geometry: Geometry, cloud: BasePointCloud, settings: NetworkSettings) -> SceneFrame:
         """The frame of a scene, for the first `settings.points` points of its cloud (uniform draws, as all are)."""
         low, high = geometry.vertices.min(axis=0), geometry.vertices.max(axis=0)
         used = slice(settings.points)
-        emission = _normalise(cloud.emission[used])
-        if settings.emission == "log":
-            emission = _normalise(np.log1p(emission))
+        emission, scales = cloud.emission[used], []
+        for step in range(1 + (settings.emission == "log")):
+            emission = np.log1p(emission) if step else emission
+            scales.append(max(float(np.sqrt(np.mean(emission**2))), 1e-30))
+            emission = np.asarray(emission / scales[-1], np.float32)
         appearance = np.concatenate([cloud.normal[used], cloud.albedo[used], emission], axis=1)
         scale = max(0.5 * float(np.linalg.norm(high - low)), 1e-30)
         return cls(
@@ -70,12 +74,15 @@ class SceneFrame:
             max_depth=spec.transport.max_depth,
             area=float(geometry.areas().sum()),
             hand=hand_of(spec),
+            changes=spec.further_changes,
+            emission_scales=tuple(scales),
         )
 
-
-def _normalise(emission: F32) -> F32:
-    """Emission (P, 3) over its root mean square."""
-    return np.asarray(emission / max(float(np.sqrt(np.mean(emission**2))), 1e-30), np.float32)
+    def normalise_emission(self, emission: Tensor) -> Tensor:
+        """Emission of points in any configuration as `appearance` has that of the base."""
+        first, *further = self.emission_scales
+        emission = emission / first
+        return torch.log1p(emission) / further[0] if further else emission
 
 
 M = TypeVar("M")
@@ -110,6 +117,8 @@ class PointInputs:
     position: Tensor  # (B, P, 3) world, scene units
     present: Tensor  # (B, P) bool; False: of a removed group
     seen: Tensor  # (B, P) bool; in this view, as rendered
+    normal: Tensor | None = None  # (B, P, 3) where configurations change it, or emission
+    emission: Tensor | None = None  # (B, P, 3) radiance leaving along the normal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -217,7 +226,9 @@ class Inputs:
         """The inputs that a `SceneDataset` has read, (B, …) by field, in the same memory; and noisy colour."""
         inputs = cls(tensors["world_to_camera"], tensors["depth"], tensors["albedo"], tensors["normal"], noisy=noisy)
         if POINTS[0] in tensors:
-            inputs = replace(inputs, points=PointInputs(*(tensors[name] for name in POINTS)))  # in their order
+            surfaces = (tensors.get(name) for name in POINT_SURFACES)
+            points = PointInputs(*(tensors[name] for name in POINTS), *surfaces)  # in their order
+            inputs = replace(inputs, points=points)
         if PHOTONS[0] in tensors:
             arrays = {name.removeprefix("photon_"): tensors[name] for name in (*PHOTONS, "photon_seen")}
             inputs = replace(inputs, photons=PhotonInputs(**arrays, present=arrays["bounce"] >= 0))

@@ -107,7 +107,7 @@ class LitPoints(nn.Module):
     def __init__(self, frame: SceneFrame, count: int) -> None:
         """Take the first `count` points of a frame's cloud, or all that are lit if these are fewer."""
         super().__init__()
-        self._optics, self._max_depth = frame.optics, frame.max_depth
+        self._optics, self._max_depth, self._turns = frame.optics, frame.max_depth, frame.changes
         self._count = min(count, len(frame.appearance), LIT_POINTS)
         self._area = frame.area / self._count
         self.visibility = LearnedVisibility(frame)
@@ -122,6 +122,8 @@ class LitPoints(nn.Module):
         """
         points, guides = require(inputs.points), require(inputs.guides)
         source, there = points.position[:, : self._count] - self.centre, points.present[:, : self._count, None]
+        if self._turns:
+            source = torch.cat([source, require(points.normal)[:, : self._count]], dim=-1)
         sent = self.albedo * there * guides.point_light[:, : self._count] / math.pi
         if 0 <= self._max_depth < PATH_EDGES:
             sent = torch.zeros_like(sent)
@@ -150,10 +152,10 @@ class LitPoints(nn.Module):
     def arriving(self, at: Tensor, facing: Tensor, source: Tensor, sent: Tensor) -> tuple[Tensor, Tensor]:
         """Light without and with learned visibility at surfaces (B, N, 3) with normals `facing`, (B, N, 3) each.
 
-        The points are at `source` and send so much, (B, L, 3) each.
+        The points are at `source`, (B, L, 3), or (B, L, 6) with normals of their own, and send so much, (B, L, 3).
         """
         factors, surfaces = self.form_factors(at, facing, source), self.visibility.surfaces
-        senders = surfaces(source, self.normal.expand_as(source))
+        senders = surfaces(*self._split(source))
         seen = factors * self.visibility(surfaces(at, facing), senders)
         return factors @ sent, seen @ sent
 
@@ -161,7 +163,7 @@ class LitPoints(nn.Module):
     def form_factors(self, at: Tensor, facing: Tensor, source: Tensor) -> Tensor:
         """cos θ cos θ′ A / (π r²) between surfaces (B, N, 3) with normals `facing` and each point, (B, N, L)."""
         leaves, squared = self._between(at, source)
-        cosines = _measure_along(facing, at, source).clamp_(min=0).mul_(leaves)
+        cosines = _measure_along(facing, at, self._split(source)[0]).clamp_(min=0).mul_(leaves)
         return cosines.div_(squared.square_()).mul_(self._area / math.pi)
 
     @torch.no_grad()
@@ -189,7 +191,7 @@ class LitPoints(nn.Module):
         sharpness = 0.5 / roughness.clamp(min=SHARPEST) ** 2
         leaves, squared = self._between(at, source)
         nearness = squared.rsqrt_()  # 1 / r
-        weight = _measure_along(sharpness * mirrored, at, source).mul_(nearness).sub_(sharpness)
+        weight = _measure_along(sharpness * mirrored, at, self._split(source)[0]).mul_(nearness).sub_(sharpness)
         weight.clamp_(min=LEAST_LOGARITHM).exp_().mul_(leaves).mul_(nearness.pow_(3))
         light, total = torch.split(weight @ functional.pad(sent, (0, 1), value=1.0), [3, 1], dim=-1)
         return light / total.clamp(min=1e-12)
@@ -199,12 +201,17 @@ class LitPoints(nn.Module):
 
         The square is at least a point's area over π, so that no near point outweighs all others.
         """
-        with_one = functional.pad(at, (0, 1), value=1.0)
-        behind = -(source * self.normal).sum(-1, keepdim=True)
-        leaves = with_one @ torch.cat([self.normal.expand_as(source), behind], dim=-1).mT
-        squares = torch.cat([-2 * source, (source * source).sum(-1, keepdim=True)], dim=-1)
+        with_one, (place, normal) = functional.pad(at, (0, 1), value=1.0), self._split(source)
+        behind = -(place * normal).sum(-1, keepdim=True)
+        leaves = with_one @ torch.cat([normal, behind], dim=-1).mT
+        squares = torch.cat([-2 * place, (place * place).sum(-1, keepdim=True)], dim=-1)
         squared = torch.baddbmm((at * at).sum(-1, keepdim=True), with_one, squares.mT)
         return leaves.clamp_(min=0), squared.clamp_(min=self._area / math.pi)
+
+    def _split(self, source: Tensor) -> tuple[Tensor, Tensor]:
+        """Positions and normals (B, L, 3) of points, which have normals of their own or those of the base."""
+        place, normal = source[..., :3], source[..., 3:]
+        return place, normal if normal.shape[-1] else self.normal.expand_as(place)
 
 
 def _measure_along(direction: Tensor, at: Tensor, source: Tensor) -> Tensor:

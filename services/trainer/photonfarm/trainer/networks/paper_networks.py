@@ -133,7 +133,8 @@ class LightTransportLayer(nn.Module):
     def forward(self, varying: Tensor, fixed: Tensor, present: Tensor, base_cloud: Tensor | None = None) -> Tensor:
         """p_i and present (B, P) → f_i (B, P, 64).
 
-        p_i comes in two parts: values that differ between samples (B, P, F), and constants (P, F′). The maxima of the
+        p_i comes in two parts: values that differ between samples (B, P, F), and constants (P, F′); where these change,
+        too, they are (B, P, F′), with those of the base cloud behind. The maxima of the
         `base_cloud` (P, F), if given, are subtracted, which is ours: a moved lamp's effect on maxima is small beside
         what all configurations have in common, and would be lost in the optimiser's changes to that.
         """
@@ -165,6 +166,7 @@ class LightTransport(Network):
         self.register_buffer("appearance", torch.from_numpy(frame.appearance), persistent=False)
         self.register_buffer("base", torch.from_numpy(frame.base), persistent=False)
         self.relative = settings.maxima == "relative"
+        self._normalise = frame.normalise_emission if frame.changes else None
         self.descriptor = make_descriptors(points, settings)
         self.light_transport = LightTransportLayer(self.coordinate_count, appearance + settings.descriptor)
 
@@ -177,6 +179,12 @@ class LightTransport(Network):
         """f_i (B, P, 64) from p_i: current world position, then normal, albedo, emission and learnable descriptor."""
         fixed = torch.cat([self.appearance, self.descriptor], dim=1)
         base_cloud = self.coordinates(self.base) if self.relative else None
+        if self._normalise is not None:  # in this scene constants change, too
+            constant, count = fixed, len(points.position)
+            emission = self._normalise(require(points.emission))
+            albedo, descriptor = (each.expand(count, -1, -1) for each in (constant[:, 3:6], self.descriptor))
+            fixed = torch.cat([require(points.normal), albedo, emission, descriptor], dim=-1)
+            fixed = torch.cat([fixed, constant[None]]) if self.relative else fixed
         return self.light_transport(self.coordinates(points.position), fixed, points.present, base_cloud)
 
 

@@ -12,9 +12,10 @@ from photonfarm.core.records import F32
 from photonfarm.renderer.tools.check.samples import Cameras, Samples
 from photonfarm.renderer.tools.check.shapes import Placed
 from photonfarm.renderer.tools.measure.exposure import TARGET
+from photonfarm.scene.groups import Movable
 from photonfarm.scene.plausibility import doubts, group_key
 from photonfarm.scene.poor_views import hand_of
-from photonfarm.scene.spec import Movable, SceneSpec
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import SpecLines
 
 MEANS = (0.2, 0.7)
@@ -181,7 +182,7 @@ def _check_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> I
     size = float(np.linalg.norm(placed.high - placed.low))
     at = np.array(group.at)
     off = float(np.linalg.norm(np.maximum(np.maximum(placed.low - at, at - placed.high), 0)))
-    if off > 0.5 * size:
+    if off > 0.5 * size and not group.stays:
         yield Finding(
             f"{key}.at",
             f"at of {group.name!r} is {off:.3g} away from its shapes, which are {size:.3g} across and stand at "

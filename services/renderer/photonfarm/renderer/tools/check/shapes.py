@@ -23,7 +23,9 @@ from photonfarm.core.records import F32, Geometry
 from photonfarm.renderer.scene.arrays import floats, points, shape_numbers
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import surroundings
-from photonfarm.scene.spec import Movable, SceneSpec, shape_ids
+from photonfarm.scene.groups import Movable, shape_ids
+from photonfarm.scene.modification import turn_about
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec, parse_spec
 
 _MATERIAL = re.compile(
@@ -175,17 +177,27 @@ def group_vertices(geometry: Geometry, number: int) -> F32:
 
 
 def _place(fixed: Any, hollow: NDArray[np.bool_], vertices: F32, group: Movable, up: F32, carpet: float) -> Placed:
+    if not len(vertices):  # a light without a shape
+        vertices = np.array([group.at], np.float32)
     low, high = vertices.min(axis=0), vertices.max(axis=0)
     corners = _corners(group)
-    if fixed is None:
+    if fixed is None or group.stays:
         return Placed(low, high, 0, 0, 0, group.at, None)
-    within = np.random.default_rng(0).uniform(group.box.low, group.box.high, (PLACES, 3))
+    rng = np.random.default_rng(0)
+    within = rng.uniform(group.box.low, group.box.high, (PLACES, 3))
     places = np.concatenate([[group.at], corners, within])
     moves = (places - group.at).astype(np.float32)
     middle = (low + high) / 2
-    there = surroundings(fixed, middle + moves, hollow).open
-    spread = vertices[np.linspace(0, len(vertices) - 1, min(POINTS, len(vertices))).astype(np.int64)]
-    behind, shapes = _behind(fixed, middle, _lift(spread, up, carpet), moves)
+    spread = _lift(vertices[np.linspace(0, len(vertices) - 1, min(POINTS, len(vertices))).astype(np.int64)], up, carpet)
+    middles, spreads = np.tile(middle, (len(moves), 1)), np.tile(spread, (len(moves), 1, 1))
+    if group.turn is not None:
+        about = up.astype(np.float64), np.array(group.at)
+        angles = rng.uniform(group.turn.min, group.turn.max, len(moves))
+        for number, degrees in enumerate(angles[1:], 1):  # but at rest
+            middles[number] = turn_about(middles[number], degrees, *about)
+            spreads[number] = turn_about(spreads[number], degrees, *about)
+    there = surroundings(fixed, middles + moves, hollow).open
+    behind, shapes = _behind(fixed, middles, spreads, moves)
     cut = np.maximum(behind - behind[0], 0)
     random, worst = slice(1 + len(corners), None), int(cut.argmax())
     return Placed(
@@ -206,13 +218,16 @@ def _lift(vertices: F32, up: F32, carpet: float) -> F32:
     return vertices + np.maximum(least - height, 0)[:, None] * up
 
 
-def _behind(fixed: Any, middle: F32, vertices: F32, moves: F32) -> tuple[NDArray[np.float64], str | None]:
-    """The share of vertices behind a surface, seen from the middle, of each move; and which shape that mostly is."""
-    offset = vertices - middle
+def _behind(fixed: Any, middles: F32, vertices: F32, moves: F32) -> tuple[NDArray[np.float64], str | None]:
+    """The share of vertices (N, V, 3) behind a surface, seen from middles (N, 3), of each move (N, 3).
+
+    Also the shape that this mostly is.
+    """
+    offset = (vertices - middles[:, None]).reshape(-1, 3)
     distance = np.maximum(np.linalg.norm(offset, axis=1), 1e-30)
-    start = np.repeat(middle + moves, len(vertices), axis=0)
-    ray = mi.Ray3f(o=points(start), d=mi.Vector3f(points(np.tile(offset / distance[:, None], (len(moves), 1)))))
-    ray.maxt = floats(np.tile((1 - TOUCHING) * distance, len(moves)))
+    start = np.repeat(middles + moves, vertices.shape[1], axis=0)
+    ray = mi.Ray3f(o=points(start), d=mi.Vector3f(points(offset / distance[:, None])))
+    ray.maxt = floats((1 - TOUCHING) * distance)
     hit = fixed.ray_intersect_preliminary(ray)
     met = np.isfinite(np.array(hit.t))
     shapes = shape_numbers(fixed)[np.array(dr.reinterpret_array(mi.UInt32, hit.shape))[met]]

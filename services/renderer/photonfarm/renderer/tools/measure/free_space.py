@@ -24,8 +24,9 @@ from photonfarm.renderer.scene.gbuffer import sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import NONE
 from photonfarm.scene.free_space import FreeSpace, pack
-from photonfarm.scene.modification import Modification, rest, sample_modifications
-from photonfarm.scene.spec import Box, SceneSpec, shape_ids
+from photonfarm.scene.groups import Box, shape_ids
+from photonfarm.scene.modification import rest, sample_modifications
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import are_in_free_space
 
 ALONG = 48
@@ -94,8 +95,8 @@ def _free(scene: LoadedScene, middles: F32, reach: np.floating) -> NDArray[np.bo
 
     Movable groups are away.
     """
-    spec, at_rest = scene.spec, rest(scene.spec)
-    scene.apply(Modification(at_rest.translation, np.zeros_like(at_rest.present)))
+    spec = scene.spec
+    scene.apply(rest(spec).without_groups())
     around = scene.surroundings(middles)
     clear = around.clearance > reach + spec.view.near
     seen = sight_shares(scene.scene, middles, _inside(spec.view.look_at, LOOK_AT)) >= SEEN
@@ -126,7 +127,9 @@ def _group_boxes(scene: LoadedScene) -> dict[str, tuple[tuple[float, float, floa
     boxes = scene.boxes.astype(np.float64)
     around = {}
     for group in spec.groups:
-        own = boxes[[number[shape] for shape in shape_ids(group)]]
+        if not (shapes := [number[shape] for shape in shape_ids(group) if shape in number]):
+            continue  # a light without a shape
+        own = boxes[shapes]
         low, high = (own[:, 0].min(axis=0) - margin, own[:, 1].max(axis=0) + margin)
         around[group.name] = (_round(low - np.array(group.at)), _round(high - np.array(group.at)))
     return around

@@ -157,6 +157,7 @@ def test_five_lines_with_a_loader_of_spawned_processes(place: str | Path, worker
         assert batch["radiance"].shape[1:] == (2, 8, 8, 3)
         assert batch["modification"].shape[1:] == (1, 4)
         assert batch["view"].shape[1:] == (6,)
+        assert batch["pass_number"].tolist() == [scene.row(row).pass_number for row in batch["row"].tolist()]
         for row, radiance in zip(batch["row"].tolist(), batch["radiance"], strict=True):
             np.testing.assert_array_equal(radiance, samples.values(row, (2, 8, 8, 3)))
             rows.append(row)
@@ -241,7 +242,7 @@ def test_wrong_names_raise_with_those_that_exist(scene: Scene, tmp_path: Path) -
 
 @pytest.mark.parametrize("fields", [["depth"], ["radiance"], ["modification"], ["radiance", "direct", "view"]])
 def test_any_fields_alone_are_had_as_tensors(scene: Scene, fields: list[str]) -> None:
-    assert set(scene.torch(fields=fields)[0]) == {"row", *fields}
+    assert set(scene.torch(fields=fields)[0]) == {"row", "pass_number", *fields}
 
 
 def test_reading_needs_neither_torch_nor_mitsuba(scene: Scene, tmp_path: Path) -> None:

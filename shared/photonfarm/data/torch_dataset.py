@@ -126,7 +126,10 @@ class SampleTensors:
 
 
 class SceneDataset(Dataset[dict[str, Any]]):
-    """A dictionary for each sample of a scene: its `row`, and tensors by name, as `SampleTensors` has them."""
+    """A dictionary for each sample of a scene: `row`, `pass_number`, and tensors by name, as `SampleTensors` has them.
+
+    References are further passes of few views; those of pass 0 have each view once.
+    """
 
     def __init__(
         self, samples: Samples, fields: Sequence[str] | None = None, *, exposure: float = 1.0, points: int | None = None
@@ -159,7 +162,9 @@ class SceneDataset(Dataset[dict[str, Any]]):
     def __getitem__(self, index: int) -> dict[str, Any]:
         """The sample at a place; raises IndexError, and CorruptError if its bytes are not what was committed."""
         row = int(self._samples.rows[index])
-        return {"row": row} | {name: values[0] for name, values in self.read([row]).items()}
+        memory = self.tensors.empty(1)
+        (sample,) = self._fill([row], memory)
+        return {"row": row, "pass_number": sample.pass_number} | {name: values[0] for name, values in memory.items()}
 
     def read(self, rows: Sequence[int], out: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
         """The samples in some rows of the store, (B, …) by name, in the first places of `out` or in new memory.
@@ -167,10 +172,16 @@ class SceneDataset(Dataset[dict[str, Any]]):
         One thread at a time may call it. Raises IncompleteError for a row that is not complete, CorruptError for bytes
         that are not what was committed.
         """
+        memory = self.tensors.empty(len(rows)) if out is None else out
+        self._fill(rows, memory)
+        return {name: values[: len(rows)] for name, values in memory.items()}
+
+    def _fill(self, rows: Sequence[int], memory: Mapping[str, Tensor]) -> Sequence[Sample]:
+        """Write the samples in some rows into the first places of memory; returns them."""
         if self._stored is None or len(self._stored) < len(rows):
             guides = any(name in GUIDES for name in self.tensors.fields)
             self._stored = Batch.empty(self._samples.spec, len(rows), guides=guides)
-        memory = self.tensors.empty(len(rows)) if out is None else out
-        for place, sample in enumerate(self._samples.read_samples(rows, self._stored)):
+        samples = self._samples.read_samples(rows, self._stored)
+        for place, sample in enumerate(samples):
             self.tensors.fill(memory, place, sample)
-        return {name: values[: len(rows)] for name, values in memory.items()}
+        return samples

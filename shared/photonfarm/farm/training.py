@@ -59,7 +59,7 @@ class TrainingProgress:
         parts = [] if self.left_s is None else [f"{format_span(self.left_s)} left"]
         if (validation := self.validation) is not None:
             error = format_estimate(validation["error"], validation["standard_error"])
-            parts.append(f"held-out error {error} on {format_count(validation['held_out'], 'sample')}")
+            parts.append(f"held-out error {error} on {format_count(validation['held_out'], 'view')}")
         return "".join(f", {part}" for part in parts)
 
     @property

@@ -137,7 +137,11 @@ def _measure_trainings(farm: FarmProgress) -> Iterator[Row]:
         ("trainer_loss", "loss", "The training loss that was logged last."),
         ("trainer_heldout_error", "error", "The held-out error of the last validation."),
         ("trainer_heldout_standard_error", "standard_error", "The standard error of the held-out error."),
-        ("trainer_heldout_samples", "held_out", "The samples that the last validation was on."),
+        (
+            "trainer_heldout_samples",
+            "held_out",
+            "The samples that the last validation was on, one of each held-out view.",
+        ),
     ):
         yield name, "run", about, {of: figures[key] for of, figures in numbers.items() if _is_number(figures.get(key))}
     spent = {

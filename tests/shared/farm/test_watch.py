@@ -268,7 +268,7 @@ def test_a_runs_log_is_followed_and_read_anew_where_a_trainer_has_replaced_it(tm
     (tmp_path / "settings.json").write_text('{"max_steps": 40}')
     log.write_text(validation(10, 0.5) + validation(20, 0.4)[:-9])
     found = run.look()
-    assert (found.step, found.steps, found.figures) == (10, 40, ", held-out error 0.50000 ± 0.10000 on 3 samples")
+    assert (found.step, found.steps, found.figures) == (10, 40, ", held-out error 0.50000 ± 0.10000 on 3 views")
     log.write_text(validation(10, 0.5) + validation(20, 0.4))
     assert run.look().step == 20
     (tmp_path / "other").write_text(json.dumps({"kind": "end", "step": 97, "reason": "steps"}) + "\n")

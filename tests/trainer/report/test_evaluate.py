@@ -42,9 +42,18 @@ from photonfarm.trainer.predictors.evaluation import (
     time_by_turns,
 )
 from photonfarm.trainer.predictors.trained import TrainedRun
+from photonfarm.trainer.runs.run_folder import METRICS, read_log
 from photonfarm.trainer.training.loop import train
 
 QUICK = {"without_inception": True}
+
+
+def test_training_measures_the_views_that_evaluate_does_each_by_its_first_pass(measured, trained) -> None:
+    run = trained()
+    last = [record for record in read_log(run.folder / METRICS) if record["kind"] == "validation"][-1]
+    found = compare(measured.store, [run])
+    assert last["held_out"] == found.samples == len(measured.held_out()) // 2
+    assert last["error"] == pytest.approx(found.rows[0].held_out.error.mean, rel=1e-6)
 
 
 def test_a_network_is_measured_once_on_each_view_that_is_held_out_by_its_first_sample(measured, trained) -> None:

@@ -132,7 +132,7 @@ function maps(scene, found) {
 }
 
 function training(runs) {
-  const held = (each) => `${count(each[5])} held-out sample${each[5] === 1 ? "" : "s"}`;
+  const held = (each) => `${count(each[5])} held-out view${each[5] === 1 ? "" : "s"}`;
   const by = (axis) => runs.map((run, place) => ({ place, points: run.validations.map((each) => [each[axis], each[2], each[3],
     { hollow: each[5] < run.validations.at(-1)[5], title: `step ${count(each[0])}: ${each[2].toFixed(5)} on ${held(each)}` }]) }));
   if (!runs.some((run) => run.validations.length)) return card("half", "Training", null, h("p", { class: "note" }, "No validation yet."));
@@ -142,7 +142,7 @@ function training(runs) {
   });
   return card("half", "Training", "held-out error, noise removed; shaded: its standard error", curves(by(0), "step"),
     curves(by(1), "seconds, with waiting"), h("div", { class: "legend" }, ...legend),
-    h("p", { class: "note" }, "Each point is a validation; hollow ones were measured on fewer held-out samples than the last: the others had not been rendered. A pointer on a point tells how many."));
+    h("p", { class: "note" }, "Each point is a validation; hollow ones were measured on fewer held-out views than the last: the others had not been rendered. A pointer on a point tells how many."));
 }
 
 const chosen = {}; // the step of each run that is shown; none: the last one

@@ -13,6 +13,7 @@ from rich import markup
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from photonfarm.core.formatting import format_count
 from photonfarm.core.processes import repeat
 from photonfarm.core.statistics import format_estimate
 from photonfarm.core.waiting import SILENCE_S, Steps
@@ -38,7 +39,8 @@ def print_record(of: dict[str, Any]) -> None:
     if of["kind"] == "end" and of["advice"]:
         click.echo(of["advice"], err=True)
     if of["kind"] == "validation":
-        there = f"on {of['held_out']} of {of['samples']} samples; {_format_rounds(of)}{_format_poor(of['poor'])}"
+        views = f"on {format_count(of['held_out'], 'view')}, {of['samples']} samples have arrived"
+        there = f"{views}; {_format_rounds(of)}{_format_poor(of['poor'])}"
         click.echo(
             f"step {of['step']}: held-out error {format_estimate(of['error'], of['standard_error'])} "
             f"({format_estimate(of['shown_error'], None)} up to white) {there}"

@@ -70,7 +70,7 @@ class TrainCommand(click.Command):
     def _check_settings(run: Path, preset: str | None, **params: Any) -> None:
         from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings  # numpy is slow to load
 
-        own = preset is None and not params["check"] and (run / CHECKPOINT).exists()
+        own = preset is None and not params["check"] and Path(run, CHECKPOINT).exists()
         make_settings(read_settings(run) if own else preset or "small", collect_changes(params))
 
 

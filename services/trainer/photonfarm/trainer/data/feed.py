@@ -73,6 +73,7 @@ class Feed:
         self._plans: list[dict[str, Any]] = []
         self._sides: set[bool] = set()  # whether samples so far are held out
         self._units: set[Key] = set()  # what is held out as one, until some are and some are not
+        self._views: dict[int, Key] = {}  # of held-out rows, by row
         self._known: set[int] = set()  # rows that have arrived
         self._skipped: dict[int, bool] = {}  # by row, of those that were asked for or are on no side
         self._missing: set[int] = set()  # rows that are known, and were set aside and are not complete again yet
@@ -163,6 +164,15 @@ class Feed:
             rows, self._arrived = self._arrived, []
             return rows, self._complete
 
+    def first_of_views(self, rows: Iterable[int]) -> list[int]:
+        """The first sample of each view among held-out rows that have arrived, in the order of their views' arrival."""
+        first: dict[Key, int] = {}
+        with self._lock:
+            for row in rows:
+                key = self._views[row]
+                first[key] = min(row, first.get(key, row))
+        return list(first.values())
+
     def plan_requests(self) -> list[dict[str, Any]]:
         """The requests of all plans, as of the last look at the store."""
         with self._lock:
@@ -219,8 +229,11 @@ class Feed:
         new = [int(row) for row in self._source.refresh()]
         sides = sides_of(self._source, new, self._settings.hold_out)
         units, held_out = units_of(self._source, new), [side == "held-out" for side in sides]
+        kept = [row for row, held in zip(new, held_out, strict=True) if held]
+        views = self._source.view_keys(kept)
         with self._lock:
             self._skipped.update((row, True) for row, side in zip(new, sides, strict=True) if side is None)
+            self._views.update(zip(kept, views, strict=True))
             self._arrived.extend(zip(new, held_out, strict=True))
             self._sides.update(held_out)
             self._units = set() if len(self._sides) > 1 else self._units.union(units)

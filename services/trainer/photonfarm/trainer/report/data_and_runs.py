@@ -156,7 +156,7 @@ class CurvePoint:
     used: int  # samples drawn at least once
     train_s: float  # wall seconds of steps
     error: float  # on held-out samples, noise removed
-    held_out: int  # the number of these samples
+    held_out: int  # the number of their views, of which each is measured by one
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -106,7 +106,7 @@ def set_plain_ticks(axes: Axes) -> None:
 
 OF_CURVES = (
     "Held-out error of linear radiance × exposure, the targets' noise taken out, over what had been spent by then. "
-    "Hollow points were measured on fewer held-out samples than the last: the others had not been rendered."
+    "Hollow points were measured on fewer held-out views than the last: the others had not been rendered."
 )
 
 

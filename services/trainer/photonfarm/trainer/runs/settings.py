@@ -215,7 +215,7 @@ class TrainSettings(Frozen):
     catch_up: Annotated[int, Field(ge=0)] = 2  # further draws a round for a sample that has been drawn less than others
 
     validate_every: Count = 250  # steps
-    validation_samples: Count = 64  # at most so many held-out samples each time
+    validation_samples: Count = 64  # at most so many held-out views each time, by the first sample of each
     checkpoint_every: Count = 500  # steps
     poll_seconds: Positive = 1.0  # between looks at the store
     prefetch: Count = 2  # batches read ahead

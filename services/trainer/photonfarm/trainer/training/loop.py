@@ -295,7 +295,7 @@ class Session:
     def _validate(self) -> None:
         """Log the held-out error of the predicting network, and compare it with the best before."""
         self._compared = None
-        rows = self._stream.held_out[: self._settings.validation_samples]
+        rows = self._feed.first_of_views(self._stream.held_out)[: self._settings.validation_samples]
         with self._watch.on("validate"):
             self._stream.drop()
             held_out_batches = read_batches(self._feed, rows, self._settings.batch)

@@ -107,7 +107,7 @@ def check_clear(spec: SceneSpec, views: list[View], modification: Modification) 
         x, y, z = views[frame].origin.tolist()
         raise SpecError(
             f"camera path: in frame {frame} the camera at ({x:.3g}, {y:.3g}, {z:.3g}) stands {what}; lead the path "
-            "around it, or take view.free_space out of the spec"
+            "around it"
         )
     return views
 

@@ -110,6 +110,28 @@ class SceneFile:
         return self.emitting | self.shapeless | ({""} if self.has_unnamed_light else frozenset())
 
 
+TEXTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm")
+"""The names' ends of images that can be read here; Mitsuba alone reads EXR, HDR and PFM."""
+
+
+def check_textures(path: Path) -> None:
+    """Read the images that a readable scene names, as far as they end in `TEXTURES`; SpecError for one that is damaged.
+
+    Workers would find that only when all is planned.
+    """
+    from PIL import Image
+
+    for file in _named_files(parse(path), path):
+        if file.suffix.lower() in TEXTURES:
+            try:
+                with Image.open(file) as image:
+                    image.load()
+            except Image.DecompressionBombError:  # too large for a web page, and perhaps not for a scene
+                continue
+            except (OSError, SyntaxError, ValueError) as error:
+                raise SpecError(f"{path}: texture {file} cannot be read: {error}; put the whole file there") from error
+
+
 def _builtin(name: str, dark: str, emitting: str) -> SceneFile:
     revision = 1  # incremented whenever a built-in room changes, as its content is code and not a file
     lights = frozenset(emitting.split())

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import nearest, sentences
-from photonfarm.scene.files import BUILTIN, SceneFile
+from photonfarm.scene.files import BUILTIN, SceneFile, check_textures
 from photonfarm.scene.groups import Light
 from photonfarm.scene.spec import SceneSpec
 
@@ -82,8 +82,8 @@ def parse_with_lights(
     spec = spec.model_copy(update={"content": scene.digest})
     if spec.view.free_space is not None and spec.view.free_space.of != spec.free_space_digest:
         raise SpecError(
-            f"{where}: view.free_space: was measured for other geometry, groups or boxes of views; "
-            f"take it out, or run `photonfarm scene free-space {where} --write` again"
+            f"{where}: view.free_space: was measured for other files of the scene (meshes or textures), groups or "
+            f"boxes of views; `photonfarm scene free-space {where} --write` measures it again"
         )
     return spec, scene.lights
 
@@ -198,9 +198,11 @@ class NamedSpec:
 
     @classmethod
     def load(cls, name: str) -> Self:
-        """The spec of a name, as `load_spec` reads it; raises SpecError."""
+        """The spec of a name, as `load_spec` reads it, its textures checked; raises SpecError."""
         file = find_spec(name)
         spec, lights = _read(file)
+        if spec.scene.file is not None:
+            check_textures(find_scene(spec.scene.file, name, file.parent))
         is_found = any((folder / str(spec.scene.file)).is_file() for folder in _named_folders())
         folder = None if is_found else scene_folder(name, spec)
         return cls(name, spec, str(folder) if folder else None, file, lights)

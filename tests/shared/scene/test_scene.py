@@ -4,13 +4,14 @@ from typing import Any
 
 import pytest
 from click.testing import CliRunner
+from PIL import Image
 from pydantic import ValidationError
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import sentences
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.spec_loading import SCENES_VARIABLE, load_spec, parse_spec, scene_folder
+from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec, load_spec, parse_spec, scene_folder
 
 SCENE = """<scene version="3.0.0">
   <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>
@@ -167,6 +168,20 @@ def test_the_scene_id_follows_the_content_and_not_the_place(scenes: Path, tmp_pa
     assert parse_spec(changed(), where="spec", beside=moved).scene_id == here
     (moved / "small/meshes/floor.ply").write_bytes(b"another")
     assert parse_spec(changed(), where="spec", beside=moved).scene_id != here
+
+
+@pytest.mark.parametrize("name", ["wood.jpg", "wood.png"])
+def test_a_texture_that_is_cut_short_is_refused_before_anything_is_planned(
+    scenes: Path, tmp_path: Path, name: str
+) -> None:
+    texture, spec = scenes / "small" / name, tmp_path / "spec.toml"
+    spec.write_text(SPEC)
+    (scenes / "small/scene.xml").write_text(SCENE.replace("meshes/floor.ply", name))
+    Image.effect_noise((64, 64), 80).save(texture)
+    assert NamedSpec.load(str(spec)).spec.name == "small"
+    texture.write_bytes(texture.read_bytes()[:-400])
+    with pytest.raises(SpecError, match=f"{name} cannot be read"):
+        NamedSpec.load(str(spec))
 
 
 def test_a_changed_copy_has_an_id_of_its_own(scenes: Path) -> None:

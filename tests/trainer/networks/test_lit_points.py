@@ -1,6 +1,7 @@
 """Light that points of a closed surface send on: inside a sphere all of it is known in closed form."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,6 +91,20 @@ def test_a_lobe_is_as_wide_as_light_that_a_rough_metal_reflects(sphere, roughnes
     drawn = np.random.default_rng(0).random(100_000)
     slope = roughness * np.sqrt(-np.log1p(-drawn))  # tan of a normal's angle
     assert 1 - found[0] == pytest.approx(1 - np.cos(2 * np.arctan(slope)).mean(), rel=0.2)
+
+
+def test_points_that_turned_send_as_those_whose_base_stands_so(sphere) -> None:
+    """Each turned half around as in the base sends outwards, so nothing arrives; turned back, all does."""
+    layer, position = sphere
+    frame = frame_of(POINTS)
+    turned = LitPoints(replace(frame, appearance=-frame.appearance), POINTS)
+    turned.load_state_dict(layer.state_dict())
+    inwards = torch.cat([position, layer.normal[None]], dim=-1)
+    for found, expected in zip(diffuse(turned, inwards), diffuse(layer, position), strict=True):
+        torch.testing.assert_close(found, expected)
+    assert all(light.max() < 1e-6 for light in diffuse(turned, position))
+    sent = position[..., 2:].expand(-1, -1, 3)
+    torch.testing.assert_close(lobe(turned, inwards, 0.2, sent), lobe(layer, position, 0.2, sent))
 
 
 def test_more_points_than_are_lit_are_not_asked_for() -> None:

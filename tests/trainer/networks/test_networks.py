@@ -60,6 +60,18 @@ def test_relative_maxima_are_less_those_of_the_reference() -> None:
     assert not at_base[..., 32:].any()
 
 
+def test_constants_of_each_sample_are_those_of_all_where_they_are_the_same() -> None:
+    made = layer().double()
+    varying, fixed, present = torch.randn(3, 50, 3).double(), torch.randn(50, 6).double(), torch.rand(3, 50) < 0.7
+    torch.testing.assert_close(made(varying, fixed.expand(3, -1, -1), present), made(varying, fixed, present))
+    reference = torch.randn(50, 3).double()
+    of_all, of_each = (made(varying, each, present, reference) for each in (fixed, fixed.expand(4, -1, -1)))
+    torch.testing.assert_close(of_each, of_all)
+    other = torch.cat([fixed.expand(2, -1, -1), fixed[None] + 1, fixed[None]])
+    torch.testing.assert_close(made(varying, other, present, reference)[:2], of_all[:2])
+    assert (made(varying, other, present, reference)[2] - of_all[2]).abs().max() > 0.1
+
+
 def test_features_of_size_one_stay_so_before_any_step() -> None:
     """Features would shrink from torch's own start with each layer, far below the U-Net's other channels."""
     torch.manual_seed(0)

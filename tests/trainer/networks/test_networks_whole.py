@@ -110,6 +110,32 @@ def test_lit_points_send_nothing_by_paths_longer_than_the_images_have(make_sourc
     assert [bool(each.any()) for each in light[:2]] == [lit, lit]
 
 
+@pytest.mark.parametrize("emission", ["linear", "log"])
+@pytest.mark.parametrize("architecture", ["light_transport", "guided_transport"])
+def test_normals_and_emission_of_each_configuration_are_taken_for_the_base_s(
+    make_source, architecture: str, emission: str
+) -> None:
+    """At rest the image is that of a scene in which nothing turns; a network of one that does needs both."""
+    source = make_source(2)
+    geometry, cloud = source.base()
+    chosen = NetworkSettings(width=4, architecture=architecture, emission=emission)
+    frame = SceneFrame.of(source.spec, geometry, cloud, chosen)
+    still, inputs = build(chosen, frame, 0), batch_of(source, (0, 1), architecture).inputs
+    turning = build(chosen, replace(frame, changes=True), 0)
+    with pytest.raises(ValueError, match="inputs"):
+        image(turning, inputs)
+
+    def given(normal: np.ndarray, light: float) -> Inputs:
+        both = (torch.from_numpy(each).expand(2, -1, -1) for each in (normal, light * cloud.emission))
+        return replace(inputs, points=replace(inputs.points, **dict(zip(("normal", "emission"), both, strict=True))))
+
+    same(image(turning, given(cloud.normal, 1.0)), image(still, inputs))
+    as_modelled = SceneFrame.of(source.spec, geometry, replace(cloud, normal=-cloud.normal), chosen)
+    same(image(turning, given(-cloud.normal, 1.0)), image(build(chosen, as_modelled, 0), inputs))
+    darker = image(turning, given(cloud.normal, 0.5)) - image(turning, given(cloud.normal, 1.0))
+    assert bool(darker.abs().max() > 1e-6) == (architecture == "light_transport")
+
+
 def test_inputs_that_lack_what_a_network_needs_are_named(make_source) -> None:
     source = make_source(1)
     with pytest.raises(ValueError, match="inputs"):

@@ -22,6 +22,7 @@ from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.arrangement import Shot
+from photonfarm.scene.groups import Power, Turn
 from photonfarm.scene.modification import rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -37,14 +38,28 @@ PAGE = Path(__file__).resolve().parents[3] / "docs/what-if.md"
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four samples of the built-in room, each of another configuration."""
+    return rendered(load_spec("room"), tmp_path_factory.mktemp("predict"))
+
+
+@pytest.fixture(scope="module")
+def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same where furniture turns, and lamps change power and colour."""
     room = load_spec("room")
+    light = {"power": Power(min=0.5, max=2), "colour": ((1.0, 1.0, 1.0), (1.0, 0.5, 0.25))}
+    objects = tuple(each.model_copy(update={"turn": Turn(min=-180, max=180)}) for each in room.objects)
+    lights = tuple(each.model_copy(update=light) for each in room.lights)
+    return rendered(room.model_copy(update={"objects": objects, "lights": lights}), tmp_path_factory.mktemp("turning"))
+
+
+def rendered(room: SceneSpec, folder: Path) -> Path:
+    """A store of four small samples of a room."""
     changes = {
         "film": room.film.model_copy(update={"width": 24, "height": 16}),
         "transport": room.transport.model_copy(update={"half_spp": 1}),
         "photons": room.photons.model_copy(update={"paths": 512}),
         "points": 2048,
     }
-    store = Store(tmp_path_factory.mktemp("predict") / "store", create=True)
+    store = Store(folder / "store", create=True)
     scene = store.scene(store.plan(room.model_copy(update=changes), Request(modifications=4), shard_rows=4).scene_id)
     assert ShardRenderer(store, worker="test").render(scene.scene_id, 0)
     return Path(store.root)
@@ -64,11 +79,21 @@ def spec_of(store: Path) -> SceneSpec:
     return SceneReader(store, scene_id).spec
 
 
-@pytest.mark.parametrize("architecture", ["cnn", "light_transport_photons", "guided_transport_photons"])
+@pytest.mark.parametrize(
+    ("scene", "architecture"),
+    [
+        ("store", "cnn"),
+        ("store", "light_transport_photons"),
+        ("store", "guided_transport_photons"),
+        ("turning", "light_transport"),
+        ("turning", "guided_transport_photons"),
+    ],
+)
 def test_a_frame_is_the_image_of_the_stored_sample_of_its_configuration_and_view(
-    store: Path, tmp_path: Path, architecture: str
+    request: pytest.FixtureRequest, tmp_path: Path, scene: str, architecture: str
 ) -> None:
     """Up to the rounding of the store's types."""
+    store: Path = request.getfixturevalue(scene)
     run = trained(store, tmp_path / "run", architecture)
     opened = open_run(run, store)
     reader = SceneReader(store, opened.spec.scene_id)

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import click
+from click.core import ParameterSource
 
 from photonfarm.cli.options import (
+    arrangement_options,
     device_option,
     json_option,
     names_redis,
@@ -20,12 +22,15 @@ from photonfarm.cli.options import (
     request_options,
     retry_option,
     run_option,
+    start_options,
     store_option,
 )
 from photonfarm.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
+    from photonfarm.plan.chosen import Chosen
     from photonfarm.plan.request import Request
+    from photonfarm.scene.arrangement import Shot
 
 
 @click.group()
@@ -51,6 +56,8 @@ def scene_show(spec: str, as_json: bool) -> None:
 @click.command()
 @click.argument("spec")
 @request_options
+@start_options
+@arrangement_options()
 @store_option
 @redis_option
 @no_queue_option
@@ -79,41 +86,66 @@ def submit(
     dry_run: bool,
     no_measure: bool,
     as_json: bool,
+    row: int | None,
+    like: str | None,
+    asked: Shot,
     request: Request,
     shard_rows: int | None,
 ) -> None:
     """Plan samples of SPEC and queue them; what is planned already is not planned again.
 
     SPEC is a scene.toml, or the name of a ready one: room and cornell are built in, others need their files.
+
+    Where something is said to stand somewhere, or a camera, --passes of that one view are planned: all others stay at
+    rest, or as --row or --like has them.
     """
     from photonfarm.cli import show
     from photonfarm.farm import dry_run as dry
     from photonfarm.farm import submission
     from photonfarm.farm.devices import AUTO, DEVICE_VARIABLE, is_card_wanted
     from photonfarm.farm.hold_out_checks import find_hold_out_warning
+    from photonfarm.plan.chosen import Chosen
+    from photonfarm.scene.arrangement import Shot, find_doubts
     from photonfarm.scene.plausibility import warnings
     from photonfarm.scene.spec_loading import NamedSpec
+    from photonfarm.store.read.find import find_start
 
     named = NamedSpec.load(spec)
-    for warning in filter(None, (*warnings(named), find_hold_out_warning(named.spec, store, request))):
+    wanted: Request | Chosen = request
+    if (row, like, asked) == (None, None, Shot()):
+        doubts = [*filter(None, [find_hold_out_warning(named.spec, store, request)])]
+    else:
+        _refuse_given("modifications", "views", "seed")
+        start = find_start(store, named.spec.scene_id, row, like) or (None, None)
+        chosen = asked.apply(named.spec, start[0]), asked.view(named.spec, start[1])
+        doubts, wanted = find_doubts(named.spec, *chosen), Chosen.of(named.spec, *chosen, request.passes)
+    for warning in (*warnings(named), *doubts):
         click.echo(f"warning: {warning}", err=True)
     result: submission.Submission
     if dry_run:
         log = partial(click.echo, err=True)
-        result = dry.rehearse(named, store, request, measure=not no_measure, log=log, shard_rows=shard_rows)
+        result = dry.rehearse(named, store, wanted, measure=not no_measure, log=log, shard_rows=shard_rows)
     else:
         url = None if no_queue else redis_url
         result = submission.submit(
             named,
             store,
             url,
-            request,
+            wanted,
             retry=retry,
             shard_rows=shard_rows,
             on_card=is_card_wanted(os.environ.get(DEVICE_VARIABLE) or AUTO),
             halves_from=halves_from,
         )
     show.print_submission(result, as_json)
+
+
+def _refuse_given(*names: str) -> None:
+    """Raise UsageError for options of random samples, where a person chooses one."""
+    ctx = click.get_current_context()
+    for name in names:
+        if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            raise click.UsageError(f"--{name}: is of random samples; one view of one configuration is asked for")
 
 
 @click.command("top-up")

@@ -208,27 +208,42 @@ def request_options(command: Callable[..., Any]) -> Callable[..., Any]:
     )(with_request)
 
 
-def _parse_point(ctx: click.Context, param: click.Parameter, text: str | None) -> tuple[float, ...] | None:  # noqa: ARG001
-    if text is None:
-        return None
+def _parse_numbers(text: str, form: str) -> Any:
+    """Finite numbers as in the form X,Y,Z, or one of a form without a comma."""
     try:
         numbers = tuple(map(float, text.split(",")))
     except ValueError:
         numbers = ()
-    if len(numbers) != 3 or not all(map(math.isfinite, numbers)):
-        raise click.BadParameter(f"{text!r}: three finite numbers are required, as X,Y,Z.")
-    return numbers
+    count = form.count(",") + 1
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        wanted = "a finite number is" if count == 1 else f"{count} finite numbers are"
+        raise click.BadParameter(f"{text!r}: {wanted} required, as {form}.")
+    return numbers if count > 1 else numbers[0]
 
 
-def _parse_points(ctx: click.Context, param: click.Parameter, texts: tuple[str, ...]) -> dict[str, Any]:
-    """Points by the names before them."""
-    points: dict[str, Any] = {}
+def _parse_point(ctx: click.Context, param: click.Parameter, text: str | None) -> Any:  # noqa: ARG001
+    return None if text is None else _parse_numbers(text, "X,Y,Z")
+
+
+def _parse_named(ctx: click.Context, param: click.Parameter, texts: tuple[str, ...]) -> dict[str, Any]:  # noqa: ARG001
+    """Numbers by the names before them, in the form of the option's metavar."""
+    found: dict[str, Any] = {}
     for text in texts:
-        name, _, point = text.rpartition("=")
-        if not name or name in points:
-            raise click.BadParameter(f"{text!r}: NAME=X,Y,Z is required, and each name once.")
-        points[name] = _parse_point(ctx, param, point)
-    return points
+        name, _, numbers = text.rpartition("=")
+        if not name or name in found:
+            raise click.BadParameter(f"{text!r}: {param.metavar} is required, and each name once.")
+        found[name] = _parse_numbers(numbers, str(param.metavar).rpartition("=")[2])
+    return found
+
+
+NAMED = {
+    "--place": ("NAME=X,Y,Z", "Where a group stands, as `at` in the spec; repeatable."),
+    "--move": ("NAME=X,Y,Z", "By how much a group goes from where it stands; repeatable."),
+    "--turn": ("NAME=DEGREES", "How a group is turned about its up axis, from how it was modelled; repeatable."),
+    "--power": ("NAME=FACTOR", "By what a light's power is multiplied, 0 is dark; repeatable."),
+    "--colour": ("NAME=R,G,B", "By what a light's red, green and blue are multiplied, beside that; repeatable."),
+}
+"""Options of what changes, by groups' names: their forms and their help."""
 
 
 def arrangement_options(*, camera: bool = True) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -243,16 +258,17 @@ def arrangement_options(*, camera: bool = True) -> Callable[[Callable[..., Any]]
             asked = {name: options.pop(name) for name in kind.model_fields}
             return command(asked=kind.of(**asked), **options)
 
-        several: dict[str, Any] = {"multiple": True, "metavar": "NAME=X,Y,Z", "callback": _parse_points}
-        single: dict[str, Any] = {"metavar": "X,Y,Z", "callback": _parse_point}
+        point: dict[str, Any] = {"metavar": "X,Y,Z", "callback": _parse_point}
         of_camera = (
-            click.option("--camera", help="Where the camera stands.", **single),
-            click.option("--look-at", help="The point that it looks at.", **single),
+            click.option("--camera", help="Where the camera stands.", **point),
+            click.option("--look-at", help="The point that it looks at.", **point),
         )
         return combine_options(
-            click.option("--place", help="Where a group stands, as `at` in the spec; may be repeated.", **several),
-            click.option("--move", help="By how much a group goes from where it stands; may be repeated.", **several),
-            click.option("--without", multiple=True, metavar="NAME", help="A group to leave out; may be repeated."),
+            *(
+                click.option(name, metavar=form, multiple=True, callback=_parse_named, help=said)
+                for name, (form, said) in NAMED.items()
+            ),
+            click.option("--without", multiple=True, metavar="NAME", help="A group to leave out; repeatable."),
             *(of_camera if camera else ()),
         )(with_arrangement)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from photonfarm.core.errors import BackendError, StoreError
 from photonfarm.core.processes import can_render, command, usable_cores
 from photonfarm.farm.submission import Submission
+from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import Extent, Request
 from photonfarm.plan.sample_costs import Allocation, CostModel, SampleCosts
 from photonfarm.scene.spec_loading import NamedSpec
@@ -54,7 +55,7 @@ class DryRun(Submission):
 def rehearse(
     named: NamedSpec,
     store: str | Path,
-    request: Request,
+    request: Request | Chosen,
     *,
     measure: bool,
     log: Callable[[str], None],
@@ -63,8 +64,9 @@ def rehearse(
     """What `submission.submit` would plan.
 
     With `measure`, also its cost, and how the same cost would be spent best; `log` is called with the reason if the
-    cost is unknown. Nothing is suggested if some samples of the request are planned already: another half_spp makes
-    another scene, in which all of them would be rendered again. Raises SpecError and StoreError as `submit` does.
+    cost is unknown. Nothing is suggested for what a person chose, and if some samples of the request are planned
+    already: another half_spp makes another scene, in which all of them would be rendered again. Raises SpecError and
+    StoreError as `submit` does.
     """
     spec = named.spec
     if is_vacant(store):
@@ -85,7 +87,7 @@ def rehearse(
     spp, static = 2 * spec.transport.half_spp, not spec.groups
     core_s = costs.seconds(spp, configurations=extent.configurations, views=extent.views, samples=new)
     counted = replace(counted, costs=costs, core_s=core_s, wall_s=core_s / cores)
-    if known:
+    if known or isinstance(request, Chosen):
         return counted
     asked = Allocation(request.modifications, request.views_per_modification, request.passes, spp)
     if static:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from photonfarm.core.errors import QueueError, SpecError, store_errors
 from photonfarm.core.models import differing
+from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import SHARD_ROWS, Request
 from photonfarm.plan.top_up import TopUp, spp_per_pass
 from photonfarm.queue.connection import connect
@@ -60,7 +61,9 @@ def estimate_sample_seconds(spec: SceneSpec, *, on_card: bool = False) -> float:
     return each_s + paths * max(transport.max_depth, 1) / DEPTH / paths_per_s
 
 
-def choose_rows_per_job(spec: SceneSpec, request: Request, workers: int = WORKERS, *, on_card: bool = False) -> int:
+def choose_rows_per_job(
+    spec: SceneSpec, request: Request | Chosen, workers: int = WORKERS, *, on_card: bool = False
+) -> int:
     """The samples of a job for a scene whose first request this is: some seconds of work, and several jobs a worker.
 
     Jobs of many seconds keep workers idle at the end, and show nothing for long; jobs of less than a second cost more
@@ -105,7 +108,7 @@ def submit(
     named: NamedSpec,
     store: str | Path,
     redis_url: str | None,
-    request: Request,
+    request: Request | Chosen,
     *,
     retry: bool = False,
     shard_rows: int | None = None,

@@ -248,11 +248,31 @@ def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_jo
     views = sample_views(
         spec, [keys[m] for m in of_view.tolist()], request.seed, index.tolist(), modifications[of_view]
     )
+    numbers = {"first_job": first_job, "shard_rows": shard_rows}
+    return expand_views(spec, modifications, of_view, views, request.passes, known, density=1.0, **numbers)
+
+
+def expand_views(
+    spec: SceneSpec,
+    modifications: F32,
+    of_view: NDArray[np.int64],
+    views: F32,
+    passes: int,
+    known: PlannedContent,
+    *,
+    density: float,
+    first_job: int,
+    shard_rows: int,
+) -> Expansion:
+    """The rows of what is new of so many passes of views (V, 6), in the order of their modifications (V,) of (M, G, 4).
+
+    `density` is that of all of them, as `PlannedRows` has it.
+    """
     modification_row = _look_up(known.modifications, contents(modifications))
     view_row = _look_up(known.views, view_contents(modification_row[of_view], views))
 
-    view = np.repeat(np.arange(len(views)), request.passes)
-    pass_ = np.tile(np.arange(request.passes, dtype=np.int32), len(views))
+    view = np.repeat(np.arange(len(views)), passes)
+    pass_ = np.tile(np.arange(passes, dtype=np.int32), len(views))
     keys = sample_keys(spec.radiance_id, modifications[of_view[view]], views[view], pass_)
     distinct = dict(zip(reversed(keys), range(len(view) - 1, -1, -1), strict=True))  # the first one stays
     new = np.array(sorted(i for key, i in distinct.items() if key not in known.samples), np.int64)
@@ -265,6 +285,7 @@ def expand(spec: SceneSpec, request: Request, known: PlannedContent, *, first_jo
         view[new],
         pass_[new],
         np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
+        *(np.full(len(vectors), density, np.float32) for vectors in (modifications, views)),
     )
     planned = len(distinct) - len(new)
     return expand_samples(candidates, first_job=first_job, shard_rows=shard_rows, known=planned)

@@ -6,8 +6,7 @@ This module alone turns names into modification vectors, and back. The command l
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from collections.abc import Iterator
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -15,13 +14,12 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, FiniteFloat, ValidationError
 
 from photonfarm.core.errors import SpecError
-from photonfarm.core.models import Frozen, nearest, sentences
-from photonfarm.scene.groups import Box
+from photonfarm.core.models import Factor, Frozen, nearest, sentences
+from photonfarm.scene.groups import Box, Light, Movable
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec, ViewSpec
 from photonfarm.scene.view import View, are_in_free_space, are_in_group, sample_view
 
-NEVER_SEEN = "the network never saw that"
 SLACK = 1e-4
 """How far beyond a box nothing is said, in scene units: float32 has no more digits."""
 
@@ -34,12 +32,29 @@ def _as_list(value: Any) -> Any:
 Point = Annotated[tuple[FiniteFloat, FiniteFloat, FiniteFloat], BeforeValidator(_as_list)]
 
 
+COLUMNS_OF = {
+    "place": slice(0, 3),
+    "move": slice(0, 3),
+    "without": slice(0, 3),
+    "turn": slice(4, 5),
+    "power": slice(5, 6),
+    "colour": slice(6, 9),
+}
+"""The columns of the modification vector that each field of an arrangement is about; column 3 says what is there."""
+
+BESIDE_PLACE = ("turn", "power", "colour")
+"""The fields that a scene may lack."""
+
+
 class Arrangement(Frozen):
     """What is changed of a configuration, by the names of groups; all others stay."""
 
     place: dict[str, Point] = Field(default_factory=dict)  # where a group's `at` shall stand, scene units
     move: dict[str, Point] = Field(default_factory=dict)  # by how much it goes from where it stands
     without: tuple[str, ...] = ()  # groups that are removed
+    turn: dict[str, FiniteFloat] = Field(default_factory=dict)  # from how it was modelled, degrees about the up axis
+    power: dict[str, Factor] = Field(default_factory=dict)  # factor on what a light emits
+    colour: dict[str, tuple[Factor, Factor, Factor]] = Field(default_factory=dict)  # further ones, on red, green, blue
 
     @classmethod
     def of(cls, **values: Any) -> Self:
@@ -52,59 +67,75 @@ class Arrangement(Frozen):
     @classmethod
     def from_modification(cls, spec: SceneSpec, modification: Modification) -> Self:
         """What a configuration changes of the scene at rest."""
-        places: dict[str, Any] = {}
+        found: dict[str, dict[str, Any]] = {key: {} for key in ("place", *BESIDE_PLACE)}
         without = []
-        for group, there, moved in zip(spec.groups, modification.present, modification.translation, strict=True):
-            if not there:
+        for group, now, before in zip(spec.groups, modification.vector, rest(spec).vector, strict=True):
+            if not now[3]:
                 without.append(group.name)
-            elif moved.any():
-                places[group.name] = tuple(map(_round_position, group.at, moved))
-        return cls(place=places, without=tuple(without))
+                continue
+            if now[:3].any():
+                found["place"][group.name] = tuple(map(_round_position, group.at, now[:3]))
+            for key in BESIDE_PLACE:
+                if (now[COLUMNS_OF[key]] != before[COLUMNS_OF[key]]).any():
+                    value = _shorten(now[COLUMNS_OF[key]])
+                    found[key][group.name] = value[0] if len(value) == 1 else tuple(value)
+        return cls(**found, without=tuple(without))
 
     def apply(self, spec: SceneSpec, start: Modification | None = None) -> Modification:
         """The configuration that this makes of another one, by default of the scene at rest.
 
-        A group that is placed or moved is there, even if it was removed. Raises SpecError for a name that no group has,
-        and for a group that is named twice.
+        A group that is named is there, even if it was removed, unless it is left out. Raises SpecError for a name that
+        no group has, for a group that is named twice, and for a change that the scene does not know.
         """
-        of, before = {group.name: g for g, group in enumerate(spec.groups)}, rest(spec) if start is None else start
-        made = replace(before, translation=before.translation.copy(), present=before.present.copy())
-        names = [*self.place, *self.move, *self.without]
-        for name in names:
-            if name not in of:
-                raise SpecError(f"{name!r} is no movable group of {spec.name}; nearest: {nearest(name, of)}")
-            if names.count(name) > 1:
+        made = (rest(spec) if start is None else start).vector.copy()
+        number = {group.name: g for g, group in enumerate(spec.groups)}
+        for name, key in self._list_named():
+            if name not in number:
+                raise SpecError(f"{name!r} is no movable group of {spec.name}; nearest: {nearest(name, number)}")
+            keys = [other for named, other in self._list_named() if named == name]
+            if (len(keys) > 1 and {"without"} & {*keys}) or {"place", "move"} <= {*keys}:
                 raise SpecError(f"{name!r} is named twice; place it, move it or leave it out")
-        for name, position in self.place.items():
-            made.translation[of[name]] = np.array(position) - np.array(spec.groups[of[name]].at)
-        for name, step in self.move.items():
-            made.translation[of[name]] += np.array(step, np.float32)
-        for name in (*self.place, *self.move):
-            made.present[of[name]] = True
-        for name in self.without:  # zeroed, so that equal configurations have equal keys
-            made.translation[of[name]], made.present[of[name]] = 0, False
-        return made
+            g = number[name]
+            if key == "without":  # at rest, so that equal configurations have equal keys
+                made[g] = rest(spec).vector[g]
+            elif key == "move":
+                made[g, :3] += np.array(self.move[name], np.float32)
+            elif key == "place":
+                made[g, :3] = np.array(self.place[name]) - np.array(spec.groups[g].at)
+            elif not spec.further_changes:
+                raise SpecError(f"{key} of {name!r}: nothing in {spec.name} turns or changes its light, by its spec")
+            else:
+                made[g, COLUMNS_OF[key]] = getattr(self, key)[name]
+            made[g, 3] = key != "without"
+        return Modification.from_vector(made)
 
     def fits(self, spec: SceneSpec, modifications: NDArray[np.float32]) -> NDArray[np.float64]:
-        """How far configurations (N, G, C) are from this, by the farthest named group, (N,); inf if one is not there.
+        """How far configurations (N, G, C) are from this, by the farthest value that is named, (N,).
 
-        Groups that are not named may be anywhere. Raises SpecError as `apply` does.
+        It is infinite where a group is not there and should be, or the other way. Groups that are not named may be
+        anywhere. Raises SpecError as `apply` does.
         """
-        wanted, of = self.apply(spec), {group.name: g for g, group in enumerate(spec.groups)}
-        named = [of[name] for name in (*self.place, *self.move, *self.without)]
-        off = modifications[:, named, :3].astype(np.float64) - wanted.translation[named]
-        distance: NDArray[np.float64] = np.linalg.norm(off, axis=-1).max(axis=1, initial=0)
-        there = ((modifications[:, named, 3] != 0) == wanted.present[named]).all(axis=1)
-        return np.where(there, distance, np.inf)
+        wanted, distance = self.apply(spec).vector, np.zeros(len(modifications))
+        number = {group.name: g for g, group in enumerate(spec.groups)}
+        for name, key in self._list_named():
+            g = number[name]
+            off = modifications[:, g, COLUMNS_OF[key]].astype(np.float64) - wanted[g, COLUMNS_OF[key]]
+            fits = (modifications[:, g, 3] != 0) == (wanted[g, 3] != 0)
+            distance = np.maximum(distance, np.where(fits, np.linalg.norm(off, axis=1), np.inf))
+        return distance
 
     def describe(self) -> str:
         """The arrangement as options of the command line; "" if nothing is changed."""
-        placed = [f"--{key} {name}={_text(point)}" for key in ("place", "move") for name, point in self._of(key)]
-        return " ".join([*placed, *(f"--without {name}" for name in self.without)])
+        words = []
+        for name, key in self._list_named():
+            said = "" if key == "without" else f"={_text(np.atleast_1d(getattr(self, key)[name]))}"
+            words.append(f"--{key} {name}{said}")
+        return " ".join(words)
 
-    def _of(self, key: str) -> Iterator[tuple[str, tuple[float, ...]]]:
-        values: Mapping[str, tuple[float, ...]] = getattr(self, key)
-        yield from values.items()
+    def _list_named(self) -> Iterator[tuple[str, str]]:
+        """The names, each with the field that it is in."""
+        for key in COLUMNS_OF:
+            yield from ((name, key) for name in getattr(self, key))
 
 
 class Shot(Arrangement):
@@ -179,16 +210,15 @@ def find_doubts(
     Each is a sentence. The renderer's `look_closer` finds what needs the scene's surfaces.
     """
     doubts = []
-    for group, there, moved in zip(spec.groups, modification.present, modification.translation, strict=True):
-        position = tuple(map(_round_position, group.at, moved))
-        if not there and group.removal_probability == 0:
-            doubts.append(f"{group.name} is removed, and in the spec it never is: {NEVER_SEEN}")
-        elif there and group.removal_probability == 1:
-            doubts.append(f"{group.name} is there, and in the spec it never is: {NEVER_SEEN}")
-        elif there and moved.any() and not _holds(group.box, position):
-            doubts.append(f"{group.name} stands at {_text(position)}, outside its box {_span(group.box)}: {NEVER_SEEN}")
+    for group, now, before in zip(spec.groups, modification.vector, rest(spec).vector, strict=True):
+        if not now[3] and group.removal_probability == 0:
+            doubts.append(f"{group.name} is removed, and in the spec it never is")
+        elif now[3] and group.removal_probability == 1:
+            doubts.append(f"{group.name} is there, and in the spec it never is")
+        elif now[3] and not np.array_equal(now, before):
+            doubts += _find_beyond(group, now)
     if trained_fov_deg not in (None, spec.view.fov_deg):
-        doubts.append(f"the field of view is {spec.view.fov_deg:g}°, not {trained_fov_deg:g}°: {NEVER_SEEN}")
+        doubts.append(f"the field of view is {spec.view.fov_deg:g}°, not {trained_fov_deg:g}°")
     if view is None:
         return doubts
     for what, point, box in (
@@ -196,9 +226,24 @@ def find_doubts(
         ("the camera looks", view.target, spec.view.look_at),
     ):
         if not _holds(box, point):
-            doubts.append(f"{what} at {_text(_shorten(point))}, outside the spec's box {_span(box)}: {NEVER_SEEN}")
+            doubts.append(f"{what} at {_text(_shorten(point))}, outside the spec's box {_span(box)}")
     obstacle = next(find_obstacles(spec, [view], modification), None)
-    return doubts if obstacle is None else [*doubts, f"the camera stands {obstacle[1]}: {NEVER_SEEN}"]
+    return doubts if obstacle is None else [*doubts, f"the camera stands {obstacle[1]}"]
+
+
+def _find_beyond(group: Movable, now: NDArray[np.float32]) -> Iterator[str]:
+    """What of a group that is there is beyond its spec."""
+    position = tuple(map(_round_position, group.at, now[:3]))
+    if now[:3].any() and not _holds(group.box, position):
+        yield f"{group.name} stands at {_text(position)}, outside its box {_span(group.box)}"
+    if len(now) > COLUMNS_OF["turn"].start:
+        power, colours = (group.power, group.colour) if isinstance(group, Light) else (None, ())
+        for what, value, usual, limits in (("turn", now[4], 0, group.turn), ("power", now[5], 1, power)):
+            low, high = (limits.min, limits.max) if limits else (usual, usual)
+            if not low - SLACK <= value <= high + SLACK:
+                yield f"{what} of {group.name} is {value:g}, outside {low:g} to {high:g}"
+        if not any(np.allclose(now[6:], colour) for colour in colours or [(1, 1, 1)]):
+            yield f"colour of {group.name} is {_text(_shorten(now[6:]))}, which is none of its spec"
 
 
 def _holds(box: Box, point: Any) -> bool:

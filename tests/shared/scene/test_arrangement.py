@@ -6,6 +6,7 @@ import pytest
 from photonfarm.core.errors import SpecError
 from photonfarm.core.statistics import Estimate, jackknife
 from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot, with_fov
+from photonfarm.scene.groups import Power, Turn
 from photonfarm.scene.modification import rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -48,6 +49,45 @@ def test_every_configuration_is_said_by_names_so_that_the_same_bits_come_of_it(s
     placed = Shot.of(place={"sofa": (0.9, 0, -0.5)}, without=["vase"], camera=(1.6, 1, 1), look_at=(0, 0.1, 0))
     words = "--place sofa=0.9,0,-0.5 --without vase --camera 1.6,1,1 --look-at 0,0.1,0"
     assert describe_shot(spec, placed.apply(spec), placed.view(spec)) == words
+
+
+@pytest.fixture(scope="module")
+def turning(spec: SceneSpec) -> SceneSpec:
+    """The room, whose sofa turns and one of whose lights changes."""
+    objects = [
+        group.model_copy(update={"turn": Turn(min=-30, max=60)}) if group.name == "sofa" else group
+        for group in spec.objects
+    ]
+    light = spec.lights[0].model_copy(update={"power": Power(min=0.5, max=2), "colour": ((1, 0.8, 0.5), (1, 1, 1))})
+    return spec.model_copy(update={"objects": tuple(objects), "lights": (light, *spec.lights[1:])})
+
+
+def test_angles_powers_and_colours_have_names_too(spec: SceneSpec, turning: SceneSpec) -> None:
+    for index in range(100):
+        modification = sample_modification(turning, 3, index)
+        said = Arrangement.from_modification(turning, modification)
+        np.testing.assert_array_equal(said.apply(turning).vector, modification.vector)
+        assert not find_doubts(turning, modification)
+        (distance,) = said.fits(turning, modification.vector[None])
+        assert distance == 0
+    asked = {"turn": {"sofa": 30}, "power": {"ceiling-light-1": 2}, "colour": {"ceiling-light-1": (1, 0.8, 0.5)}}
+    made = Arrangement.of(**asked, move={"sofa": (0, 0, 0.1)}).apply(turning)
+    np.testing.assert_array_equal(made.turn[number(spec, "sofa")], 30)
+    np.testing.assert_allclose(made.light[number(spec, "ceiling-light-1")], [2, 1.6, 1])
+    words = "--place sofa=1.85,0,0.4 --turn sofa=30 --power ceiling-light-1=2 --colour ceiling-light-1=1,0.8,0.5"
+    assert Arrangement.from_modification(turning, made).describe() == words
+    (off,) = Arrangement.of(turn={"sofa": 25}).fits(turning, made.vector[None])
+    assert off == 5
+    beyond = {
+        "turn": {"sofa": 90, "lamp": 5},
+        "power": {"ceiling-light-1": 3},
+        "colour": {"ceiling-light-1": (0, 1, 0)},
+    }
+    assert len(find_doubts(turning, Arrangement.of(**beyond).apply(turning))) == 4
+    gone = Arrangement.of(without=["sofa"]).apply(turning, made)
+    assert gone.turn[number(spec, "sofa")] == 0
+    with pytest.raises(SpecError, match="nothing in room turns"):
+        Arrangement.of(turn={"sofa": 30}).apply(spec)
 
 
 @pytest.mark.parametrize(

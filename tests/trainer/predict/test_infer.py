@@ -218,8 +218,9 @@ def test_the_verb_shows_a_row_or_a_file_of_buffers(
         (["--orbit", "0"], "'--orbit'"),
         (["--place", "sofa"], "NAME=X,Y,Z"),
         (["--place", "sofa=1,0,0", "--place", "sofa=2,0,0"], "each name once"),
-        (["--camera", "1,nan,0"], "three finite numbers"),
-        (["--move", "sofa=1,0"], "three finite numbers"),
+        (["--camera", "1,nan,0"], "3 finite numbers"),
+        (["--move", "sofa=1,0"], "3 finite numbers"),
+        (["--turn", "sofa=left"], "a finite number is required, as DEGREES"),
         (["--fov", "171"], "'--fov'"),
     ],
 )

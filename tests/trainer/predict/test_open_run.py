@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -301,7 +302,7 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
     assert {Path(line).name for line in done.stdout.split()} == names
     said = json.loads((tmp_path / "out/frame.json").read_text())
     (scene_id,) = Store(store).scene_ids()
-    start, view = find_start(Store(store), scene_id, 1, None) or pytest.fail("row 1 is planned")
+    start, view = find_start(store, scene_id, 1, None) or pytest.fail("row 1 is planned")
     assert "vase" in said["without"]
     assert said["camera"] == [-1.9, 1.6, 1.7]
     np.testing.assert_allclose(said["look_at"], view.target, rtol=1e-6)
@@ -312,6 +313,13 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
         truth = (layers["A"] + layers["B"]) / 2
         np.testing.assert_allclose(layers["truth"], truth, rtol=1e-6)
         np.testing.assert_allclose(layers["difference"], layers["prediction"] - truth, atol=1e-6)
+    other = tmp_path / "other"
+    shutil.copytree(store, other)
+    place[2] = str(other)
+    for words in ("planned as a sample", "planned as a sample before"):
+        again = CliRunner().invoke(umbrella, [*place, *asked[:-2], "--store-it"], catch_exceptions=False)
+        assert words in again.stderr.splitlines()
+    assert len(Store(other).scene(scene_id).plans()) == 2
 
 
 def test_the_lines_of_the_page_make_a_frame_and_its_truth(

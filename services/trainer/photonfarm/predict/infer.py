@@ -6,6 +6,7 @@ buffers` has written them to a file.
 
 from __future__ import annotations
 
+import logging
 import statistics
 import subprocess
 import time
@@ -24,8 +25,9 @@ from photonfarm.core.errors import IncompleteError, SpecError, StoreError, store
 from photonfarm.core.pictures import enlarge, write_png
 from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
+from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.hold_out import rows_held_out
-from photonfarm.predict.opened_run import OpenRun
+from photonfarm.predict.opened_run import OpenRun, never_seen
 from photonfarm.renderer.jobs.truth import Amount, write_beside
 from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot
 from photonfarm.scene.camera_path import Frames
@@ -33,6 +35,7 @@ from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import Sample, SceneReader, Store
+from photonfarm.store.model.lease import announce_work
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import require
@@ -40,6 +43,8 @@ from photonfarm.trainer.predictors.evaluation import choose_error
 from photonfarm.trainer.predictors.trained import TrainedRun
 
 NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
+log = logging.getLogger(__name__)
+
 FFMPEG = "imageio_ffmpeg"
 """The package with ffmpeg, of the extra `video`."""
 
@@ -63,11 +68,13 @@ def show_frame(
     out: Path,
     amount: Amount | None,
     load_s: float,
+    *,
+    store_it: bool = False,
 ) -> InferResult:
     """Write the network's image of what is asked for, and with an `amount` the truth beside it: as `write_beside`.
 
     frame.json says what stands where, by names, what the network never saw, seconds, and the error with its interval.
-    `load_s` is what loading took.
+    `load_s` is what loading took. With `store_it`, the view is planned as a sample, which workers find by themselves.
     """
     with torch.no_grad():
         frame = opened.predict(*(start or (None, None)), **dict(asked))
@@ -94,6 +101,11 @@ def show_frame(
             f"{truth.spp} samples per pixel"
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
+    if store_it:
+        stored = opened.store.scene(opened.scene_id)
+        with announce_work(stored.storage, opened.scene_id, "infer", log.warning):
+            planned = stored.plan(Chosen.of(*shot))
+        said.append("planned as a sample" if planned.new else "planned as a sample before")
     files = write_beside(out, image, truth, opened.spec.exposure, about)
     return InferResult(tuple(files), "\n".join(said), tuple(about["doubts"]))
 
@@ -163,8 +175,8 @@ def show_path(
         images = ((opened.predict(modification, view).radiance * opened.spec.exposure).cpu().numpy() for view in views)
         shown = _show_images(images, len(views), out, fps, "for what the network reads and the network")
     stands = Arrangement.from_modification(opened.spec, modification)
-    doubts = find_doubts(opened.spec, modification)
-    return InferResult(shown.files, f"{stands.describe() or 'at rest'}: {shown.sentence}", tuple(doubts))
+    doubts = never_seen(find_doubts(opened.spec, modification))
+    return InferResult(shown.files, f"{stands.describe() or 'at rest'}: {shown.sentence}", doubts)
 
 
 def _show_images(images: Iterator[F32], count: int, out: Path, fps: float, what: str) -> InferResult:

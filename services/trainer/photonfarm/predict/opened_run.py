@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,8 +126,8 @@ class OpenRun:
         images = [self._images(each)[0] for each in of_half]
         radiance = (images[0] if len(images) == 1 else torch.stack(images).mean(0)) / self._exposure
         seconds = {"edit": staged - began, "inputs": given - staged, "network": time.perf_counter() - given}
-        doubts = find_doubts(self.spec, configuration, view, self._trained_fov)
-        return Frame(radiance, of_half[0], configuration, view, seconds, tuple(doubts))
+        doubts = never_seen(find_doubts(self.spec, configuration, view, self._trained_fov))
+        return Frame(radiance, of_half[0], configuration, view, seconds, doubts)
 
     def truth(
         self,
@@ -148,12 +148,12 @@ class OpenRun:
 
     def look_closer(
         self, configuration: Modification | None = None, view: View | None = None, **asked: Any
-    ) -> list[str]:
+    ) -> tuple[str, ...]:
         """What stands in walls, or beyond them, and what the camera is inside of, each as a sentence; as `predict`."""
         from photonfarm.renderer.scene.surroundings import look_closer
 
         configuration, view = self._stage(configuration, view, asked)
-        return look_closer(self._scene, configuration, view)
+        return never_seen(look_closer(self._scene, configuration, view))
 
     def _stage(
         self, configuration: Modification | None, view: View | None, asked: Mapping[str, Any]
@@ -247,6 +247,11 @@ class OpenRun:
             number = torch.full((1,), float(len(images)), device=self._device)
             variance = self._tensor(images.mean(axis=-1).var(axis=0, ddof=1) / len(images))
         return NoisyColour(self._tensor(images.mean(axis=0) * kept[..., None]), self._tensor(kept), number, variance)
+
+
+def never_seen(doubts: Iterable[str]) -> tuple[str, ...]:
+    """Doubts as those of a network."""
+    return tuple(f"{doubt}: the network never saw that" for doubt in doubts)
 
 
 def take_torch(values: Any) -> Tensor:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     metavar="SPP|SECONDSs",
     help="Render it by bdpt beside the network's image, with so many samples per pixel (256) or for so long (20s).",
 )
+@click.option("--store-it", is_flag=True, help="Plan it as a sample, too; else the store stays as it is.")
 @click.option(
     "--camera-path",
     "path",
@@ -54,6 +55,7 @@ def infer(
     asked: Shot,
     fov: float | None,
     truth: str | None,
+    store_it: bool,
     path: Path | None,
     orbit: int | None,
     buffers: Path | None,
@@ -72,19 +74,21 @@ def infer(
     from photonfarm.renderer.jobs.truth import Amount
     from photonfarm.scene.arrangement import Arrangement, Shot
     from photonfarm.scene.camera_path import CameraPath, Frames
-    from photonfarm.store import Store
     from photonfarm.store.read.find import find_start
     from photonfarm.trainer.predictors.trained import TrainedRun
 
     began = time.perf_counter()
     kinds = {"--camera-path": path, "--orbit": orbit, "--buffers": buffers}
     given = [name for name, value in kinds.items() if value is not None]
-    of_frame = {"--camera": asked.camera, "--look-at": asked.look_at, "--truth": truth, "--fov": fov}
+    of_camera = {"--camera": asked.camera, "--look-at": asked.look_at, "--fov": fov}
+    of_frame = {**of_camera, "--truth": truth, "--store-it": store_it or None}
     alone = [name for name, value in of_frame.items() if value is not None]
     arranged = like is not None or asked != Shot() or bool(alone)
     if len(given) > 1 or (given and alone) or (buffers is not None and (arranged or row is not None)):
         others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
         raise click.UsageError(f"{' and '.join(others)} exclude each other")
+    if store_it and fov is not None:
+        raise click.UsageError("--store-it and --fov exclude each other: samples have the spec's field of view")
     amount = None if truth is None else Amount.parse(truth)
     along = orbit or (CameraPath.load(path) if path else None)
     if isinstance(along, CameraPath):
@@ -105,11 +109,12 @@ def infer(
         result = shows.show_sample(store, trained, row, out, device)
     else:
         require_renderer(trained)
-        start = find_start(Store(store), trained.scene_id, row, like)
+        start = find_start(store, trained.scene_id, row, like)
         asked.apply(trained.source(store).spec)  # a wrong name is refused before anything is loaded
         with tell_waiting(say, f"rendering {trained.scene_id}"):
             opened = OpenRun(trained, store, device, fov)
-            result = shows.show_frame(opened, asked, start, out, amount, time.perf_counter() - began)
+            load_s = time.perf_counter() - began
+            result = shows.show_frame(opened, asked, start, out, amount, load_s, store_it=store_it)
     for doubt in result.doubts:
         say(f"warning: {doubt}")
     for file in result.files:

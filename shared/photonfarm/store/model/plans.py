@@ -18,6 +18,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from photonfarm.core.errors import CorruptError, SpecError, store_errors
 from photonfarm.core.keys import Key
 from photonfarm.core.models import sentences
+from photonfarm.plan.chosen import Chosen, expand_chosen
 from photonfarm.plan.request import UNUSED, Expansion, Joined, PlannedContent, PlannedRows, Request, expand
 from photonfarm.plan.top_up import TopUp, expand_top_up
 from photonfarm.scene.modification import Modification
@@ -36,7 +37,7 @@ FORGOTTEN = "forgotten."
 INPUTS = [field.name for field in fields(PlannedRows)]
 """The names of a plan's arrays of inputs."""
 
-AnyRequest: TypeAlias = Request | TopUp | Joined
+AnyRequest: TypeAlias = Request | Chosen | TopUp | Joined
 
 _REQUEST: TypeAdapter[AnyRequest] = TypeAdapter(Annotated[AnyRequest, Field(discriminator="kind")])
 
@@ -155,6 +156,8 @@ def expand_request(
     known = content(before)
     if isinstance(request, TopUp):
         return expand_top_up(spec, request, known, first_job=first_job, shard_rows=shard_rows)
+    if isinstance(request, Chosen):
+        return expand_chosen(spec, request, known, first_job=first_job, shard_rows=shard_rows)
     return expand(spec, request, known, first_job=first_job, shard_rows=shard_rows)
 
 

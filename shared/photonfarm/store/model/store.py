@@ -13,10 +13,12 @@ from typing import TypeVar
 
 from photonfarm.core.errors import CorruptError, SpecError, StoreError, store_errors
 from photonfarm.core.models import differing
-from photonfarm.plan.request import SHARD_ROWS, PlannedContent, Request, expand
+from photonfarm.plan.chosen import Chosen
+from photonfarm.plan.request import SHARD_ROWS, Request
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store.format import declarations
 from photonfarm.store.io.storage import FORMAT_FILE, STRAY_AGE_S, TMP, Storage, open_storage, put_json
+from photonfarm.store.model.plans import expand_request
 from photonfarm.store.model.scene_store import (
     SCENES,
     PlanResult,
@@ -116,7 +118,7 @@ class Store:
     def plan(
         self,
         spec: SceneSpec,
-        request: Request,
+        request: Request | Chosen,
         *,
         shard_rows: int | None = None,
         usual_rows: int = SHARD_ROWS,
@@ -131,7 +133,7 @@ class Store:
         if halves_from is not None:
             self._check_same_radiance(spec, halves_from)
         if dry_run and not self.has_scene(spec.scene_id):
-            expansion = expand(spec, request, PlannedContent(), first_job=0, shard_rows=shard_rows or usual_rows)
+            expansion = expand_request(spec, request, [], first_job=0, shard_rows=shard_rows or usual_rows)
             return PlanResult(spec.scene_id, None, expansion.new, expansion.known, 0, expansion.extent)
         scene = SceneStore(self.storage, spec.scene_id, spec) if dry_run else self.add(spec)
         return scene.plan(

@@ -121,14 +121,14 @@ def find_samples(store: Store, scene_ids: Sequence[str], query: Query, *, limit:
     return Matches(sum(len(match.rows) for _, match in matches), described, min(nearest, default=None))
 
 
-def find_start(store: Store, scene_id: str, row: int | None, like: str | None) -> tuple[Modification, View] | None:
+def find_start(store: str | Path, scene_id: str, row: int | None, like: str | None) -> tuple[Modification, View] | None:
     """What the sample in a row shows, or the first one of a configuration's, a view's or a sample's key; None for none.
 
     Raises StoreError if no plan of the scene has it, SpecError for text that is no key.
     """
     if row is None and like is None:
         return None
-    found = find_samples(store, [scene_id], Query.of(row=row, like=like), limit=1).samples
+    found = find_samples(Store(store), [scene_id], Query.of(row=row, like=like), limit=1).samples
     if not found:
         named = " and ".join([f"--row {row}"] * (row is not None) + [f"--like {like}"] * (like is not None))
         raise StoreError(f"{named}: no plan of scene {scene_id} has such a sample; `photonfarm store find` shows them")

@@ -43,7 +43,7 @@ def find_views(
     """
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
-    start = find_start(opened, stored.scene_id, row, like)
+    start = find_start(store, stored.scene_id, row, like)
     configuration = start[0] if start else None
     if isinstance(path, CameraPath):
         configuration = path.apply(stored.spec, configuration)

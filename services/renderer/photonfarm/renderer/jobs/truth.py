@@ -170,9 +170,8 @@ def render_asked(
 
     start, stored = None, None
     if row is not None or like is not None:
-        opened = Store(store)
-        stored = scene_or_spec(opened, named)
-        start = find_start(opened, stored.scene_id, row, like)
+        stored = scene_or_spec(Store(store), named)
+        start = find_start(store, stored.scene_id, row, like)
     spec = with_fov(load_named(store, named) if stored is None else locate(stored.spec), fov)
     configuration, view = start or (None, None)
     configuration, view = asked.apply(spec, configuration), asked.view(spec, view)

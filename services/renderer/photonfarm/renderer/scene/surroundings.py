@@ -31,7 +31,6 @@ from numpy.typing import NDArray
 
 from photonfarm.core.records import F32
 from photonfarm.renderer.scene.arrays import points as mi_points
-from photonfarm.scene.arrangement import NEVER_SEEN
 from photonfarm.scene.groups import shape_ids
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.view import View
@@ -114,14 +113,15 @@ def look_closer(loaded: LoadedScene, modification: Modification, view: View) -> 
     A group's points are 27 in the box around it. Groups that meet are nothing special: placements are drawn so.
     """
     shapes, spec = loaded.scene.shapes(), loaded.spec
-    boxes, at_rest, found = boxes_of(shapes), rest(spec).vector, []
+    boxes, at_rest = boxes_of(shapes), rest(spec).vector
+    found: list[str] = []
     room = boxes[loaded.still]
     low, high = (room[:, 0].min(axis=0), room[:, 1].max(axis=0)) if len(room) else (-np.inf, np.inf)
     slack = 0.01 * np.max(high - low)
     for group, now, before in zip(spec.groups, modification.vector[:, :5], at_rest[:, :5], strict=True):
-        if np.array_equal(now, before) or not now[3]:  # what it emits is in nothing's way
-            continue
         own = boxes[[shape.id() in shape_ids(group) for shape in shapes]]
+        if np.array_equal(now, before) or not now[3] or not len(own):  # light is in nothing's way
+            continue
         corners = own[:, 0].min(axis=0), own[:, 1].max(axis=0)
         if (corners[0] < low - slack).any() or (corners[1] > high + slack).any():
             found.append(f"{group.name} reaches beyond all that never moves")
@@ -136,7 +136,7 @@ def look_closer(loaded: LoadedScene, modification: Modification, view: View) -> 
         found.append(f"the camera is inside {shapes[number].id()!r}")
     elif (view.origin < low - slack).any() or (view.origin > high + slack).any():
         found.append("the camera is beyond all that never moves")
-    return [f"{sentence}: {NEVER_SEEN}" for sentence in found]
+    return found
 
 
 def directions() -> F32:

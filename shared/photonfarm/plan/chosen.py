@@ -1,0 +1,62 @@
+"""Samples that a person chose: views of configurations by names, which no distribution was asked for.
+
+Shape letters: M configurations, V views.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from pydantic import Field
+
+from photonfarm.core.models import Frozen
+from photonfarm.plan.request import Expansion, Extent, PlannedContent, SampleCount, contents, expand_views
+from photonfarm.scene.arrangement import Shot, list_shot
+from photonfarm.scene.modification import Modification
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View
+
+
+class Chosen(Frozen):
+    """What to plan: passes of views, each with its configuration; what a shot does not name is at rest."""
+
+    kind: Literal["chosen"] = "chosen"
+    shots: Annotated[tuple[Shot, ...], Field(min_length=1)]
+    passes: Annotated[int, Field(ge=1, le=65536)] = 1
+
+    @classmethod
+    def of(cls, spec: SceneSpec, configuration: Modification, view: View, passes: int = 1) -> Self:
+        """The request for passes of one view of a configuration, which comes out of the names to the bit."""
+        said = list_shot(spec, configuration, view)
+        said.pop("fov")
+        return cls(shots=(Shot.of(**said),), passes=passes)
+
+    @property
+    def samples(self) -> SampleCount:
+        """The number of samples it names, planned already or not."""
+        return len(self.shots) * self.passes
+
+    @property
+    def views_per_modification(self) -> int:
+        """The views that each configuration has at least."""
+        return 1
+
+    def extent(self, spec: SceneSpec) -> Extent:
+        """The extent of the request in a scene without plans."""
+        modifications = len({shot.apply(spec).vector.tobytes() for shot in self.shots})
+        return Extent(modifications, modifications, len(self.shots))
+
+
+def expand_chosen(
+    spec: SceneSpec, request: Chosen, known: PlannedContent, *, first_job: int, shard_rows: int
+) -> Expansion:
+    """The rows of a request's new samples; see `request.expand`. Raises SpecError for what is impossible."""
+    vectors = np.stack([shot.apply(spec).vector for shot in request.shots])
+    place = {content: m for m, content in enumerate(dict.fromkeys(contents(vectors)))}
+    of_view = np.array([place[content] for content in contents(vectors)], np.int64)
+    _, first = np.unique(of_view, return_index=True)
+    order = np.argsort(of_view, kind="stable")
+    views = np.stack([shot.view(spec).vector for shot in request.shots])[order]
+    numbers = {"first_job": first_job, "shard_rows": shard_rows}
+    return expand_views(spec, vectors[first], of_view[order], views, request.passes, known, density=np.nan, **numbers)

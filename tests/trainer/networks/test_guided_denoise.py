@@ -81,7 +81,7 @@ def test_it_starts_from_the_filtered_half_and_the_known_light_and_goes_on_to_the
     torch.testing.assert_close(images[1e9], wanted, rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(images[0.0], inputs.noisy.colour)
     off = [float((image - inputs.noisy.colour).detach().abs().mean()) for image in images.values()]
-    assert off[0] > 1.5 * off[1] > 0
+    assert off[0] > 100 * off[1] > 0, "further from the half than noise explains: no error of the guess was learned"
 
 
 def test_what_it_learned_for_one_pass_fades_by_the_root_of_their_number(make_source) -> None:

@@ -15,7 +15,9 @@ two take turns [data.batch].
 n is the number of passes of the half. The squared error of a denoiser falls by √n (docs/results/networks.md), and that
 of what is known without any sample does not fall. So with √n fades what the network learned to set against the noise
 of one pass: what it adds, its error, and the share of the coarse filter, whose window stays as wide. By the same factor
-the half takes over from the known light where nothing reflects by the guides, which do not see all paths.
+the half takes over from the known light where nothing reflects by the guides, which do not see all paths. And where the
+guess is further from the half than noise explains, v is at least 1 − (1 + 4/n) · variance / (half − guess)², both
+means over 5 × 5 pixels (James and Stein, 1961, with slack for a variance that is itself estimated from n passes).
 
 Shape letters: B batch, H W image.
 """
@@ -54,6 +56,9 @@ DARK = 0.1
 COARSE = (0.0, 1.0, 0.0)
 """1 for what is filtered coarsely, in the order of `SHARES`."""
 
+TINY = 1e-12
+"""A squared difference that is none."""
+
 LEVELS = 3
 """The passes of the filter, with neighbours at 1, 2 and 4 pixels: it is fine after the first, coarse after the last."""
 
@@ -88,7 +93,11 @@ class GuidedDenoise(Guided):
         added = fading * ((1 - weight) * (known - filtered) + light)
         shows = half.shows + (1 - half.shows) * (1 - fading)
         guess = torch.lerp(known + light, filtered + added, shows)
-        return guess + shows * (error / (error + half.noise)) * (noisy.colour - guess)
+        apart = noisy.colour - guess
+        further = _mean(apart.detach().mean(dim=-1, keepdim=True) ** 2, 5).clamp(min=TINY)
+        doubt = torch.where(fading < 1, 1 - (1 + 4 * fading**2) * half.variance / further, 0)
+        share = torch.maximum(error / (error + half.noise), doubt)
+        return guess + shows * share * apart
 
     def _measure_places(self, inputs: Inputs) -> Tensor:
         """Where each pixel's surface is, from the eye, over the scene's size, (B, H, W, 3)."""
@@ -102,7 +111,8 @@ class Half(NamedTuple):
     """What a network sees of a half, without gradients."""
 
     filtered: Tensor  # (B, H, W, 3, n) by each filter
-    noise: Tensor  # (B, H, W, 1) its variance over its squared brightness
+    variance: Tensor  # (B, H, W, 1) of its mean colour
+    noise: Tensor  # (B, H, W, 1) that over its squared brightness
     shows: Tensor  # (B, H, W, 1) 0 where nothing reflects, and the known light is all there is; else 1
     channels: list[Tensor]  # `HALF_CHANNELS`, and 6 of each filter
 
@@ -130,7 +140,7 @@ def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor, denoised: T
     images = [noisy.colour / reflects, *averages, noise]
     images += [image / reflects for each in filtered for image in (each, each - direct)]
     channels = [shows * image.sign() * torch.log1p(image.abs()) for image in images]
-    return Half(torch.stack(filtered, dim=-1), noise, shows, channels)
+    return Half(torch.stack(filtered, dim=-1), spread, noise, shows, channels)
 
 
 def _estimate_variance(light: Tensor, reflects: Tensor) -> Tensor:

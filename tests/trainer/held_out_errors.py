@@ -30,5 +30,5 @@ def held_out_errors(make: Callable[[], SceneReader], folder: Path) -> Errors:
     last_of = make_network_predictor(run.network(source.spec, source.base()))
     batches = read_in_turn(source, rows, run.settings.batch, run.needs, run.settings.network.points)
     errors = measure_together([last_of, *make_baselines(source, run, "cpu")], batches)
-    last, baselines = errors[0].error, Baselines(*errors[1:])
+    last, baselines = errors[0].error, Baselines("", *errors[1:])
     return Errors(baselines.untrained.error.mean, last.mean, baselines.mean_colour.error.mean, last.count)

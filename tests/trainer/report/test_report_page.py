@@ -10,9 +10,12 @@ import numpy as np
 import pytest
 from chromium import chromium, needs_chromium
 
+from photonfarm.core.archives import Seconds
 from photonfarm.core.statistics import Estimate, group_means
-from photonfarm.trainer.predictors.evaluation import HeldOutErrors
-from photonfarm.trainer.report.contents import ReportContents
+from photonfarm.trainer.predictors.evaluation import HeldOutErrors, read_in_turn
+from photonfarm.trainer.report.contents import ReportContents, ReportEntry
+from photonfarm.trainer.report.data_and_runs import LIGHT, NOTHING, show_given
+from photonfarm.trainer.report.frame_times import FrameTime
 from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, encode_half_floats, encode_light
 from photonfarm.trainer.report.views import Layer, ShownView, make_light_layer
 
@@ -24,15 +27,19 @@ def errors(*per_sample: float) -> HeldOutErrors:
 
 
 def judged(
-    contents: ReportContents, own: HeldOutErrors, colour: HeldOutErrors, shown: HeldOutErrors | None = None
+    contents: ReportContents,
+    own: HeldOutErrors,
+    given: HeldOutErrors,
+    shown: HeldOutErrors | None = None,
+    than: str = NOTHING,
 ) -> Verdict:
-    """The verdict if these had been the errors of the network and of the mean colour; `shown`: of light up to white."""
+    """The verdict if these were the errors of the network and of what it is given; `shown`: of light up to white."""
     entry = contents.entries[0]
     return Verdict.of(
         replace(
             contents,
             entries=(replace(entry, row=replace(entry.row, held_out=own)),),
-            baselines=replace(contents.baselines, mean_colour=colour, mean_shown_colour=shown or colour),
+            baselines=replace(contents.baselines, given=given, mean_shown_colour=shown or given, than=than),
         )
     )
 
@@ -42,7 +49,7 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
     better = judged(contents, errors(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), colour)
     assert better.kind == "better"
     assert better.sentence == "light_transport predicts unseen configurations with 1/18 of the mean colour’s error."
-    assert "below the mean colour’s in 3 of 3 configurations" in better.further[0]
+    assert "below that of the mean colour, 1.8, in 3 of 3 configurations" in better.further[0]
     assert "no references" in better.further[-1]
     assert "with 50 % of " in judged(contents, errors(0.9, 0.9), errors(1.8, 1.8)).sentence
     with_lamps = judged(contents, errors(0.1, 0.1), errors(50, 50), shown=errors(2, 2))
@@ -59,6 +66,36 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
     below_noise = judged(contents, errors(-0.1, 0.05), errors(1.8, 1.8))
     assert below_noise.kind == "better"
     assert not re.search(r"1/|inf|nan|-", below_noise.sentence), "no ratio to nothing"
+
+
+def test_a_network_that_is_given_light_is_compared_with_that_light_and_with_denoisers_of_its_time(contents) -> None:
+    own, light = errors(0.1, 0.1, 0.1, 0.1), errors(0.4, 0.4, 0.4, 0.4)
+    verdict = judged(contents, own, light, than=LIGHT)
+    assert verdict.sentence == "light_transport predicts unseen configurations with 25 % of the known light’s error."
+    colour = contents.baselines.mean_colour.error.mean
+    assert f"that of one colour for every pixel is {colour:.3g}" in verdict.further[0]
+    assert len(verdict.further) == 2, "no time, so no denoiser of its time"
+
+    def timed(milliseconds: float, error: float, architecture: str | None = None) -> ReportEntry:
+        entry, time = contents.entries[0], FrameTime({"network": Seconds(milliseconds / 1e3, 0.0, 1.0)})
+        row = replace(entry.row, held_out=errors(error, error))
+        return replace(entry, name=f"{error}", architecture=architecture, row=row, time=time)
+
+    def compared(*denoisers: ReportEntry) -> str:
+        own = timed(20, 0.1, "guided")
+        return Verdict.of(replace(contents, entries=(own, *denoisers))).further[1]
+
+    assert compared(timed(5, 0.9), timed(19, 0.2), timed(15, 0.3), timed(21, 0.01)).startswith("0.2, in 19")
+    assert compared(timed(40, 0.01), timed(30, 0.2)).startswith("0.2, in 30"), "none is so quick: the quickest"
+
+
+def test_what_a_network_is_given_is_shown_as_it_is(measured, trained) -> None:
+    run = trained(network={"architecture": "guided", "width": 4})
+    name, show = show_given(run, "cpu")
+    (batch,) = read_in_turn(measured.reader(), [0, 1], 2, run.needs)
+    assert name == LIGHT
+    np.testing.assert_array_equal(show(batch), batch.inputs.guides.direct, "nothing shines or mirrors there")
+    assert show_given(trained(), "cpu") == (NOTHING, None)
 
 
 def test_the_page_holds_the_verdict_and_the_light_of_the_store_to_the_bit(measured, reported) -> None:

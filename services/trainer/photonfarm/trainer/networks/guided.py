@@ -62,6 +62,12 @@ def guide_channels(inputs: Inputs, scale: float) -> list[Tensor]:
     ]
 
 
+def show_known_light(inputs: Inputs) -> Tensor:
+    """What a view emits, and the direct light that its surfaces reflect, as the guides give them, (B, H, W, 3)."""
+    guides = require(inputs.guides)
+    return guides.emission + guides.direct + guides.gloss
+
+
 class Guided(Network):
     """Image synthesis from the guides of a view, added to its emission and direct light.
 
@@ -107,8 +113,7 @@ class Guided(Network):
 
         The further light is that of all lit points, or else that of photons in the widest window.
         """
-        guides = require(inputs.guides)
-        light = guides.emission + guides.direct + guides.gloss
+        light = show_known_light(inputs)
         if self.lit_points is None and self.photon_light is None:
             return light
         return light + inputs.albedo * torch.expm1(further[-1] if self.lit_points is None else further[DIFFUSE])

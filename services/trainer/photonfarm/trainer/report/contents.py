@@ -22,7 +22,14 @@ from photonfarm.trainer.compare.evaluate import Evaluation, MeasureOptions, Pred
 from photonfarm.trainer.compare.evaluation_samples import Reference
 from photonfarm.trainer.predictors.evaluation import Predictor
 from photonfarm.trainer.predictors.trained import TrainedRun, list_predictors
-from photonfarm.trainer.report.data_and_runs import Baselines, DatasetCard, RunStory, make_baselines, shorten_names
+from photonfarm.trainer.report.data_and_runs import (
+    Baselines,
+    DatasetCard,
+    RunStory,
+    make_baselines,
+    shorten_names,
+    show_given,
+)
 from photonfarm.trainer.report.frame_times import (
     FrameTime,
     Machine,
@@ -132,6 +139,7 @@ class ReportContents:
             "dataset": self.card.document(),
             "runs": [story.document() for story in self.stories],
             "mean_colour": self.baselines.mean_colour.error.mean,
+            "given": {"what": self.baselines.than, "error": self.baselines.given.error.mean},
             "untrained": self.baselines.untrained.error.mean,
             "evaluation": rows,
             "machine": asdict(self.machine),
@@ -193,7 +201,7 @@ def gather_contents(
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run, card.samples.core_seconds) for name, run in zip(names, runs, strict=True)),
-        baselines=Baselines(*evaluation.beside),
+        baselines=Baselines(show_given(first, "cpu")[0], *evaluation.beside),
         evaluation=evaluation,
         entries=tuple(entries),
         costs=costs,

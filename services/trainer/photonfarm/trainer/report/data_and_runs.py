@@ -1,7 +1,7 @@
 """What a report is on: the data, with their cost and how to make them again, and the training runs.
 
-A run is told by its settings, curve, waits and cost. Baselines for its errors are the mean colour, and the network
-before its first step.
+A run is told by its settings, curve, waits and cost. Baselines for its errors are what its network is given, shown as
+it is, the mean colour, and the network before its first step.
 """
 
 from __future__ import annotations
@@ -21,12 +21,16 @@ from photonfarm.plan.request import UNUSED
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, SceneStatus, Store
 from photonfarm.store.model.store import scene_status
+from photonfarm.trainer.networks.guided import show_known_light
+from photonfarm.trainer.networks.inputs import require
 from photonfarm.trainer.predictors.evaluation import (
+    DevicePredictor,
     HeldOutErrors,
     Predictor,
     average_colours,
     make_constant_predictor,
 )
+from photonfarm.trainer.predictors.half_filter import HalfFilter, uses_denoiser
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.advice import Advice, advise
@@ -245,20 +249,34 @@ MOST_TRAINING = 1024  # samples to take the mean colour of
 
 COLOUR = "the mean colour of the training samples"
 
+NOTHING, LIGHT, HALF = "the mean colour", "the known light", "the denoised half"
+"""What a network is given that is an image: nothing, so that one colour is the best; lamps and direct light; a half."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Baselines:
     """Errors to compare with, in linear radiance × exposure, the targets' noise removed."""
 
+    than: str  # what `given` is of: NOTHING, LIGHT or HALF
     mean_colour: HeldOutErrors  # of the training samples, everywhere
     mean_shown_colour: HeldOutErrors  # the same of these samples with light above white cut, for `shown` alone
     untrained: HeldOutErrors  # the first run's network before its first step
+    given: HeldOutErrors  # what that is given, shown as it is: training's own share is what is below this
+
+
+def show_given(run: TrainedRun, device: str) -> tuple[str, DevicePredictor | None]:
+    """What a run's network is given that is an image, and a predictor that shows it as it is; None for NOTHING."""
+    place = usable_device(device)
+    if uses_denoiser(run.settings):
+        filtered = HalfFilter(run.settings, place)
+        return HALF, DevicePredictor(lambda inputs: require(require(filtered(inputs).noisy).filtered), place)
+    return (LIGHT, DevicePredictor(show_known_light, place)) if run.needs.guides else (NOTHING, None)
 
 
 def make_baselines(
     source: SceneReader, run: TrainedRun, device: str, tell: Callable[[str, int, int], object] = lambda *_: None
 ) -> list[Predictor]:
-    """The predictors of `Baselines`, in its order, from what is complete of a run's scene.
+    """The predictors of the errors of `Baselines`, in its order, from what is complete of a run's scene.
 
     Of the samples the radiance alone is read. Raises IncompleteError without training samples for the colour.
     """
@@ -276,4 +294,5 @@ def make_baselines(
 
     colours = average_colours(read())
     untrained = TrainedRun.load(run.folder, INITIAL).predictor(source.spec, source.base(), device)
-    return [*map(make_constant_predictor, colours), untrained]
+    mean, shown_mean = map(make_constant_predictor, colours)
+    return [mean, shown_mean, untrained, show_given(run, device)[1] or mean]

@@ -16,7 +16,7 @@ from typing import Literal
 
 import numpy as np
 
-from photonfarm.core.formatting import format_count
+from photonfarm.core.formatting import format_count, format_milliseconds
 from photonfarm.core.page import render_page
 from photonfarm.core.pictures import reduce_image
 from photonfarm.core.records import F32
@@ -24,12 +24,13 @@ from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
+from photonfarm.trainer.report.data_and_runs import HALF, LIGHT, NOTHING
 from photonfarm.trainer.report.plots import PlotGroup
 from photonfarm.trainer.report.tables import list_facts, make_tables
 from photonfarm.trainer.report.views import ShownView, write_legend
 
 Kind = Literal["better", "mixed", "worse"]
-"""Than the mean colour; "mixed": in the mean over all, but not in most configurations, or only by light above white."""
+"""Than what it is given; "mixed": in the mean over all, but not in most of them, or only by light above white."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,19 +43,47 @@ class Verdict:
 
     @classmethod
     def of(cls, contents: ReportContents) -> Verdict:
-        """The verdict on the first entry, against the mean colour and against the network before its first step."""
-        entry, colour, unit = contents.entries[0], contents.baselines.mean_colour, contents.evaluation.unit
-        errors, start = entry.row.held_out, contents.baselines.untrained.error.mean
-        shown = _compare_shown(errors, contents.baselines.mean_shown_colour)
-        better = group_means(errors.per_sample, errors.units) < group_means(colour.per_sample, colour.units)
-        kind, sentence = _judge(entry.name, errors.error.mean / colour.error.mean, shown, float(better.mean()), unit)
-        learned = f"from {start:.3g} before the first step to {errors.error.mean:.3g}"
+        """The verdict on the first entry, against what its network is given, shown as it is: training's own share.
+
+        A network that is given nothing that is an image is compared with the mean colour.
+        """
+        entry, baselines, unit = contents.entries[0], contents.baselines, contents.evaluation.unit
+        errors, given, than = entry.row.held_out, baselines.given, baselines.than
+        shown = _compare_shown(errors, baselines.mean_shown_colour if than == NOTHING else given)
+        better = group_means(errors.per_sample, errors.units) < group_means(given.per_sample, given.units)
+        ratio = errors.error.mean / given.error.mean
+        kind, sentence = _judge(entry.name, than, ratio, shown, float(better.mean()), unit)
+        learned = f"from {baselines.untrained.error.mean:.3g} before the first step to {errors.error.mean:.3g}"
+        colour = (
+            "" if than == NOTHING else f"; that of one colour for every pixel is {baselines.mean_colour.error.mean:.3g}"
+        )
         further = (
-            f"Training took its error {learned}; it is below the mean colour’s in {better.sum()} of "
-            f"{format_count(len(better), unit)} that no training saw.",
+            f"Training took its error {learned}; it is below that of {than}, {given.error.mean:.3g}{EXPLAINED[than]}, "
+            f"in {better.sum()} of {format_count(len(better), unit)} that no training saw{colour}.",
+            *_compare_with_denoiser(contents),
             _describe_references(contents),
         )
         return cls(kind, sentence, further)
+
+
+EXPLAINED = {
+    NOTHING: "",
+    LIGHT: " (lamps and direct light, as it is given them)",
+    HALF: " (what it is given of a view, filtered)",
+}
+
+
+def _compare_with_denoiser(contents: ReportContents) -> list[str]:
+    """The sentence on the best ready denoiser whose frame takes no longer than the first network's, or the quickest."""
+    entry = contents.entries[0]
+    ready = {each: each.time.total for each in contents.entries if each.architecture is None and each.time}
+    if entry.time is None or not ready:
+        return []
+    total, quickest = entry.time.total, min(ready, key=lambda each: ready[each])
+    in_time = [each for each, seconds in ready.items() if seconds <= total]
+    other = min(in_time or [quickest], key=lambda each: each.row.held_out.error.mean)
+    times = f"in {format_milliseconds(ready[other])} ms a frame for its {format_milliseconds(total)}"
+    return [f"{other.name}, {times}, has an error of {other.row.held_out.error.mean:.3g}."]
 
 
 def _compare_shown(errors: HeldOutErrors, constant: HeldOutErrors) -> float:
@@ -63,25 +92,24 @@ def _compare_shown(errors: HeldOutErrors, constant: HeldOutErrors) -> float:
     return max(own, 0.0) / colour if colour > 0 else 0.0
 
 
-def _judge(name: str, ratio: float, shown: float, wins: float, unit: str) -> tuple[Kind, str]:
-    """The verdict's kind and sentence, from ratios to the mean colour's error and the share of units that are better.
+def _judge(name: str, than: str, ratio: float, shown: float, wins: float, unit: str) -> tuple[Kind, str]:
+    """The verdict's kind and sentence, from ratios to a baseline's error and the share of units that are better.
 
     Of the two ratios it says the larger one: a lamp in view makes the mean colour so wrong that all else looks good.
     """
     if ratio <= 0:
         return "better", f"{name} predicts unseen {unit}s with no error that these views can show."
     if ratio >= 1:
-        times = f"{ratio:.3g} times that of one colour for every pixel"
-        return "worse", f"{name} is worse than the mean colour: on unseen {unit}s its error is {times}."
+        return "worse", f"{name} is worse than {than}: on unseen {unit}s its error is {ratio:.3g} times as large."
     if shown >= 1:
         over_all = f"over all pixels it has {_format_share(ratio)} that error"
-        return "mixed", f"{name} is worse than the mean colour where no light is above white; {over_all}."
+        return "mixed", f"{name} is worse than {than} where no light is above white; {over_all}."
     share = _format_share(max(ratio, shown))
     if wins < 0.5:
         mean = f"only in the mean over all has it {share} that error"
-        return "mixed", f"{name} is worse than the mean colour in most unseen {unit}s; {mean}."
+        return "mixed", f"{name} is worse than {than} in most unseen {unit}s; {mean}."
     where = " where no light is above white" if shown > ratio else ""
-    return "better", f"{name} predicts unseen {unit}s with {share} the mean colour’s error{where}."
+    return "better", f"{name} predicts unseen {unit}s with {share} {than}’s error{where}."
 
 
 def _format_share(ratio: float) -> str:

@@ -137,8 +137,9 @@ def _plot_curve(axes: Axes, contents: ReportContents, x: Callable[[RunStory, Cur
             axes.plot(*places, marker="o", markersize=4, color=colour, label=named, **look)
     axes.set_yscale("log")
     lowest = axes.get_ylim()[0]
+    baselines = contents.baselines
     levels = (
-        ("mean colour", contents.baselines.mean_colour.error.mean, "--"),
+        (baselines.than.removeprefix("the "), baselines.given.error.mean, "--"),
         ("noise of the targets", contents.evaluation.noise_floor, ":"),
     )
     for name, value, style in levels:

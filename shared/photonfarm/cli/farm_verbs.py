@@ -74,6 +74,16 @@ def scene_show(spec: str, as_json: bool) -> None:
     help="Say what would be planned, its size and cost, and what should teach more at that cost; write nothing.",
 )
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
+@click.option(
+    "--cameras",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Plan the views of this transforms.json (of nerfstudio, or of `export --to exr`) instead of random ones.",
+)
+@click.option(
+    "--configurations",
+    type=click.Path(exists=True, dir_okay=False, path_type=Path),
+    help="Plan the configurations of this JSON or CSV file, by the names of groups, instead of random ones.",
+)
 @device_option
 @json_option
 def submit(
@@ -85,6 +95,8 @@ def submit(
     halves_from: str | None,
     dry_run: bool,
     no_measure: bool,
+    cameras: Path | None,
+    configurations: Path | None,
     as_json: bool,
     row: int | None,
     like: str | None,
@@ -98,6 +110,9 @@ def submit(
 
     Where something is said to stand somewhere, or a camera, --passes of that one view are planned: all others stay at
     rest, or as --row or --like has them.
+
+    --cameras and --configurations plan what files say: each configuration by its own camera, or by all of --cameras, or
+    from --views random places.
     """
     from photonfarm.cli import show
     from photonfarm.farm import dry_run as dry
@@ -107,18 +122,28 @@ def submit(
     from photonfarm.plan.chosen import Chosen
     from photonfarm.scene.arrangement import Shot, find_doubts
     from photonfarm.scene.plausibility import warnings
+    from photonfarm.scene.shot_files import read_shots
     from photonfarm.scene.spec_loading import NamedSpec
     from photonfarm.store.read.find import find_start
 
     named = NamedSpec.load(spec)
     wanted: Request | Chosen = request
-    if (row, like, asked) == (None, None, Shot()):
+    if (row, like, asked, cameras, configurations) == (None, None, Shot(), None, None):
         doubts = [*filter(None, [find_hold_out_warning(named.spec, store, request)])]
     else:
-        _refuse_given("modifications", "views", "seed")
         start = find_start(store, named.spec.scene_id, row, like) or (None, None)
-        chosen = asked.apply(named.spec, start[0]), asked.view(named.spec, start[1])
-        doubts, wanted = find_doubts(named.spec, *chosen), Chosen.of(named.spec, *chosen, request.passes)
+        modification = asked.apply(named.spec, start[0])
+        if cameras or configurations:
+            _refuse_given("files say what is planned", "modifications", "camera", "look_at")
+            many = {"views": request.views_per_modification, "seed": request.seed}
+            chosen = read_shots(named.spec, cameras, configurations, modification, **many)
+        else:
+            _refuse_given("is of random samples; one view of one configuration is asked for", *RANDOM)
+            chosen = [(modification, asked.view(named.spec, start[1]))]
+        doubts = [*dict.fromkeys(doubt for each in chosen for doubt in find_doubts(named.spec, *each))]
+        if len(doubts) > MOST_DOUBTS:
+            doubts[MOST_DOUBTS:] = [f"and {len(doubts) - MOST_DOUBTS} more like these"]
+        wanted = Chosen.of_all(named.spec, chosen, request.passes)
     for warning in (*warnings(named), *doubts):
         click.echo(f"warning: {warning}", err=True)
     result: submission.Submission
@@ -140,12 +165,20 @@ def submit(
     show.print_submission(result, as_json)
 
 
-def _refuse_given(*names: str) -> None:
-    """Raise UsageError for options of random samples, where a person chooses one."""
+MOST_DOUBTS = 8
+"""The most doubts about chosen samples that are said."""
+
+
+RANDOM = ("modifications", "views", "seed")
+"""The options of random samples."""
+
+
+def _refuse_given(why: str, *names: str) -> None:
+    """Raise UsageError for options of other samples than those that a person chooses."""
     ctx = click.get_current_context()
     for name in names:
         if ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE:
-            raise click.UsageError(f"--{name}: is of random samples; one view of one configuration is asked for")
+            raise click.UsageError(f"--{name.replace('_', '-')}: {why}")
 
 
 @click.command("top-up")

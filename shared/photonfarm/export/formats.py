@@ -125,6 +125,7 @@ class Exr(Format):
             frame = {
                 "file_path": f"{SAMPLES}/{row:08d}{Exr.SUFFIX}",
                 "transform_matrix": camera_to_world(view, snapshot.spec).tolist(),
+                "look_at": view.target.tolist(),
                 "configuration_key": modification.key(snapshot.spec.radiance_id).hex(),
                 "split": snapshot.split_of(row),
             }

@@ -5,13 +5,15 @@ Shape letters: M configurations, V views.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Literal, Self
 
 import numpy as np
 from pydantic import Field
 
+from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Frozen
-from photonfarm.plan.request import Expansion, Extent, PlannedContent, SampleCount, contents, expand_views
+from photonfarm.plan.request import MAX_SAMPLES, Expansion, Extent, PlannedContent, SampleCount, contents, expand_views
 from photonfarm.scene.arrangement import Shot, list_shot
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
@@ -28,9 +30,16 @@ class Chosen(Frozen):
     @classmethod
     def of(cls, spec: SceneSpec, configuration: Modification, view: View, passes: int = 1) -> Self:
         """The request for passes of one view of a configuration, which comes out of the names to the bit."""
-        said = list_shot(spec, configuration, view)
-        said.pop("fov")
-        return cls(shots=(Shot.of(**said),), passes=passes)
+        return cls.of_all(spec, [(configuration, view)], passes)
+
+    @classmethod
+    def of_all(cls, spec: SceneSpec, views: Iterable[tuple[Modification, View]], passes: int = 1) -> Self:
+        """The request for passes of several views, each with its configuration; SpecError for too many."""
+        said = [list_shot(spec, configuration, view) for configuration, view in views]
+        shots = tuple(Shot.of(**{key: value for key, value in each.items() if key != "fov"}) for each in said)
+        if len(shots) * passes > MAX_SAMPLES:
+            raise SpecError(f"names {len(shots) * passes} samples; at most {MAX_SAMPLES} fit one request")
+        return cls(shots=shots, passes=passes)
 
     @property
     def samples(self) -> SampleCount:

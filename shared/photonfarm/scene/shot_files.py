@@ -1,0 +1,205 @@
+"""Cameras and configurations that are read from files: `transforms.json`, and JSON or CSV by the names of groups."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from photonfarm.core.errors import SpecError
+from photonfarm.scene.arrangement import Shot
+from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View, sample_view
+
+FOV_SLACK_DEG, ROLL_SLACK_DEG = 0.05, 0.5
+"""By how much a camera may differ from the spec's field of view, and from one that stands upright."""
+
+COLOURS = ("red", "green", "blue")
+
+DISTORTED = ("k1", "k2", "k3", "k4", "p1", "p2")
+"""The coefficients of lenses, which must be 0."""
+
+
+def read_shots(
+    spec: SceneSpec,
+    cameras: Path | None,
+    configurations: Path | None,
+    start: Modification | None = None,
+    *,
+    views: int = 1,
+    seed: int = 0,
+) -> list[tuple[Modification, View]]:
+    """The views of a spec that two files say, each with its configuration.
+
+    Configurations change `start`, by default the scene at rest, which is the only one without their file. Each is seen
+    by its own camera if it has one, else by all `cameras`; without that file by so many random `views`, of a master
+    seed. Raises SpecError for what is no such file, and for what the spec cannot have.
+    """
+    seen_by = [] if cameras is None else read_cameras(cameras, spec)
+    start = rest(spec) if start is None else start
+    arranged = [(start, None)] if configurations is None else read_configurations(configurations, spec, start)
+    shots: list[tuple[Modification, View]] = []
+    for modification, own in arranged:
+        key = modification.key(spec.radiance_id)
+        drawn = () if own or cameras else (sample_view(spec, key, seed, i, modification) for i in range(views))
+        shots += [(modification, view) for view in ([own] if own else [*seen_by, *drawn])]
+    return shots
+
+
+# -------------------------------------------------------------------------------------------------------------- cameras
+
+
+def read_cameras(file: Path, spec: SceneSpec) -> list[View]:
+    """The views in a `transforms.json`, as nerfstudio and `photonfarm export --to exr` write it.
+
+    Its world is the scene's. Raises SpecError for a camera that is not upright, or has another field of view, another
+    aspect, or a lens that distorts.
+    """
+    document = _read_json(file)
+    frames = document.get("frames") if isinstance(document, Mapping) else None
+    if not isinstance(frames, list) or not frames:
+        raise SpecError(f"{file}: has no frames; a transforms.json has a list of them, each with a transform_matrix")
+    return [_read_camera({**document, **frame}, spec, f"{file}: frame {n}") for n, frame in enumerate(frames)]
+
+
+def _read_camera(camera: Mapping[str, Any], spec: SceneSpec, where: str) -> View:
+    """The view of a frame, with what is said of all frames; its own `look_at` if it has one."""
+    try:
+        to_world = np.array(camera["transform_matrix"], np.float64)[:3, :4]
+        fov_deg = _read_fov(camera)
+        lens = [float(camera.get(name, 0)) for name in DISTORTED]
+        aspect = float(camera.get("w", spec.film.width)) / float(camera.get("h", spec.film.height))
+        look_at = None if (said := camera.get("look_at")) is None else np.array(said, np.float32).reshape(3)
+    except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError) as error:
+        raise SpecError(f"{where}: is no camera: {error!r}; a transform_matrix of 4 × 4 numbers is required") from error
+    if to_world.shape != (3, 4) or not np.isfinite(to_world).all():
+        raise SpecError(f"{where}: transform_matrix: 4 × 4 finite numbers are required")
+    if fov_deg is not None and abs(fov_deg - spec.view.fov_deg) > FOV_SLACK_DEG:
+        raise SpecError(f"{where}: has a field of view of {fov_deg:.2f}°, and the spec of {spec.view.fov_deg:g}°")
+    if abs(aspect - spec.film.width / spec.film.height) > 1e-3 * aspect:
+        raise SpecError(f"{where}: its image is {aspect:.3f} times as wide as high, and the spec's film is not")
+    if any(lens):
+        raise SpecError(f"{where}: has a lens that distorts; undistort its images, and give their cameras")
+    right, _, backward, origin = to_world.T
+    if look_at is None:  # the point ahead that is nearest to the middle of what is looked at
+        middle = 0.5 * (spec.view.look_at.low + spec.view.look_at.high)
+        ahead = -backward / np.linalg.norm(backward)
+        distance = float((middle - origin) @ ahead)
+        look_at = (origin + ahead * (distance if distance > spec.view.near else 1.0)).astype(np.float32)
+    view = View(origin.astype(np.float32), look_at)
+    made = Camera.of(view, spec)
+    off = max(_angle_between(made.right, right), _angle_between(-made.forward, backward))
+    if off > ROLL_SLACK_DEG:
+        raise SpecError(
+            f"{where}: is turned by {off:.1f}° about its axis; cameras of this spec are upright, by view.up"
+        )
+    return view
+
+
+def _read_fov(camera: Mapping[str, Any]) -> float | None:
+    """The field of view along the width, in degrees; None if it is not said."""
+    if "fl_x" in camera and "w" in camera:
+        return float(np.degrees(2 * np.arctan(0.5 * float(camera["w"]) / float(camera["fl_x"]))))
+    return float(np.degrees(float(camera["camera_angle_x"]))) if "camera_angle_x" in camera else None
+
+
+def _angle_between(one: Any, other: Any) -> float:
+    """The angle between two directions, in degrees."""
+    cosine = float(one @ other) / (float(np.linalg.norm(one)) * float(np.linalg.norm(other)))
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+# ------------------------------------------------------------------------------------------------------- configurations
+
+
+def read_configurations(
+    file: Path, spec: SceneSpec, start: Modification | None = None
+) -> list[tuple[Modification, View | None]]:
+    """The configurations in a file, by names, as changes of `start`, each with its camera if it has one.
+
+    JSON is a list of tables as `photonfarm infer` writes them, with the fields of a `Shot`. CSV has a column for each
+    number: `sofa.x`, `sofa.y` and `sofa.z` are where that stands, `sofa.present` is 0 where it is not there,
+    `sofa.turn`, `lamp.power`, `lamp.red`, `lamp.green`, `lamp.blue` are as the modification vector has them, `camera.x`
+    … `look_at.z` the camera's; an empty cell changes nothing.
+    """
+    is_table = file.suffix.lower() == ".csv"
+    entries = list(_read_table(file)) if is_table else _read_list(file)
+    if not entries:
+        raise SpecError(f"{file}: has no configurations")
+    found: list[tuple[Modification, View | None]] = []
+    for number, entry in enumerate(entries):
+        try:
+            fov_deg = entry.pop("fov", spec.view.fov_deg)
+            if fov_deg != spec.view.fov_deg:
+                raise SpecError(f"fov = {fov_deg}: samples of this spec have {spec.view.fov_deg:g}")
+            shot = Shot.of(**_fill_places(entry, spec) if is_table else entry)
+            modification = shot.apply(spec, start)
+            found.append((modification, None if shot.camera is None else shot.view(spec)))
+        except SpecError as error:
+            where = f"line {number + 2}" if is_table else f"configuration {number}"
+            raise SpecError(f"{file}: {where}: {error}") from error
+    return found
+
+
+def _read_list(file: Path) -> list[dict[str, Any]]:
+    document = _read_json(file)
+    entries = document if isinstance(document, list) else [document]
+    if not all(isinstance(entry, dict) for entry in entries):
+        raise SpecError(f"{file}: a list of tables is required, each with place, move, without, camera or look_at")
+    return entries
+
+
+def _read_json(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise SpecError(f"{file}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise SpecError(f"{file}: is not valid JSON: {error}") from error
+
+
+def _read_table(file: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a CSV file, by names and coordinates."""
+    try:
+        with file.open(newline="", encoding="utf-8-sig") as lines:
+            for row in csv.DictReader(lines, restval=""):
+                yield {name.strip(): cell.strip() for name, cell in row.items() if name and cell and cell.strip()}
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise SpecError(f"{file}: cannot be read: {error}") from error
+
+
+def _fill_places(cells: Mapping[str, str], spec: SceneSpec) -> dict[str, Any]:
+    """The cells of a row as a `Shot` has them; coordinates of a group that are not said are those at rest."""
+    at = {group.name: group.at for group in spec.groups}
+    entry: dict[str, Any] = {"place": {}, "colour": {}, "turn": {}, "power": {}, "without": []}
+    for key, cell in cells.items():
+        name, _, what = key.rpartition(".")
+        number = _read_number(key, cell)
+        if name in ("camera", "look_at") and what in "xyz":
+            entry.setdefault(name, [None, None, None])["xyz".index(what)] = number
+        elif name and what == "present":
+            entry["without"] += [name] * (number == 0)
+        elif name and what in ("x", "y", "z"):
+            entry["place"].setdefault(name, [*at.get(name, (0.0, 0.0, 0.0))])["xyz".index(what)] = number
+        elif name and what in COLOURS:
+            entry["colour"].setdefault(name, [1.0, 1.0, 1.0])[COLOURS.index(what)] = number
+        elif name and what in ("turn", "power"):
+            entry[what][name] = number
+        else:
+            known = ", ".join(f"NAME.{what}" for what in ("x", "y", "z", "present", "turn", "power", *COLOURS))
+            raise SpecError(f"column {key!r}: is none of {known}, camera.x … look_at.z")
+    for changes in ("place", "colour", "turn", "power"):
+        entry[changes] = {name: value for name, value in entry[changes].items() if name not in entry["without"]}
+    return entry
+
+
+def _read_number(key: str, cell: str) -> float:
+    try:
+        return float(cell)
+    except ValueError as error:
+        raise SpecError(f"column {key!r}: {cell!r} is no number") from error

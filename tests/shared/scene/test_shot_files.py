@@ -1,0 +1,155 @@
+"""Files of chosen samples: cameras of transforms.json, and configurations by the names of groups."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import store_samples as samples
+from click.testing import CliRunner
+
+from photonfarm.cli.main import umbrella
+from photonfarm.core.errors import SpecError
+from photonfarm.export.snapshot import camera_to_world
+from photonfarm.scene.modification import rest
+from photonfarm.scene.shot_files import read_cameras, read_configurations, read_shots
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.view import View, sample_view
+from photonfarm.store import Store
+
+SPEC = samples.small_spec()
+VIEW = View(np.float32([1, 1, 1]), np.float32([0, 0.5, 0]))
+
+
+def views(count: int, spec: SceneSpec = SPEC) -> list[View]:
+    return [sample_view(spec, b"0" * 16, 5, i) for i in range(count)]
+
+
+def transforms(folder: Path, **changes: Any) -> Path:
+    """Three cameras as nerfstudio writes them: a matrix, a focal length and a width."""
+    frames = [{"transform_matrix": camera_to_world(view, SPEC).tolist()} for view in views(3)]
+    focal = 4 / np.tan(np.radians(SPEC.view.fov_deg / 2))
+    document = {"w": 8, "h": 8, "fl_x": focal, "fl_y": focal, "frames": frames, **changes}
+    (file := folder / "transforms.json").write_text(json.dumps(document))
+    return file
+
+
+def test_cameras_of_a_transforms_json_see_what_they_saw(tmp_path: Path) -> None:
+    for found, view in zip(read_cameras(transforms(tmp_path), SPEC), views(3), strict=True):
+        np.testing.assert_array_equal(found.origin, view.origin)
+        np.testing.assert_allclose(camera_to_world(found, SPEC), camera_to_world(view, SPEC), atol=1e-5)
+    exact = [{"transform_matrix": camera_to_world(v, SPEC).tolist(), "look_at": v.target.tolist()} for v in views(3)]
+    for found, view in zip(read_cameras(transforms(tmp_path, frames=exact), SPEC), views(3), strict=True):
+        np.testing.assert_array_equal(found.vector, view.vector)
+
+
+ROLLED = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"frames": [{"transform_matrix": ROLLED.tolist()}]}, "frame 0: is turned by 90.0°"),
+        ({"fl_x": 100}, "field of view"),
+        ({"camera_angle_x": 1.0, "fl_x": None, "w": 8}, "no camera"),
+        ({"h": 4}, "2.000 times as wide"),
+        ({"k1": 0.1}, "distorts"),
+        ({"frames": []}, "no frames"),
+        ({"frames": [{}]}, "frame 0: is no camera"),
+        ({"frames": [{"transform_matrix": [[1, 2], [3, 4]]}]}, "4 × 4"),
+    ],
+)
+def test_cameras_that_the_spec_cannot_have_are_refused(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
+    with pytest.raises(SpecError, match=says):
+        read_cameras(transforms(tmp_path, **changes), SPEC)
+
+
+def test_configurations_are_read_by_names_from_json_and_csv_alike(tmp_path: Path) -> None:
+    entries: list[dict[str, Any]] = [
+        {"place": {"object": [0.5, 0, 0.25]}, "camera": [1, 0.5, 0], "look_at": [0, 0, 0], "fov": SPEC.view.fov_deg},
+        {"without": ["object"]},
+        {},
+    ]
+    (tables := tmp_path / "rooms.json").write_text(json.dumps(entries))
+    (cells := tmp_path / "rooms.csv").write_text(
+        "object.x, object.z, object.present, camera.x, camera.y, camera.z, look_at.x, look_at.y, look_at.z\n"
+        "0.5, 0.25, 1, 1, 0.5, 0, 0, 0, 0\n, , 0\n, , 1\n"
+    )
+    for file in (tables, cells):
+        (first, camera), (second, none), (third, _) = read_configurations(file, SPEC)
+        np.testing.assert_array_equal(first.vector, np.float32([[0.5, 0, 0.25, 1]]))
+        assert camera is not None
+        np.testing.assert_array_equal(camera.vector, np.float32([1, 0.5, 0, 0, 0, 0]))
+        assert none is None
+        assert not second.present.any()
+        np.testing.assert_array_equal(third.vector, rest(SPEC).vector)
+    assert len(read_shots(SPEC, transforms(tmp_path), tables)) == 1 + 3 + 3
+    assert len(read_shots(SPEC, None, tables, views=2)) == 1 + 2 + 2
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ('[{"place": {"sofa": [0, 0, 0]}}]', "configuration 0: 'sofa' is no movable group of small; nearest"),
+        ('[{"fov": 10}]', "fov = 10"),
+        ('[{"plaice": {}}]', "plaice"),
+        ("[1]", "list of tables"),
+        ("[]", "no configurations"),
+        ("{", "not valid JSON"),
+    ],
+)
+def test_a_configuration_that_the_scene_cannot_have_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    (file := tmp_path / "rooms.json").write_text(text)
+    with pytest.raises(SpecError, match=says):
+        read_configurations(file, SPEC)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"), [("object.x\nfar", "line 2: column 'object.x': 'far'"), ("object\n1", "NAME.x"), ("", "no conf")]
+)
+def test_a_table_that_cannot_be_meant_is_refused(tmp_path: Path, text: str, says: str) -> None:
+    (file := tmp_path / "rooms.csv").write_text(text)
+    with pytest.raises(SpecError, match=says):
+        read_configurations(file, SPEC)
+
+
+def test_submit_plans_the_samples_of_files_and_says_what_no_random_one_shows(tmp_path: Path) -> None:
+    (tmp_path / "rooms.csv").write_text("table.x, table.z\n0.5, 0.5\n9, 0\n")
+    room = ["submit", "room", "--store", str(tmp_path / "store"), "--no-queue"]
+    done = CliRunner().invoke(umbrella, [*room, "--configurations", str(tmp_path / "rooms.csv"), "--views", "3"])
+    assert done.exit_code == 0, done.output
+    assert "6 samples planned" in done.stdout
+    assert "warning: table stands at 9,0,0, outside its box" in done.stderr
+    again = CliRunner().invoke(umbrella, [*room, "--configurations", str(tmp_path / "rooms.csv"), "--views", "3"])
+    assert "0 samples planned" in again.stdout
+
+
+def test_options_say_where_cameras_of_a_file_look(tmp_path: Path) -> None:
+    spec = load_spec("room")
+    frame = {"transform_matrix": camera_to_world(VIEW, spec).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    room = ["submit", "room", "--store", str(tmp_path / "store"), "--no-queue"]
+    asked = ["--cameras", str(tmp_path / "transforms.json"), "--without", "vase", "--passes", "2"]
+    assert "2 samples planned" in CliRunner().invoke(umbrella, [*room, *asked]).stdout
+    store = Store(tmp_path / "store")
+    (rows,) = (plan.rows for plan in store.scene(store.scene_ids()[0]).plans())
+    assert rows.modification[0, [group.name for group in spec.groups].index("vase"), 3] == 0
+    np.testing.assert_array_equal(rows.view[0, :3], VIEW.origin)
+    refused = CliRunner().invoke(umbrella, [*room, *asked, "--camera", "0,1,0"])
+    assert (refused.exit_code, "--camera: files say" in refused.stderr) == (2, True)
+
+
+def test_a_table_turns_dims_and_colours(tmp_path: Path) -> None:
+    turning = samples.small_spec(
+        objects=[{**samples.ALWAYS["objects"][0], "turn": {"min": -90, "max": 90}}],
+        lights=[{"name": "lamp", "shapes": ["ceiling-light"], "power": {"min": 0, "max": 2}, "colour": [[1, 0.5, 0]]}],
+    )
+    (file := tmp_path / "rooms.csv").write_text(
+        "object.turn,lamp.power,lamp.green,lamp.present\n30,0.5,0.25,1\n,,2,0\n"
+    )
+    (first, _), (second, _) = read_configurations(file, turning)
+    expected = np.float32([[0, 0, 0, 1, 30, 1, 1, 1, 1], [0, 0, 0, 1, 0, 0.5, 1, 0.25, 1]])
+    np.testing.assert_array_equal(first.vector, expected)
+    np.testing.assert_array_equal(second.vector[1], np.float32([0, 0, 0, 0, 0, 1, 1, 1, 1]))

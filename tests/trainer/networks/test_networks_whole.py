@@ -89,6 +89,25 @@ def test_what_reflects_nothing_shows_what_it_emits_and_nothing_else(make_source,
     assert not torch.isclose(made, inputs.guides.emission).all()
 
 
+@pytest.mark.parametrize("architecture", [name for name in EVERY if name.startswith("guided")])
+def test_black_surfaces_that_shine_have_learned_light_by_a_setting(make_source, architecture: str) -> None:
+    """Black glass in the upper left quarter, whose reflection the guides have missed; a matt black surface below."""
+    source = make_source(1, photons=64)
+    inputs = batch_of(source, (0,), architecture).inputs
+    left, glass = (slice(None), slice(None), slice(None, 8)), (slice(None), slice(None, 8), slice(None, 8))
+    for what in (inputs.albedo, inputs.guides.specular, inputs.guides.throughput, inputs.guides.direct):
+        what[left] = 0
+    inputs.guides.gloss[left], inputs.guides.mean_depth[left], inputs.guides.roughness[left] = 0, 1, 1
+    inputs.guides.roughness[glass] = 0.1
+    stored = inputs.guides.specular.clone()
+    without, mended = (image(network(source, architecture, least_specular=least), inputs) for least in (0, 0.04))
+    changed = ~torch.isclose(mended, inputs.guides.emission)
+    torch.testing.assert_close(without[left], inputs.guides.emission[left])
+    torch.testing.assert_close(mended[:, 8:, :8], inputs.guides.emission[:, 8:, :8])
+    assert changed[glass].all()
+    assert torch.equal(inputs.guides.specular, stored)
+
+
 def test_a_scene_far_from_the_origin_gives_the_same_image(make_source) -> None:
     source, kind, offset = make_source(1), "guided_transport", np.float32(1024)
     chosen = NetworkSettings(width=4, architecture=kind)

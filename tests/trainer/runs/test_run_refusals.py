@@ -110,6 +110,19 @@ def test_a_checkpoint_of_another_versions_network_is_refused_as_that(make_source
         train(make_source(24), tiny(max_steps=2), run)
 
 
+def test_a_run_of_before_there_was_a_setting_is_what_it_was(make_source, tiny, run) -> None:
+    train(make_source(24), tiny(max_steps=1), run)
+    written, state = json.loads((run / "settings.json").read_text()), checkpoint.load(run / CHECKPOINT)
+    for network in (written["network"], state["settings"]["network"]):
+        assert network.pop("least_specular") == 0
+    (run / "settings.json").write_text(json.dumps(written))
+    checkpoint.save(run / CHECKPOINT, state)
+    assert TrainedRun.load(run).settings == tiny(max_steps=1)
+    with pytest.raises(SpecError, match=r"least_specular = 0\.0, and 0\.04"):
+        train(make_source(24), tiny(network={"width": 4, "least_specular": 0.04}), run)
+    assert train(make_source(24), tiny(max_steps=2), run).step == 2
+
+
 @pytest.mark.parametrize("hold_out", [1e-06, 0.999999], ids=["nothing to validate on", "nothing to train on"])
 def test_a_hold_out_that_leaves_one_side_empty_is_refused(make_source, tiny, run, hold_out: float) -> None:
     with pytest.raises(SpecError, match=f"hold_out = {hold_out}") as refused:

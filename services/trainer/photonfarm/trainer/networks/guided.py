@@ -11,6 +11,8 @@ Shape letters: B batch, H W image, C channels.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -90,8 +92,19 @@ class Guided(Network):
         photon_light = PhotonLight(frame, settings.architecture, bounces=1) if photons else None
         further += (CHANNELS if transport else 0) + (3 * len(WINDOWS) if photons else 0)
         super().__init__(settings, frame, further=further + GUIDE_CHANNELS, outputs=outputs)
+        self.least_specular = settings.least_specular
         self.lit_points = transport(frame, settings.lit_points) if transport else None
         self.photon_light = photon_light
+
+    def forward(self, inputs: Inputs) -> Tensor:
+        """The image, (B, H, W, 3), linear radiance × exposure, as every network's."""
+        return super().forward(self.raise_specular(inputs))
+
+    def raise_specular(self, inputs: Inputs) -> Inputs:
+        """The inputs in which whatever shines reflects at least the settings' `least_specular`; without, themselves."""
+        if not self.least_specular:
+            return inputs
+        return replace(inputs, guides=require(inputs.guides).reflect_at_least(self.least_specular))
 
     def channels(self, inputs: Inputs, further: list[Tensor]) -> Tensor:
         """Further channels, guides, and the image-space channels, (B, H, W, C)."""

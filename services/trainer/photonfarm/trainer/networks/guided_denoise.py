@@ -79,6 +79,7 @@ class GuidedDenoise(Guided):
 
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure. What reflects nothing shows what it emits."""
+        inputs = self.raise_specular(inputs)
         noisy, lit = require(inputs.noisy), self.further(inputs)
         denoised = require(noisy.filtered) if self._has_denoiser else None
         half = look_at_half(inputs, noisy, self._measure_places(inputs), denoised)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 import torch
@@ -191,6 +191,14 @@ class GuideInputs(SurfaceInputs):
     beyond_depth: Tensor  # (B, H, W) scene units, along the path
     point_light: Tensor  # (B, L, 3) irradiance × exposure of the first points
     glossy_count: Tensor | None = None  # (B,) int64 on the host: glossy pixels of each sample that is on a card
+
+    def reflect_at_least(self, least: float) -> Self:
+        """These guides, with a `specular` of at least so much × (1 − roughness) on surfaces that have any other lobe.
+
+        A dielectric of which the guides' rays found no reflection else counts as one that reflects nothing.
+        """
+        smooth = (1 - self.roughness) * (self.mean_depth > 0)
+        return replace(self, specular=torch.maximum(self.specular, least * smooth[..., None]))
 
     def find_glossy(self) -> Tensor:
         """The pixels whose glossy lobe is summed, (B, H, W) bool; the same on all devices."""

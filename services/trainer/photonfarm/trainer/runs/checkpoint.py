@@ -28,6 +28,7 @@ from photonfarm.core.models import Changes, differing
 from photonfarm.farm.training import METADATA
 from photonfarm.store.io.local import sync
 from photonfarm.trainer.runs.run_folder import GOOD, check_version
+from photonfarm.trainer.runs.settings import EARLIER
 
 FORMAT = 5
 ANEW = "remove it, and the run begins anew"
@@ -77,7 +78,10 @@ def load(path: Path, *, without: str = "") -> dict[str, Any]:
         raise StoreError(
             f"{path}: has format {stored!r}, but this version reads format {FORMAT}; train anew in another folder"
         )
-    return dict(_put_together(document, tensors))
+    state = dict(_put_together(document, tensors))
+    if "settings" in state:
+        state["settings"]["network"] = {**EARLIER, **state["settings"]["network"]}
+    return state
 
 
 class _DamagedError(Exception):

@@ -24,7 +24,7 @@ from photonfarm.core.pictures import display
 from photonfarm.core.records import F32
 from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS, VIEWS
 from photonfarm.scene.spec_loading import SCENES_VARIABLE
-from photonfarm.trainer.runs.settings import KEYS, NetworkSettings, TrainSettings
+from photonfarm.trainer.runs.settings import EARLIER, KEYS, NetworkSettings, TrainSettings
 
 __all__ = [
     "CHECKPOINT",
@@ -103,11 +103,11 @@ def read_settings(run: Path) -> TrainSettings:
 
 
 def check_version(path: Path, network: Mapping[str, Any]) -> None:
-    """Raise SpecError unless a run's stored settings of its network have all present keys.
+    """Raise SpecError unless a run's stored settings of its network have all present keys, but for those of `EARLIER`.
 
     A missing key would take today's default, and make another network.
     """
-    if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in network):
+    if missing := ", ".join(key for key in NetworkSettings.model_fields if key not in {**EARLIER, **network}):
         raise SpecError(
             f"{path}: lacks the network settings {missing}: another version wrote it; train anew in another folder "
             "(--run)"

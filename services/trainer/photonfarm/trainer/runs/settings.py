@@ -157,6 +157,9 @@ class NetworkSettings(Frozen):
     # when a run begins
     reflectance: bool = False  # of denoise_K (ours): it is given the reflectance of all lobes, and of what mirrors
     # show, for diffuse albedo, so that patterns of metals and mirrored ones are not smoothed away
+    least_specular: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of guided networks (ours): what a surface that has
+    # any lobe but the diffuse one reflects by it, at least, where it is smooth; 0.04 is glass seen straight on, of
+    # which the guides' few samples find nothing
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it
 
@@ -170,6 +173,10 @@ class NetworkSettings(Frozen):
         if self.architecture == "feature_projection" and not self.descriptor:
             raise ValueError("has descriptor = 0; feature_projection projects descriptors, and at least 1 is needed")
         return self
+
+
+EARLIER: Mapping[str, Any] = {"least_specular": 0.0}
+"""The settings that a run of before there were any lacks, each with the value by which its network is what it was."""
 
 
 class TrainSettings(Frozen):

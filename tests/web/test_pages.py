@@ -312,10 +312,10 @@ def test_a_browser_shows_the_farm_and_a_sample_without_errors_at_a_desks_and_a_p
             page.wait_for(pictures_there)
             assert page.value("document.querySelectorAll('svg.plot circle').length") >= 12
             said = page.value("document.body.innerText")
-            assert f"{run.name}: 0.00990 at step 100, on 2 held-out samples" in said
-            assert "hollow ones were measured on fewer held-out samples" in " ".join(said.split())
+            assert f"{run.name}: 0.00990 at step 100, on 2 held-out views" in said
+            assert "hollow ones were measured on fewer held-out views" in " ".join(said.split())
             told = "[...document.querySelectorAll('circle.hollow')].map((point) => point.textContent)"
-            assert page.value(told) == 2 * ["step 0: 1.00000 on 1 held-out sample"], "by steps and by seconds"
+            assert page.value(told) == 2 * ["step 0: 1.00000 on 1 held-out view"], "by steps and by seconds"
             assert page.value("document.documentElement.scrollWidth") <= width
             page.open(f"{address}#/sample/{scene.scene_id}/3", width)
             page.wait_for("document.querySelectorAll('.pictures img').length >= 7")

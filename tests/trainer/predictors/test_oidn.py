@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from photonfarm.core.errors import SpecError
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import Inputs, Needs, NoisyColour, SurfaceInputs
 from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
@@ -100,12 +99,6 @@ def test_the_pattern_of_a_metal_stays_where_reflectance_is_given() -> None:
     seen = SurfaceInputs(emission=lamp, specular=mirror, throughput=mirror, beyond_albedo=metal)
     assert torch.equal(replace(inputs, surface=seen).reflects[:, :8], black[:, :8] + 1)
     assert torch.equal(replace(inputs, surface=seen).reflects[:, 8:], 0.5 * metal[:, 8:])
-
-
-def test_without_its_package_it_says_what_to_install(monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
-    with pytest.raises(SpecError, match=r"photonfarm\[oidn\]"):
-        Oidn()
 
 
 def test_it_needs_no_mitsuba_and_no_gpu() -> None:

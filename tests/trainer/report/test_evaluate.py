@@ -1,18 +1,20 @@
 """`photonfarm evaluate` on a store: what is measured, on which samples, against which references."""
 
 import json
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
 from PIL import Image
 
-from photonfarm.cli.main import umbrella
+from photonfarm.cli.main import main, umbrella
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.core.pictures import display
 from photonfarm.plan.hold_out import are_held_out
@@ -54,6 +56,15 @@ def test_training_measures_the_views_that_evaluate_does_each_by_its_first_pass(m
     found = compare(measured.store, [run])
     assert last["held_out"] == found.samples == len(measured.held_out()) // 2
     assert last["error"] == pytest.approx(found.rows[0].held_out.error.mean, rel=1e-6)
+
+
+def test_without_its_package_a_denoiser_says_what_to_install(measured, monkeypatch, capsys) -> None:
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", None)
+    asked = ["--store", str(measured.store), "--run", str(measured.runs[0]), "--denoiser", "oidn-fast"]
+    with pytest.raises(SystemExit) as ended:
+        main(["evaluate", *asked])
+    assert ended.value.code == click.UsageError.exit_code
+    assert "photonfarm[oidn]" in capsys.readouterr().err
 
 
 def test_a_network_is_measured_once_on_each_view_that_is_held_out_by_its_first_sample(measured, trained) -> None:

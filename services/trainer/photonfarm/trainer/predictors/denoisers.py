@@ -105,7 +105,7 @@ class Oidn:
     def __init__(self, threads: int = 1, device: str | torch.device = "cpu", quality: OidnQuality = "high") -> None:
         """Load the library; `threads` are the CPU's.
 
-        Raises SpecError if the package is not installed or does not work on this device.
+        Raises ModuleNotFoundError if the package is not installed, SpecError if it does not work on this device.
         """
         place, self._oidn = torch.device(device), _import_package()
         self._quality = self._oidn.Quality[quality.capitalize()]
@@ -148,8 +148,7 @@ class Oidn:
 def _import_package() -> ModuleType:
     try:
         return import_module(PACKAGE)
-    except (ImportError, OSError) as error:  # the latter if its library cannot be loaded
-        raise SpecError(
-            f"the denoiser oidn: needs the package {PACKAGE}, which cannot be imported ({error}); "
-            "pip install photonfarm[oidn]"
-        ) from error
+    except ModuleNotFoundError:
+        raise  # the command line names the extra that brings it
+    except (ImportError, OSError) as error:
+        raise SpecError(f"{PACKAGE}: its library cannot be loaded: {error}; leave the denoiser out") from error

@@ -60,7 +60,7 @@ class HalfFilter:
     def __init__(self, settings: TrainSettings, device: str | torch.device = "cpu", run: Path | None = None) -> None:
         """Load the denoiser that the settings name, and keep images in the folder of a `run`.
 
-        Raises SpecError if it is not installed, or does not work on this device.
+        Raises what `Oidn` does.
         """
         name = settings.network.filter
         self._oidn = Oidn(settings.threads, device, OIDN[name])

@@ -138,7 +138,7 @@ class ReadyPredictor:
         return False
 
     def predictor(self, _spec: object, _base: object, device: str) -> DevicePredictor:
-        """The predictor on a device, whatever the scene. Raises SpecError if a package is missing, or cannot use it."""
+        """The predictor on a device, whatever the scene. Raises what `Oidn` does, and SpecError for no such device."""
         place = usable_device(device)
         return DevicePredictor(self._images(place), place)
 

@@ -40,6 +40,11 @@ class Run(Frozen):
     train: Mapping[str, Any]
     further: tuple[int, ...] = ()  # seeds from which it is trained again
 
+    @property
+    def is_given_halves(self) -> bool:
+        """Whether its network can be given the mean of several halves of a view."""
+        return bool(self.train["architecture"] == "guided_denoise")
+
 
 class Long(Frozen):
     """Some of the networks once more, trained for longer, and from how many seeds."""
@@ -160,6 +165,11 @@ def name_seeded(name: str, seed: int) -> str:
 def name_long(name: str, steps: int) -> str:
     """The name of a network's run of more steps than others."""
     return f"{name}-{steps}"
+
+
+def name_halves(name: str, halves: int) -> str:
+    """The name of a run's row by so many halves of a view; by one it is that of the run."""
+    return name if halves == 1 else f"{name} {halves}/1"
 
 
 def _is_denoiser(train: Mapping[str, Any]) -> bool:

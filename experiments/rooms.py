@@ -13,7 +13,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from experiments.experiment import Experiment, name_seeded
+from experiments.experiment import Experiment, name_halves, name_seeded
 from experiments.stages import EVALUATION, PATHS
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.formatting import format_markdown_table
@@ -181,16 +181,26 @@ def read_estimate(row: Mapping[str, Any], metric: str) -> Estimate | None:
 
 
 def _read_further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[float]]]:
-    """MSE of each image by each further seed, of each network; raises IncompleteError where they were not measured."""
+    """MSE of each image by each further seed, of each network's rows.
+
+    Raises IncompleteError where they were not measured.
+    """
     if not file.is_file():
         raise IncompleteError(f"{file}: not there; `python experiments/run.py {experiment.name}` makes it")
-    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]  # in the order of the runs
-    errors = {run.name: row["metric_space"]["mse"]["values"] for run, row in zip(experiment.again(), rows, strict=True)}
-    by_run: dict[str, list[list[float]]] = {}
+    rows = json.loads(file.read_text(encoding="utf-8"))["rows"]  # the runs, then those of several halves run by run
+    again, several = experiment.again(), experiment.size.halves
+    names = [run.name for run in again]
+    names += [name_halves(run.name, halves) for run in again if run.is_given_halves for halves in several]
+    errors = {
+        name: row["metric_space"]["mse"]["values"] for name, row in zip(names, rows, strict=len(rows) > len(again))
+    }
+    by_row: dict[str, list[list[float]]] = {}
     for run in experiment.trained():
-        names = [name_seeded(run.name, seed) for seed in run.further]
-        by_run[run.name] = [[round(value, 6) for value in errors[name]] for name in names if name in errors]
-    return {name: values for name, values in by_run.items() if values}
+        for halves in (1, *several):
+            names = [name_halves(name_seeded(run.name, seed), halves) for seed in run.further]
+            values = [[round(value, 6) for value in errors[name]] for name in names if name in errors]
+            by_row[name_halves(run.name, halves)] = values
+    return {name: values for name, values in by_row.items() if values}
 
 
 def _compact(row: Mapping[str, Any]) -> dict[str, Any]:

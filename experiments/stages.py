@@ -195,15 +195,16 @@ class Stages:
         size, out = self.experiment.size, self.folder / "report"
         denoisers = [argument for name in size.untrained for argument in ("--denoiser", name)]
         denoisers += [] if size.inception else ["--without-inception"]
+        halves = [argument for halves in size.halves for argument in ("--halves", str(halves))]
         if size.untrained:  # these two options are for them
-            denoisers += [argument for kept in size.kept for argument in ("--kept", str(kept))]
-            denoisers += [argument for halves in size.halves for argument in ("--halves", str(halves))]
+            denoisers += [*(argument for kept in size.kept for argument in ("--kept", str(kept))), *halves]
         self._measure("report", self.experiment.trained(), [*denoisers, "--out", out], out / "report.json")
         self._tell_commits(out / "report.json")
         if size.untrained:
             self._trace_paths()
         if again := self.experiment.again():
-            self._measure("evaluate", again, ["--without-inception"], self._folder(again[0]) / EVALUATION)
+            halves = halves if any(run.is_given_halves for run in again) else []
+            self._measure("evaluate", again, ["--without-inception", *halves], self._folder(again[0]) / EVALUATION)
         return out
 
     def _trace_paths(self) -> None:

@@ -93,7 +93,10 @@ def leave(folder: Path, size: SizeName, document: dict[str, Any]) -> None:
     if again := Experiment.load(folder.name, size).again():
         evaluated = folder / "runs" / again[0].name / "evaluation.json"
         evaluated.parent.mkdir(parents=True)
-        evaluated.write_text(json.dumps({"rows": [row(run.name, 0, 0.01) for run in again]}))
+        rows = [row(run.name, 0, 0.01) for run in again]
+        several = Experiment.load(folder.name, size).size.halves
+        rows += [row(run.name, 0, 0.01 / n) for run in again if run.is_given_halves for n in several]
+        evaluated.write_text(json.dumps({"rows": rows}))
 
 
 def room(name: str, document: dict[str, Any] | None = None) -> Room:
@@ -222,7 +225,10 @@ def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_he
     assert tables.main() == IncompleteError.exit_code
     first = made("here", "fixed-living-room")
     assert first["fixed-living-room"]["machine"] == MACHINE
-    assert first["fixed-living-room"]["further_seeds"]["cnn"] == [[0.01, 0.011, 0.009, 0.01]] * 2
+    further = first["fixed-living-room"]["further_seeds"]
+    assert further["cnn"] == [[0.01, 0.011, 0.009, 0.01]] * 2
+    assert further["guided_denoise 2/1"] == [[0.005, 0.0055, 0.0045, 0.005]] * 2
+    assert "cnn 2/1" not in further
     page = (tmp_path / "out" / "tables.md").read_text()
     assert str(tmp_path) not in page
     second = made("elsewhere", "night-living-room")

@@ -29,19 +29,23 @@ PURPOSES = ("half A", "half B")
 log = logging.getLogger(__name__)
 
 
-def halves_of(scene: LoadedScene, samples: Sequence[tuple[Key, View]]) -> list[tuple[F32, int]]:
+def halves_of(
+    scene: LoadedScene, samples: Sequence[tuple[Key, View]], half_spp: int | None = None
+) -> list[tuple[F32, int]]:
     """Two independent estimates of each view, (2, H, W, 3), by a sample's key, and the number of discarded renders.
 
-    Samples given together are rendered together. Raises IncompleteError if estimates stay non-finite.
+    Samples given together are rendered together; `half_spp` is that of the spec unless it is given. Raises
+    IncompleteError if estimates stay non-finite.
     """
+    given = {} if half_spp is None else {"half_spp": half_spp}
     if not samples:
         return []
     seeds = [_first_seeds(key) for key, _ in samples]
     if len(samples) == 1:
-        images = scene.render_halves(samples[0][1], seeds[0])
+        images = scene.render_halves(samples[0][1], seeds[0], **given)
     else:
         views = [view for _, view in samples for _ in PURPOSES]
-        images = scene.render_images(views, [seed for pair in seeds for seed in pair])
+        images = scene.render_images(views, [seed for pair in seeds for seed in pair], **given)
     estimates = []
     for (key, view), taken, halves in zip(
         samples, seeds, images.reshape(len(samples), 2, *images.shape[1:]), strict=True
@@ -49,7 +53,7 @@ def halves_of(scene: LoadedScene, samples: Sequence[tuple[Key, View]]) -> list[t
         thrown = 0
         for half, purpose in enumerate(PURPOSES):
             if not np.isfinite(halves[half]).all():
-                halves[half], more = _draw_again(scene, key, purpose, view, taken)
+                halves[half], more = _draw_again(scene, key, purpose, view, taken, given)
                 thrown += more
         estimates.append((halves, thrown))
     return estimates
@@ -59,7 +63,7 @@ def half_of(scene: LoadedScene, key: Key, view: View) -> F32:
     """The first of a sample's two estimates alone, (H, W, 3); raises IncompleteError if it stays non-finite."""
     taken = _first_seeds(key)
     half = scene.render_half(view, taken[0])
-    return half if np.isfinite(half).all() else _draw_again(scene, key, PURPOSES[0], view, taken)[0]
+    return half if np.isfinite(half).all() else _draw_again(scene, key, PURPOSES[0], view, taken, {})[0]
 
 
 def _first_seeds(key: Key) -> tuple[int, int]:
@@ -68,11 +72,13 @@ def _first_seeds(key: Key) -> tuple[int, int]:
     return seed_a, next(_seeds(key, PURPOSES[1], (seed_a,)))
 
 
-def _draw_again(scene: LoadedScene, key: Key, purpose: str, view: View, taken: tuple[int, int]) -> tuple[F32, int]:
+def _draw_again(
+    scene: LoadedScene, key: Key, purpose: str, view: View, taken: tuple[int, int], given: dict[str, int]
+) -> tuple[F32, int]:
     """Another estimate in place of a non-finite one, with seeds that are not `taken`, and how many were discarded."""
     _log_discarded(key, purpose)
     for attempt, seed in enumerate(islice(_seeds(key, purpose, taken), ATTEMPTS - 1), start=1):
-        image = scene.render_halves(view, (seed,))[0]
+        image = scene.render_halves(view, (seed,), **given)[0]
         if np.isfinite(image).all():
             return image, attempt
         _log_discarded(key, purpose)

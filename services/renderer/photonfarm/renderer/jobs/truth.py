@@ -40,6 +40,9 @@ PARTS = 16
 
 LEAST_PASSES = 2
 
+SMALL_HALF = 4
+"""The most samples per pixel of a half where time is what ends: so that a pass takes little of it."""
+
 SUFFIXES = (".npz", ".exr", ".png")
 """The kinds of files that an image in two halves is written as."""
 
@@ -108,10 +111,13 @@ class Truth:
 def render_truth(scene: LoadedScene, key: Key, view: View, amount: Amount) -> Truth:
     """The truth of the scene's present configuration from a view, by the view's content key.
 
-    At least two passes are rendered, and a pass is whole. Seeds follow from the key, and are those of no sample. Raises
-    IncompleteError if halves stay non-finite.
+    At least two passes are rendered, and a pass is whole. They are as large as those of samples, unless there would be
+    too few of them for each part. Seeds follow from the key, and are those of no sample. Raises IncompleteError if
+    halves stay non-finite.
     """
-    began, each, done = time.perf_counter(), 2 * scene.spec.transport.half_spp, 0
+    most = SMALL_HALF if amount.spp is None else amount.spp // (2 * PARTS)
+    half_spp = max(1, min(scene.spec.transport.half_spp, most))
+    began, each, done = time.perf_counter(), 2 * half_spp, 0
     size = scene.spec.film.height, scene.spec.film.width, 3
     sums, passes = np.zeros((PARTS, 2, *size)), np.zeros(PARTS, np.int64)
     while True:
@@ -123,7 +129,8 @@ def render_truth(scene: LoadedScene, key: Key, view: View, amount: Amount) -> Tr
         if left <= 0:
             break
         numbers = range(done, done + (min(left, scene.samples_at_once) if amount.spp else 1))
-        for halves, _ in halves_of(scene, [(make_key("truth", key, number), view) for number in numbers]):
+        keyed = [(make_key("truth", key, number), view) for number in numbers]
+        for halves, _ in halves_of(scene, keyed, half_spp):
             sums[done % PARTS] += halves
             passes[done % PARTS] += 1
             done += 1

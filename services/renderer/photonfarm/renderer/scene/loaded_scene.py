@@ -132,13 +132,13 @@ class LoadedScene:
         sensor = self._sensor.aim(view)
         return np.array(self._integrator.render_seeds(self.scene, sensor, seeds, spp, guide), np.float32)
 
-    def render_images(self, views: Sequence[View], seeds: Sequence[int]) -> F32:
+    def render_images(self, views: Sequence[View], seeds: Sequence[int], half_spp: int | None = None) -> F32:
         """A half-estimate of each view by its seed, (K, H, W, 3), in as few launches as the device's memory allows.
 
         They are those of `render_halves`, up to rounding.
         """
         places = np.stack([self._sensor.place(view) for view in views])
-        sensor, spp = self._sensor.at_origin, self.spec.transport.half_spp
+        sensor, spp = self._sensor.at_origin, half_spp or self.spec.transport.half_spp
         guide = self._learn_path_guide(self._integrator)
         return np.array(self._integrator.render_seeds(self.scene, sensor, seeds, spp, guide, places), np.float32)
 

@@ -131,7 +131,7 @@ def test_a_network_of_halves_is_given_several_with_their_number_and_their_varian
     np.testing.assert_allclose(noisy.colour[0], passes.mean(axis=0), rtol=1e-6)
     np.testing.assert_allclose(noisy.variance[0], passes.mean(axis=-1).var(axis=0, ddof=1) / 2, rtol=1e-4, atol=1e-6)
     assert torch.equal(batch.target[0], torch.from_numpy(reader.read(found.measured[0]).radiance))
-    with pytest.raises(SpecError, match="halves: no run is of a network of halves"):
+    with pytest.raises(SpecError, match="halves = 2: no run is of a network of halves"):
         compare(measured.store, [trained()], halves=[2], **QUICK)
 
 

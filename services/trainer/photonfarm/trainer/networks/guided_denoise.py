@@ -78,7 +78,10 @@ class GuidedDenoise(Guided):
         self.register_buffer("coarse", torch.tensor(COARSE[:filters]), persistent=False)
 
     def forward(self, inputs: Inputs) -> Tensor:
-        """The image, (B, H, W, 3), linear radiance × exposure. What reflects nothing shows what it emits."""
+        """The image, (B, H, W, 3), linear radiance × exposure.
+
+        Of one pass, what reflects nothing shows what it emits.
+        """
         inputs = self.raise_specular(inputs)
         noisy, lit = require(inputs.noisy), self.further(inputs)
         denoised = require(noisy.filtered) if self._has_denoiser else None

@@ -159,7 +159,10 @@ def list_predictors(
     """
     several = [replace(run, halves=count) for run in runs if run.needs.passes for count in halves]
     if halves and not (several or denoisers):
-        raise SpecError("halves: no run is of a network of halves, as guided_denoise is, and no denoiser is named")
+        asked = ", ".join(map(str, halves))
+        raise SpecError(
+            f"halves = {asked}: no run is of a network of halves, as guided_denoise, and no denoiser is named"
+        )
     amounts = [*((*choice, 1) for choice in denoisers)]
     amounts += [(name, 1, count) for name in dict.fromkeys(name for name, _ in denoisers) for count in halves]
     return [*runs, *several, *(ReadyPredictor(name, k, runs[0].settings, count) for name, k, count in amounts)]

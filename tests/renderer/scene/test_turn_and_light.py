@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,8 @@ from photonfarm.renderer.jobs.render import lit_points
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.base_cloud import cloud_of, geometry_of
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.tools.check.shapes import placements
+from photonfarm.renderer.tools.plan_view import PlanView
 from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces, rest, sample_modification
 from photonfarm.scene.view import View, sample_view
 
@@ -190,3 +193,27 @@ def test_a_light_that_cannot_change_so_is_refused(file_scene: Loader, folder: Pa
         file_scene(folder, KINDS["envmap"][1], lights=[{**sky, "at": [1, 0, 0], "box": EVERYWHERE}])
     with pytest.raises(SpecError, match="lacks at"):
         file_scene(folder, KINDS["area"][1], lights=[{"name": "lamp", "shapes": ["Lamp"]}])
+
+
+def test_a_check_tries_angles_and_the_plan_shows_them(file_scene: Loader, tmp_path: Path) -> None:
+    """A beam that stays clear of a wall until it turns."""
+    block = '<shape type="cube" id="{}"><transform name="to_world"><scale {}/><translate {}/></transform></shape>'
+    wall = block.format("Wall", 'x="3" y="2" z="0.1"', 'z="-1" y="2"')
+    beam = block.format("Beam", 'x="0.8" y="0.3" z="0.1"', 'z="-0.5" y="0.5"')
+    there = {"name": "beam", "shapes": ["Beam"], "at": [0, 0, -0.5]}
+    there["box"] = {"min": [-0.5, 0, -0.5], "max": [0.5, 0, -0.5]}
+    content = wall + beam + KINDS["constant"][1]
+    shares = []
+    for turn in ({}, {"turn": {"min": -90, "max": 90}}):
+        scene = file_scene(tmp_path, content, objects=[{**there, **turn}])
+        geometry = scene.base()[0]
+        shares.append(placements(scene, geometry)[0].cut)
+    assert shares[0] == 0 < 0.3 < shares[1]
+    plan = PlanView.of(scene.spec, geometry)
+    standing, turned = (str(plan.configuration(changed(scene, turn=degrees), [])) for degrees in (0, 90))
+    assert "polygon" not in standing
+    polygon = re.search('<polygon class="thing hue0" points="([^"]*)"', turned)
+    assert polygon is not None
+    corners = np.array([[float(number) for number in point.split(",")] for point in polygon[1].split()])
+    width, height = np.ptp(corners, axis=0)
+    assert height == pytest.approx(8 * width, rel=0.01)

@@ -45,7 +45,9 @@ def test_what_stands_in_a_wall_or_beyond_and_a_camera_inside_of_something_are_sa
     assert look(inside, without=["pedestal"]) == []
 
 
-def test_a_group_in_a_solid_that_never_moves_is_said(file_scene: Any, tmp_path: Path) -> None:
+def test_a_group_in_a_solid_that_never_moves_and_a_camera_between_two_sheets_are_said(
+    file_scene: Any, tmp_path: Path
+) -> None:
     pillar, ball = (
         f'<shape type="cube" id="{name}"><transform name="to_world"><scale value="{size}"/>'
         f'<translate x="{x}" y="{size}" z="0"/></transform></shape>'
@@ -53,6 +55,9 @@ def test_a_group_in_a_solid_that_never_moves_is_said(file_scene: Any, tmp_path: 
     )
     lamp = '<shape type="sphere" id="Lamp"><point name="center" x="0" y="2.5" z="0"/><float name="radius" value="0.1"/>'
     lamp += '<emitter type="area"/></shape>'
+    for y in (2.7, 2.8):
+        lamp += '<shape type="rectangle"><transform name="to_world"><rotate x="1" angle="-90"/><scale value="3"/>'
+        lamp += f'<translate x="0" y="{y}" z="0"/></transform></shape>'
     box = {"min": [-4, 0, -4], "max": [4, 0, 4]}
     block = {"name": "block", "shapes": ["Block"], "at": [2, 0, 0], "box": box}
     scene = file_scene(tmp_path, pillar + ball + lamp, objects=[block])
@@ -61,6 +66,8 @@ def test_a_group_in_a_solid_that_never_moves_is_said(file_scene: Any, tmp_path: 
         configuration = Shot.of(place={"block": (x, 0, 0)}).apply(scene.spec)
         scene.apply(configuration)
         assert [doubt.partition(":")[0] for doubt in look_closer(scene, configuration, view)] == said
+    between = View(np.float32([0, 2.75, 0]), np.float32([0, 1, 0]))
+    assert look_closer(scene, configuration, between)[0].startswith("the camera sees hardly anything")
 
 
 def test_the_truth_of_a_stored_view_has_the_mean_of_its_passes_and_other_seeds(tmp_path: Path, small: Any) -> None:

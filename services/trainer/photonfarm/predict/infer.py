@@ -132,11 +132,13 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
         out.mkdir(parents=True, exist_ok=True)
     for file, pixels in zip(files, shown.values(), strict=True):
         write_png(enlarge(pixels), file)
+    sample = source.read(row)
+    shot = describe_shot(source.spec, sample.modification, sample.view)
     (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
     if not is_held_out:
-        return InferResult(files, f"row {row}: {NOT_JUDGED}")
+        return InferResult(files, f"row {row}: {NOT_JUDGED}; {shot}")
     error = choose_error(batch)(image, *batch.target[0].numpy())
-    return InferResult(files, f"row {row}: held out; squared error {error:.5f}, the noise taken out")
+    return InferResult(files, f"row {row}: held out; squared error {error:.5f}, the noise taken out; {shot}")
 
 
 def _explain_missing(source: SceneReader, row: int) -> StoreError | IncompleteError:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.records import F32
 from photonfarm.renderer.scene.arrays import points as mi_points
-from photonfarm.scene.groups import shape_ids
+from photonfarm.scene.groups import Box, shape_ids
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.view import View
 
@@ -136,7 +136,26 @@ def look_closer(loaded: LoadedScene, modification: Modification, view: View) -> 
         found.append(f"the camera is inside {shapes[number].id()!r}")
     elif (view.origin < low - slack).any() or (view.origin > high + slack).any():
         found.append("the camera is beyond all that never moves")
+    elif not have_sight(loaded, view.origin[None])[0]:
+        found.append("the camera sees hardly anything of what cameras look at: it is inside of something, or behind it")
     return found
+
+
+LOOK_AT, SEEN = 64, 0.1
+"""The random look-at points, and the share of them that a camera in the open sees."""
+
+
+def have_sight(loaded: LoadedScene, points: F32) -> NDArray[np.bool_]:
+    """Whether points (N, 3) see enough of where cameras look, in the present configuration, (N,)."""
+    from photonfarm.renderer.scene.gbuffer import sight_shares
+
+    sees: NDArray[np.bool_] = sight_shares(loaded.scene, points, uniform_in(loaded.spec.view.look_at, LOOK_AT)) >= SEEN
+    return sees
+
+
+def uniform_in(box: Box, count: int) -> F32:
+    """Points uniform in a box, always the same, (count, 3)."""
+    return (box.low + np.random.default_rng(0).random((count, 3)) * (box.high - box.low)).astype(np.float32)
 
 
 def directions() -> F32:

@@ -20,11 +20,10 @@ from numpy.typing import NDArray
 from photonfarm.core.errors import SpecError
 from photonfarm.core.records import F32
 from photonfarm.core.waiting import Log
-from photonfarm.renderer.scene.gbuffer import sight_shares
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.renderer.scene.surroundings import NONE
+from photonfarm.renderer.scene.surroundings import NONE, have_sight, uniform_in
 from photonfarm.scene.free_space import FreeSpace, pack
-from photonfarm.scene.groups import Box, shape_ids
+from photonfarm.scene.groups import shape_ids
 from photonfarm.scene.modification import rest, sample_modifications
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import are_in_free_space
@@ -34,9 +33,6 @@ ALONG = 48
 
 CONFIGURATIONS, ORIGINS = 64, 512
 """The random configurations, and the random origins in each, in which the free share of the box is measured."""
-
-LOOK_AT, SEEN = 64, 0.1
-"""The random look-at points, and the share of them that a free cell sees."""
 
 LEAST = 0.02
 """The share of the box that must be free, so that drawing cameras in it ends soon."""
@@ -99,14 +95,8 @@ def _free(scene: LoadedScene, middles: F32, reach: np.floating) -> NDArray[np.bo
     scene.apply(rest(spec).without_groups())
     around = scene.surroundings(middles)
     clear = around.clearance > reach + spec.view.near
-    seen = sight_shares(scene.scene, middles, _inside(spec.view.look_at, LOOK_AT)) >= SEEN
-    free: NDArray[np.bool_] = clear & seen & (around.solid == NONE)
+    free: NDArray[np.bool_] = clear & have_sight(scene, middles) & (around.solid == NONE)
     return free
-
-
-def _inside(box: Box, count: int) -> F32:
-    """Points uniform in a box, always the same, (count, 3)."""
-    return (box.low + np.random.default_rng(0).random((count, 3)) * (box.high - box.low)).astype(np.float32)
 
 
 def _middles(spec: SceneSpec) -> tuple[F32, NDArray[np.float64]]:
@@ -144,4 +134,4 @@ def _share(spec: SceneSpec, space: FreeSpace) -> float:
     """The share of the box of origins that is free, in the mean over random configurations."""
     with_space = spec.model_copy(update={"view": spec.view.model_copy(update={"free_space": space})})
     vectors = np.repeat(sample_modifications(with_space, 0, range(CONFIGURATIONS)), ORIGINS, axis=0)
-    return float(are_in_free_space(with_space, _inside(spec.view.origin, len(vectors)), vectors).mean())
+    return float(are_in_free_space(with_space, uniform_in(spec.view.origin, len(vectors)), vectors).mean())

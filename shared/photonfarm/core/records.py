@@ -58,7 +58,7 @@ class BasePointCloud:
     emission: F32  # (P, 3) radiance leaving along the normal
     group: NDArray[np.int16]  # (P,) movable group, or STATIC
     face: NDArray[np.uint32]  # (P,) triangle of `Geometry` that the point lies in
-    pivots: Pivots | None = None  # of the spec, and not stored; None: nothing turns
+    pivots: Pivots | None = None  # of the spec, and not stored; None: a scene whose configurations have no turns
 
 
 @dataclass(frozen=True, slots=True, eq=False)

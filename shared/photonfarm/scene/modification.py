@@ -189,7 +189,7 @@ def rebuild(base: BasePointCloud, modification: Modification) -> tuple[F32, NDAr
     if not len(modification.present):
         return base.position, np.ones(len(base.position), np.bool_)
     position = base.position
-    if base.pivots is not None:
+    if base.pivots is not None and modification.turn.any():
         position = position.copy()
         for g in np.flatnonzero(modification.turn):
             own = base.group == g

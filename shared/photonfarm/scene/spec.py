@@ -214,8 +214,8 @@ class SceneSpec(Frozen):
 
     @property
     def pivots(self) -> Pivots | None:
-        """What groups turn about; None if none does."""
-        if not any(group.turn for group in self.groups):
+        """What groups turn about; None in a scene whose configurations have no turns."""
+        if not self.further_changes:
             return None
         return Pivots(np.array([group.at for group in self.groups]), np.array(self.view.up, np.float64))
 

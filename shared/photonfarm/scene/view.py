@@ -156,7 +156,7 @@ def are_in_group(spec: SceneSpec, g: int, origins: F32, modifications: F32) -> N
         return np.zeros(len(origins), np.bool_)
     low, high = np.array(space.groups[group.name])
     offset = origins.astype(np.float64) - (np.array(group.at) + modifications[:, g, :3])
-    if group.turn is not None:  # as seen from the group
+    if modifications.shape[-1] > len(FIELDS):  # as seen from the group
         up = np.array(spec.view.up, np.float64)
         back = np.stack([turn_matrix(-degrees, up) for degrees in modifications[:, g, len(FIELDS)]])
         offset = np.einsum("nij,nj->ni", back, offset)

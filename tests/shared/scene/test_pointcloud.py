@@ -1,12 +1,21 @@
 """Point cloud sampling, supplement 2.3 and 2.1. Significance of the statistical tests: 1e-4 each, seeds fixed."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from photonfarm.core.keys import Stream, make_key
-from photonfarm.core.records import STATIC, BasePointCloud, Geometry
-from photonfarm.scene.modification import draw, rebuild, sample_modification, sample_surface
+from photonfarm.core.records import STATIC, BasePointCloud, Geometry, Pivots
+from photonfarm.scene.modification import (
+    Modification,
+    draw,
+    rebuild,
+    rebuild_surfaces,
+    sample_modification,
+    sample_surface,
+)
 from photonfarm.scene.spec import SceneSpec
 
 COUNT = 40_000
@@ -70,6 +79,31 @@ def test_points_move_with_their_group_and_no_others_do(base: BasePointCloud, dyn
             moved = position[of_group] - base.position[of_group]
             assert np.abs(moved - modification.translation[g]).max() < 1e-6
             assert (present[of_group] == modification.present[g]).all()
+
+
+def test_points_turn_about_the_at_of_their_group_before_they_move(base: BasePointCloud) -> None:
+    """As docs/store-format.md says, with y up: what lies along +x comes to lie along −z by a quarter of a turn."""
+    at = np.arange(12.0).reshape(4, 3)
+    vector = np.zeros((4, 9), np.float32)
+    vector[:, 3:] = 1, 0, 1, 1, 1, 1
+    vector[1, 4], vector[2, [0, 4]], vector[3, 5:] = 90, (1, -30), (2, 1, 0.5, 0)
+    modification = Modification.from_vector(vector)
+    turning = replace(base, pivots=Pivots(at, np.array([0.0, 1, 0])))
+    (position, _), (normal, emission) = rebuild(turning, modification), rebuild_surfaces(turning, modification)
+    for g, degrees in ((1, 90), (2, -30)):
+        own, angle = base.group == g, np.radians(degrees)
+        x, y, z = (base.position[own] - at[g]).T
+        turned = [np.cos(angle) * x + np.sin(angle) * z, y, np.cos(angle) * z - np.sin(angle) * x]
+        np.testing.assert_allclose(position[own], np.transpose(turned) + at[g] + vector[g, :3], atol=1e-5)
+        x, y, z = base.normal[own].T
+        turned = [np.cos(angle) * x + np.sin(angle) * z, y, np.cos(angle) * z - np.sin(angle) * x]
+        np.testing.assert_allclose(normal[own], np.transpose(turned), atol=1e-6)
+    others = ~np.isin(base.group, (1, 2))
+    np.testing.assert_array_equal(position[others], base.position[others])
+    np.testing.assert_array_equal(normal[others], base.normal[others])
+    dimmed = base.group == 3
+    np.testing.assert_array_equal(emission[dimmed], base.emission[dimmed] * np.float32([2, 1, 0]))
+    np.testing.assert_array_equal(emission[~dimmed], base.emission[~dimmed])
 
 
 def test_a_static_scene_has_its_base_cloud(base: BasePointCloud, static_spec: SceneSpec) -> None:

@@ -33,7 +33,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
 
     Of the first, two plans: jobs 0 to 2 and 3 to 5, of 8 rows each. Job 3 wants passes of views in jobs 0 to 2; job 4
     is not committed, and job 5 has no files. Rows 20 to 23 are unused. The second is static (G = 0) and without
-    photons; the third looks straight up, and its second plan was withdrawn.
+    photons; the third looks straight up, its object turns, and its second plan was withdrawn.
     """
     store = Store(tmp_path_factory.mktemp("conformance") / "store", create=True)
     grown(store)
@@ -41,7 +41,10 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Store:
     scene = store.scene(store.plan(static, Request(modifications=3), shard_rows=2).scene_id)
     samples.commit_all(scene)
     above = {"min": [0, 1, 0], "max": [0, 2, 0]}
-    upwards = samples.small_spec(name="up", view={"origin": {"min": [0, 0, 0], "max": [0, 0, 0]}, "look_at": above})
+    turning = [{**samples.ALWAYS["objects"][0], "turn": {"min": -90, "max": 90}}]
+    upwards = samples.small_spec(
+        name="up", objects=turning, view={"origin": {"min": [0, 0, 0], "max": [0, 0, 0]}, "look_at": above}
+    )
     above_scene = store.scene(store.plan(upwards, Request(modifications=2)).scene_id)
     samples.commit_all(above_scene)
     above_scene.plan(Request(modifications=2, seed=1))
@@ -119,6 +122,7 @@ def same(reader: SceneReader, row: int, plain: Arrays) -> None:
     assert plain["densities"].tolist() == [1, 1]
     moved, vector = zip("xyz", sample.modification.translation.reshape(-1), strict=False), sample.modification
     changed = [f"object {axis}" for axis, value in moved if value] + ["object present"] * (not vector.present.all())
+    changed += ["object turn"] * bool(vector.turn.any())
     assert plain["changed"].tolist() == changed
     np.testing.assert_allclose(plain["rays"], Camera.of(sample.view, reader.spec).rays(), atol=1e-6)
     vectors = sample.modification.vector, sample.view.vector

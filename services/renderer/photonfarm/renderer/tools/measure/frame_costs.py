@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import cycle, islice
 from math import sqrt
@@ -142,9 +142,9 @@ def write_frame_costs(
     reader.refresh()
     _check_complete(reader, rows)
     frames = [TimedFrame(row, *reader.inputs(row)[:2], reader.modification_key(row)) for row in rows]
-    used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(reader.base()[1]).items()}
-    spec = locate(reader.spec)
-    costs = frame_costs(LoadedScene.load(spec), BasePointCloud(**used), frames, amounts, timed, seconds)
+    cloud, spec = reader.base()[1], locate(reader.spec)
+    used: dict[str, Any] = {name: values[:points] for name, values in arrays_of(cloud).items()}
+    costs = frame_costs(LoadedScene.load(spec), replace(cloud, **used), frames, amounts, timed, seconds)
     costs.write(out)
     return costs
 

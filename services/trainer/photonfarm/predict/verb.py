@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 @fov_option
 @click.option(
     "--truth",
-    metavar="SPP|SECONDSs",
+    metavar="SPP|TIME",
     help="Render it by bdpt beside the network's image, with so many samples per pixel (256) or for so long (20s).",
 )
 @click.option("--store-it", is_flag=True, help="Plan it as a sample, too; else the store stays as it is.")

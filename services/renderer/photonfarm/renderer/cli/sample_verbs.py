@@ -177,7 +177,7 @@ def measure_frames(
 @fov_option
 @click.option(
     "--spp",
-    metavar="SPP|SECONDSs",
+    metavar="SPP|TIME",
     help="Samples per pixel (256), or for how long to render (20s).  [default: 64]",
 )
 @click.option(

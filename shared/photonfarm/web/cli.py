@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import logging
-import signal
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +12,6 @@ from photonfarm.farm.running_farm import METRICS_PORT, WEB_PORT
 
 if TYPE_CHECKING:
     from photonfarm.farm.watch import FarmWatch
-    from photonfarm.web.server import Routes
 
 
 _watch_options = combine_options(
@@ -60,10 +56,10 @@ def web(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any)
     """
     from photonfarm.core.processes import free_port
     from photonfarm.web.farm_pages import FarmPages
-    from photonfarm.web.server import make_page_routes
+    from photonfarm.web.server import make_page_routes, serve
 
     pages = FarmPages(store, _watch(store, redis_url, runs))
-    _serve(make_page_routes(pages), "", **where | {"port": free_port(where["port"])})
+    serve(make_page_routes(pages), say=click.echo, **where | {"port": free_port(where["port"])})
 
 
 @click.command("serve-metrics")
@@ -75,9 +71,13 @@ def serve_metrics(store: str | Path, redis_url: str, runs: tuple[Path, ...], **w
     `web` serves the same beside its pages. Ends on Ctrl-C.
     """
     from photonfarm.web.images import Cached
-    from photonfarm.web.server import make_metric_routes
+    from photonfarm.web.server import make_metric_routes, serve
 
-    _serve(make_metric_routes(Cached(_watch(store, redis_url, runs).look).get), "metrics", **where)
+    serve(
+        make_metric_routes(Cached(_watch(store, redis_url, runs).look).get),
+        say=lambda address: click.echo(f"{address}metrics"),
+        **where,
+    )
 
 
 def _watch(store: str | Path, redis_url: str, runs: tuple[Path, ...]) -> FarmWatch:
@@ -90,22 +90,3 @@ def _watch(store: str | Path, redis_url: str, runs: tuple[Path, ...]) -> FarmWat
     if not runs and running_farm(opened) is None:
         runs = (Path("run"),)
     return FarmWatch(opened, redis_url, runs, named_redis=names_redis())
-
-
-def _serve(routes: Routes, path: str, *, host: str, port: int, names: tuple[str, ...]) -> None:
-    """Serve until Ctrl-C, and print the address. Raises StoreError if nothing can listen there."""
-    from photonfarm.core.errors import StoreError
-    from photonfarm.web.server import PageServer
-
-    logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
-    try:
-        server = PageServer(routes, host, port, names)
-    except OSError as error:
-        raise StoreError(f"--host {host} --port {port}: cannot listen there: {error.strerror}") from error
-    with server:
-        click.echo(f"http://{host}:{server.server_address[1]}/{path}")
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            return

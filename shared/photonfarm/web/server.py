@@ -1,7 +1,8 @@
-"""The server of the pages and the metrics: GET and HEAD of what the table of routes has, and nothing else.
+"""The server of pages: GET and HEAD of what a table of routes has, POST of what a second one has, and nothing else.
 
 It serves one machine's user, so it listens on this machine alone unless told otherwise, and answers only to names of
-its own, so that no other site's page can ask it (by a name that leads here).
+its own, so that no other site's page can ask it (by a name that leads here), and no other site's page can post to it.
+The farm's pages and the metrics have no second table.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Callable
+import signal
+import sys
+from collections.abc import Callable, Sequence
 from functools import cache
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -17,7 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from photonfarm.core.errors import PhotonfarmError
+from photonfarm.core.errors import PhotonfarmError, StoreError
 from photonfarm.core.page import STYLES
 
 if TYPE_CHECKING:
@@ -68,7 +71,7 @@ def make_page_routes(pages: FarmPages) -> Routes:
         ("/run/([0-9]{1,3})/([0-9]{1,8}).png", True, lambda run, step: (PNG, pages.prediction(int(run), int(step)))),
     ]
     routes = [(re.compile(pattern.replace(".", r"\.")), stays, make) for pattern, stays, make in table]
-    return routes + make_metric_routes(pages.view)
+    return [*routes, *make_metric_routes(pages.view)]
 
 
 def make_metric_routes(look: Callable[[], FarmProgress]) -> Routes:
@@ -100,7 +103,7 @@ JSON = "application/json"
 
 Answer = tuple[str, bytes]  # its type and its content
 
-Routes = list[tuple[re.Pattern[str], bool, Callable[..., Answer]]]
+Routes = Sequence[tuple[re.Pattern[str], bool, Callable[..., Answer]]]
 """What is served: patterns of paths, whether an answer stays the same, and functions of the patterns' groups."""
 
 log = logging.getLogger(__name__)
@@ -118,6 +121,21 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Answer with what the path names."""
+        self._find(self.server.routes)
+
+    do_HEAD = do_GET  # noqa: N815 - the library asks for these names
+
+    def do_POST(self) -> None:
+        """Do what the path names, if a page of this server asks for it; there is never a body to read."""
+        origin = self.headers.get("Origin")
+        if not self.server.writes:
+            self._refuse(HTTPStatus.NOT_IMPLEMENTED, "this server has no way to write")
+        elif origin is None or urlsplit(origin).netloc != self.headers.get("Host"):
+            self._refuse(HTTPStatus.FORBIDDEN, "only a page of this server may ask for that")
+        else:
+            self._find(self.server.writes)
+
+    def _find(self, routes: Routes) -> None:
         if not self._is_asked_by_name():
             self._refuse(HTTPStatus.FORBIDDEN, "this server answers only to its own name")
             return
@@ -125,13 +143,11 @@ class _Handler(BaseHTTPRequestHandler):
             path = urlsplit(self.path).path
         except ValueError:
             path = ""
-        for pattern, stays, make in self.server.routes:
+        for pattern, stays, make in routes:
             if match := pattern.fullmatch(path):
                 self._answer(make, match.groups(), stays)
                 return
         self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
-
-    do_HEAD = do_GET  # noqa: N815 - the library asks for these names
 
     def _answer(self, make: Callable[..., Answer], groups: tuple[str, ...], stays: bool) -> None:
         try:
@@ -175,12 +191,32 @@ class PageServer(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, routes: Routes, host: str, port: int, names: tuple[str, ...] = ()) -> None:
+    def __init__(
+        self, routes: Routes, host: str, port: int, names: tuple[str, ...] = (), *, writes: Routes = ()
+    ) -> None:
         """Listen; raises OSError if that is impossible. It answers to `names` besides its host's and this machine's."""
-        self.routes = routes
+        self.routes, self.writes = routes, writes
         self.names = {*LOCAL_NAMES, host.lower(), *(name.lower() for name in names)}
         super().__init__((host, port), _Handler)
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002
         """Log a connection that broke off."""
         log.debug("a connection broke off", exc_info=True)
+
+
+def serve(
+    routes: Routes, *, host: str, port: int, names: tuple[str, ...], say: Callable[[str], None], writes: Routes = ()
+) -> None:
+    """Serve until Ctrl-C, once the address was said. Raises StoreError if nothing can listen there."""
+    logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    try:
+        server = PageServer(routes, host, port, names, writes=writes)
+    except OSError as error:
+        raise StoreError(f"--host {host} --port {port}: cannot listen there: {error.strerror}") from error
+    with server:
+        say(f"http://{host}:{server.server_address[1]}/")
+        try:
+            server.serve_forever()
+        except KeyboardInterrupt:
+            return

@@ -11,15 +11,14 @@ import numpy as np
 import pytest
 import torch
 from click.testing import CliRunner
+from small_room import rendered, trained
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.pictures import display
 from photonfarm.core.statistics import block_z_test, clean_error
 from photonfarm.farm.devices import Card
-from photonfarm.plan.request import Request
 from photonfarm.predict import infer, open_run
-from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.arrangement import Shot
@@ -30,15 +29,12 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import View, sample_view
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.read.find import find_start
-from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
-from photonfarm.trainer.training.loop import train
 
 PAGE = Path(__file__).resolve().parents[3] / "docs/what-if.md"
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four samples of the built-in room, each of another configuration."""
     return rendered(load_spec("room"), tmp_path_factory.mktemp("predict"))
 
 
@@ -50,29 +46,6 @@ def turning(tmp_path_factory: pytest.TempPathFactory) -> Path:
     objects = tuple(each.model_copy(update={"turn": Turn(min=-180, max=180)}) for each in room.objects)
     lights = tuple(each.model_copy(update=light) for each in room.lights)
     return rendered(room.model_copy(update={"objects": objects, "lights": lights}), tmp_path_factory.mktemp("turning"))
-
-
-def rendered(room: SceneSpec, folder: Path) -> Path:
-    """A store of four small samples of a room."""
-    changes = {
-        "film": room.film.model_copy(update={"width": 24, "height": 16}),
-        "transport": room.transport.model_copy(update={"half_spp": 1}),
-        "photons": room.photons.model_copy(update={"paths": 512}),
-        "points": 2048,
-    }
-    store = Store(folder / "store", create=True)
-    scene = store.scene(store.plan(room.model_copy(update=changes), Request(modifications=4), shard_rows=4).scene_id)
-    assert ShardRenderer(store, worker="test").render(scene.scene_id, 0)
-    return Path(store.root)
-
-
-def trained(store: Path, folder: Path, architecture: str) -> Path:
-    """A run of one step."""
-    (scene_id,) = Store(store).scene_ids()
-    network = NetworkSettings.model_validate({"architecture": architecture, "width": 4})
-    settings = TrainSettings(network=network, max_steps=1, batch=2, hold_out=0.5, poll_seconds=0.01, threads=1)
-    train(SceneReader(store, scene_id), settings, folder)
-    return folder
 
 
 def spec_of(store: Path) -> SceneSpec:

@@ -6,7 +6,6 @@ buffers` has written them to a file.
 
 from __future__ import annotations
 
-import logging
 import statistics
 import subprocess
 import time
@@ -25,7 +24,6 @@ from photonfarm.core.errors import IncompleteError, SpecError, StoreError, store
 from photonfarm.core.pictures import enlarge, write_png
 from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
-from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.predict.opened_run import OpenRun, never_seen
 from photonfarm.renderer.jobs.truth import Amount, write_beside
@@ -35,7 +33,6 @@ from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 from photonfarm.store import Sample, SceneReader, Store
-from photonfarm.store.model.lease import announce_work
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import require
@@ -43,8 +40,6 @@ from photonfarm.trainer.predictors.evaluation import choose_error
 from photonfarm.trainer.predictors.trained import TrainedRun
 
 NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
-log = logging.getLogger(__name__)
-
 FFMPEG = "imageio_ffmpeg"
 """The package with ffmpeg, of the extra `video`."""
 
@@ -102,10 +97,7 @@ def show_frame(
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
     if store_it:
-        stored = opened.store.scene(opened.scene_id)
-        with announce_work(stored.storage, opened.scene_id, "infer", log.warning):
-            planned = stored.plan(Chosen.of(*shot))
-        said.append("planned as a sample" if planned.new else "planned as a sample before")
+        said.append(opened.plan_sample(*shot[1:]))
     files = write_beside(out, image, truth, opened.spec.exposure, about)
     return InferResult(tuple(files), "\n".join(said), tuple(about["doubts"]))
 

@@ -8,9 +8,11 @@ Shape letters: H W image, P points, K photon slots.
 
 from __future__ import annotations
 
+import copy
+import logging
 import os
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +27,13 @@ from photonfarm.core.processes import can_render
 from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
 from photonfarm.farm.devices import AUTO, CPU
+from photonfarm.plan.chosen import Chosen
 from photonfarm.scene.arrangement import Shot, find_doubts, with_fov
 from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces, rest
 from photonfarm.scene.spec import WITHOUT_SHADOWS
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import Store
+from photonfarm.store.model.lease import announce_work
 from photonfarm.trainer.data.batch import choose_kept_pixels
 from photonfarm.trainer.networks.inputs import (
     SURFACE,
@@ -45,8 +49,14 @@ from photonfarm.trainer.runs.run_folder import make_environment
 
 if TYPE_CHECKING:
     from photonfarm.core.records import Photons
-    from photonfarm.renderer.jobs.truth import Truth
+    from photonfarm.renderer.jobs.truth import RefinedTruth, Truth
+    from photonfarm.renderer.scene.floor_plan import FloorPlan
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
+    from photonfarm.scene.spec import Film, SceneSpec
+    from photonfarm.trainer.predictors.evaluation import DevicePredictor
+
+
+log = logging.getLogger(__name__)
 
 
 def require_renderer(run: TrainedRun) -> None:
@@ -87,16 +97,30 @@ class OpenRun:
         self.store = Store(store)
         source = run.source(self.store.root)
         self.spec, self.scene_id = with_fov(locate(source.spec), fov), run.scene_id
-        geometry, self._cloud = source.base()
+        geometry, self.cloud = source.base()
         self._scene: LoadedScene = load_scene(self.spec)
         torch.set_num_threads(run.settings.threads)
         self._run, self._needs, self._exposure = run, run.needs, self.spec.exposure
-        self._trained_fov = source.spec.view.fov_deg
+        self._trained_fov, self.architecture = source.spec.view.fov_deg, run.settings.network.architecture
         if device == AUTO and backend.device().card is None:
             device = CPU
-        predictor = run.predictor(self.spec, (geometry, self._cloud), device)
+        self._predictor_of: Callable[[SceneSpec], DevicePredictor] = lambda spec: run.predictor(
+            spec, (geometry, self.cloud), device
+        )
+        predictor = self._predictor_of(self.spec)
         self._images, self._device, self.network = predictor.images, predictor.device, predictor.network
+        self._of_films: dict[Film, dict[str, Any]] = {}
         self._apply(rest(self.spec))
+
+    def with_film(self, film: Film) -> OpenRun:
+        """The same in its present configuration, with images of another size; the network was not trained on that."""
+        if film not in self._of_films:
+            spec = self.spec.model_copy(update={"film": film})
+            self._of_films[film] = {"spec": spec, "_images": self._predictor_of(spec).images}
+        seen = copy.copy(self)
+        for name, value in {**self._of_films[film], "_scene": self._scene.with_film(film)}.items():
+            setattr(seen, name, value)
+        return seen
 
     def predict(
         self,
@@ -117,7 +141,7 @@ class OpenRun:
         """
         self._check_halves(passes, both=both)
         began = time.perf_counter()
-        configuration, view = self._stage(configuration, view, asked)
+        configuration, view = self.stage(configuration, view, **asked)
         staged = time.perf_counter()
         inputs = self._inputs(view)
         halves = [self._noisy(view, passes, other=other) for other in (False, True)[: 1 + both] if self._needs.kept]
@@ -143,8 +167,27 @@ class OpenRun:
 
         if (spp is None) == (seconds is None):
             raise SpecError("truth: one of spp and seconds is required")
-        _, view = self._stage(configuration, view, asked)
+        _, view = self.stage(configuration, view, **asked)
         return render_truth(self._scene, view_key(self._key, view.vector), view, Amount(spp, seconds))
+
+    def plan_sample(self, configuration: Modification, view: View) -> str:
+        """Plan it in the store as a sample that was chosen by hand, which workers find; says whether that is new."""
+        stored = self.store.scene(self.scene_id)
+        with announce_work(stored.storage, self.scene_id, "predict", log.warning):
+            planned = stored.plan(Chosen.of(self.spec, configuration, view))
+        return "planned as a sample" if planned.new else "planned as a sample before"
+
+    def draw_plan(self) -> FloorPlan:
+        """The room from above; the scene comes to rest."""
+        from photonfarm.renderer.scene.floor_plan import draw_floor_plan
+
+        self.stage(rest(self.spec))
+        return draw_floor_plan(self._scene)
+
+    def refine(self, refined: RefinedTruth, frame: Frame) -> None:
+        """Add one more pass to the truth of a frame."""
+        _, view = self.stage(frame.configuration, frame.view)
+        refined.add(self._scene, view_key(self._key, view.vector), view)
 
     def look_closer(
         self, configuration: Modification | None = None, view: View | None = None, **asked: Any
@@ -152,13 +195,13 @@ class OpenRun:
         """What stands in walls, or beyond them, and what the camera is inside of, each as a sentence; as `predict`."""
         from photonfarm.renderer.scene.surroundings import look_closer
 
-        configuration, view = self._stage(configuration, view, asked)
+        configuration, view = self.stage(configuration, view, **asked)
         return never_seen(look_closer(self._scene, configuration, view))
 
-    def _stage(
-        self, configuration: Modification | None, view: View | None, asked: Mapping[str, Any]
+    def stage(
+        self, configuration: Modification | None = None, view: View | None = None, **asked: Any
     ) -> tuple[Modification, View]:
-        """Bring the scene into the configuration that is asked for; returns that and the view."""
+        """Bring the scene into the configuration that is asked for, as `predict`; returns that and the view."""
         shot = Shot.of(**asked)
         wanted, seen = shot.apply(self.spec, configuration), shot.view(self.spec, view)
         if not np.array_equal(wanted.vector, self._modification.vector):
@@ -182,12 +225,12 @@ class OpenRun:
 
         self._scene.apply(modification)
         self._modification, self._key = modification, modification.key(self.spec.radiance_id)
-        self._lit = lit_points(self._cloud, modification)
+        self._lit = lit_points(self.cloud, modification)
         self._photons = photons_of(self._scene, self._key)[0] if self._needs.photons else None
         used = self._run.settings.network.points
-        position, present = rebuild(self._cloud, modification)
+        position, present = rebuild(self.cloud, modification)
         self._points = position[:used], present[:used]
-        surfaces = rebuild_surfaces(self._cloud, modification) if self.spec.further_changes else ()
+        surfaces = rebuild_surfaces(self.cloud, modification) if self.spec.further_changes else ()
         self._surfaces = [values[:used] for values in surfaces]
 
     def _inputs(self, view: View) -> Inputs:

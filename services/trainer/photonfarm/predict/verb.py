@@ -1,7 +1,8 @@
-"""The verb infer."""
+"""The verbs infer and live."""
 
 from __future__ import annotations
 
+import shlex
 import time
 from functools import partial
 from pathlib import Path
@@ -16,6 +17,9 @@ from photonfarm.trainer.cli.train_verb import run_option
 
 if TYPE_CHECKING:
     from photonfarm.scene.arrangement import Shot
+
+
+LIVE_PORT = 8430
 
 
 @click.command()
@@ -120,3 +124,47 @@ def infer(
     for file in result.files:
         click.echo(file)
     say(result.sentence)
+
+
+@click.command()
+@store_option
+@run_option
+@device_option
+@click.option("--host", default="localhost", show_default=True, help="The address to listen on.")
+@click.option("--name", "names", multiple=True, help="A name by which others may ask; may be repeated.")
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65535),
+    default=LIVE_PORT,
+    show_default=True,
+    help="If it is taken, a free one is taken instead.",
+)
+@click.option(
+    "--truth", "most_spp", type=click.IntRange(1), default=4096, show_default=True, help="Most samples per pixel."
+)
+@click.option("--may-submit", is_flag=True, help="Let whoever reaches the page plan what it shows as a sample.")
+def live(
+    store: str | Path,
+    run: Path,
+    device: str,
+    host: str,
+    names: tuple[str, ...],
+    port: int,
+    most_spp: int,
+    may_submit: bool,
+) -> None:
+    """Serve a page on which furniture, lamps and the camera are dragged: the network's picture beside the truth.
+
+    The network's picture follows each move; as soon as nothing moves, `bdpt` renders the truth, and the error between
+    both stands below. Nothing is written without --may-submit. Ends on Ctrl-C.
+    """
+    from photonfarm.core.processes import free_port
+    from photonfarm.predict.live import Live
+    from photonfarm.predict.opened_run import OpenRun
+    from photonfarm.trainer.predictors.trained import TrainedRun
+    from photonfarm.web.server import serve
+
+    trained = TrainedRun.load(run)
+    begins = f"photonfarm infer --store {shlex.quote(str(store))} --run {shlex.quote(str(run))} --truth 256"
+    shown = Live(lambda: OpenRun(trained, store, device), most_spp, begins, may_submit)
+    serve(shown.routes(), host=host, port=free_port(port), names=names, say=click.echo, writes=shown.writes())

@@ -108,35 +108,61 @@ class Truth:
         return self.error(np.zeros_like(self.radiance)).mean
 
 
+class RefinedTruth:
+    """The truth of one configuration and view, which becomes better pass by pass."""
+
+    def __init__(self, spec: SceneSpec, half_spp: int) -> None:
+        """Begin without a pass; each will have so many samples per pixel in either half."""
+        self._sums = np.zeros((PARTS, 2, spec.film.height, spec.film.width, 3))
+        self._passes = np.zeros(PARTS, np.int64)
+        self.pass_spp, self._exposure = 2 * half_spp, spec.exposure
+        self._seconds = 0.0
+
+    @property
+    def spp(self) -> int:
+        """Samples per pixel so far, both halves together."""
+        return self.pass_spp * int(self._passes.sum())
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether there are passes enough for a result."""
+        return int(self._passes.sum()) >= LEAST_PASSES
+
+    def add(self, scene: LoadedScene, key: Key, view: View, passes: int = 1) -> None:
+        """Render further passes together, in the scene's present configuration, by the view's content key.
+
+        Seeds follow from the key, and are those of no sample. Raises IncompleteError if halves stay non-finite.
+        """
+        began, done = time.perf_counter(), int(self._passes.sum())
+        numbers = range(done, done + passes)
+        keyed = [(make_key("truth", key, number), view) for number in numbers]
+        for number, (halves, _) in zip(numbers, halves_of(scene, keyed, self.pass_spp // 2), strict=True):
+            self._sums[number % PARTS] += halves
+            self._passes[number % PARTS] += 1
+        self._seconds += time.perf_counter() - began
+
+    def result(self) -> Truth:
+        """The image so far, once there `is_enough`."""
+        used = self._passes > 0
+        means = self._sums[used] / self._passes[used][:, None, None, None, None]
+        return Truth(means, self._passes[used], self.spp, self._seconds, self._exposure)
+
+
 def render_truth(scene: LoadedScene, key: Key, view: View, amount: Amount) -> Truth:
     """The truth of the scene's present configuration from a view, by the view's content key.
 
     At least two passes are rendered, and a pass is whole. They are as large as those of samples, unless there would be
-    too few of them for each part. Seeds follow from the key, and are those of no sample. Raises IncompleteError if
-    halves stay non-finite.
+    too few of them for each part. Raises IncompleteError if halves stay non-finite.
     """
     most = SMALL_HALF if amount.spp is None else amount.spp // (2 * PARTS)
-    half_spp = max(1, min(scene.spec.transport.half_spp, most))
-    began, each, done = time.perf_counter(), 2 * half_spp, 0
-    size = scene.spec.film.height, scene.spec.film.width, 3
-    sums, passes = np.zeros((PARTS, 2, *size)), np.zeros(PARTS, np.int64)
-    while True:
-        left = LEAST_PASSES - done
-        if amount.spp is not None:
-            left = max(left, -(-amount.spp // each) - done)
-        elif time.perf_counter() - began < (amount.seconds or 0):
-            left = max(left, 1)
-        if left <= 0:
-            break
-        numbers = range(done, done + (min(left, scene.samples_at_once) if amount.spp else 1))
-        keyed = [(make_key("truth", key, number), view) for number in numbers]
-        for halves, _ in halves_of(scene, keyed, half_spp):
-            sums[done % PARTS] += halves
-            passes[done % PARTS] += 1
-            done += 1
-    used = min(done, PARTS)
-    means = sums[:used] / passes[:used, None, None, None, None]
-    return Truth(means, passes[:used], done * each, time.perf_counter() - began, scene.spec.exposure)
+    began, refined = time.perf_counter(), RefinedTruth(scene.spec, max(1, min(scene.spec.transport.half_spp, most)))
+    refined.add(scene, key, view, LEAST_PASSES)
+    while amount.spp is not None and refined.spp < amount.spp:
+        left = -(-(amount.spp - refined.spp) // refined.pass_spp)
+        refined.add(scene, key, view, min(left, scene.samples_at_once))
+    while amount.seconds is not None and time.perf_counter() - began < amount.seconds:
+        refined.add(scene, key, view)
+    return refined.result()
 
 
 @dataclass(frozen=True, slots=True, eq=False)

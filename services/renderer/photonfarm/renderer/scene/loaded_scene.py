@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -17,7 +18,7 @@ from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photo
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.groups import shape_ids
 from photonfarm.scene.modification import Modification, rest
-from photonfarm.scene.spec import GuideSpec, SceneSpec, Transport
+from photonfarm.scene.spec import Film, GuideSpec, SceneSpec, Transport
 from photonfarm.scene.view import View, sample_view
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ class LoadedScene:
         self._path_guides: dict[Any, Any] = {}  # by integrator, of the present configuration
         self._distant = [emitter for emitter in scene.emitters() if emitter.get_shape() is None]
         self._state = rest(spec)
+        self._of_films: dict[Film, dict[str, Any]] = {}
 
     @classmethod
     def load(cls, spec: SceneSpec, beside: Path | None = None, **options: Any) -> Self:
@@ -122,6 +124,19 @@ class LoadedScene:
             # It gives environment lights the old bounding sphere of the scene, and directional ones none
             for emitter in self._distant:
                 emitter.set_scene(self.scene)
+
+    def with_film(self, film: Film) -> Self:
+        """The same scene in its present configuration, seen through another film; what edits this one edits both."""
+        from photonfarm.renderer.bdpt.recording import Recorders
+        from photonfarm.renderer.scene.loading import AimedSensor
+
+        if film not in self._of_films:
+            spec = self.spec.model_copy(update={"film": film})
+            self._of_films[film] = {"spec": spec, "_sensor": AimedSensor(spec), "_recorders": Recorders()}
+        seen = copy.copy(self)
+        for name, value in self._of_films[film].items():
+            setattr(seen, name, value)
+        return seen
 
     def render_halves(self, view: View, seeds: Sequence[int], half_spp: int | None = None) -> F32:
         """Half-estimates of linear radiance for each seed, (K, H, W, 3), by the spec's integrator.

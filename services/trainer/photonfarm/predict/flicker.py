@@ -1,0 +1,76 @@
+"""How much a film flickers: what changes of the surfaces that stay in view from one frame to the next.
+
+A surface is followed by depth and camera, which are exact where nothing moves but the camera. What a still surface
+shows may change truly, as in a mirror, and following it rounds to pixels: so the figure of an image is to be read
+beside that of the truth along the same path.
+
+Shape letters: T frames, H W image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from photonfarm.core.records import F32
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
+
+SAME_SURFACE = 0.02
+"""The share of its depth within which a surface that is followed is taken to be the one that was there."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Register:
+    """Where each pixel's surface stood in the frame before: the four pixels around it with their weights."""
+
+    index: NDArray[np.int64]  # (4, N) into the pixels of the frame before
+    weight: NDArray[np.float64]  # (4, N)
+    pixels: NDArray[np.int64]  # (N,) those of this frame whose surface was in view
+
+    def change(self, before: F32, now: F32) -> NDArray[np.float64]:
+        """What is new at each pixel whose surface was in view, (N, 3), of two images (H, W, 3)."""
+        flat, own = (image.reshape(-1, image.shape[-1]).astype(np.float64) for image in (before, now))
+        shown: NDArray[np.float64] = own[self.pixels] - (self.weight[..., None] * flat[self.index]).sum(axis=0)
+        return shown
+
+
+def register(spec: SceneSpec, views: tuple[View, View], depths: tuple[F32, F32]) -> Register:
+    """Follow the surfaces of a frame back into the frame before; views and depths (H, W) of both, the earlier first.
+
+    A pixel counts if its surface was inside the earlier image, and all four pixels around it lay at its depth.
+    """
+    before, now = (Camera.of(view, spec) for view in views)
+    ray = now.rays().astype(np.float64)
+    place = now.origin + ray * (depths[1] / (ray @ now.forward))[..., None]
+    seen = (place.reshape(-1, 3) - before.origin) @ np.stack([before.right, before.down, before.forward], axis=1)
+    depth = np.where(seen[:, 2] > 0, seen[:, 2], np.inf)
+    at = before.focal_px * seen[:, :2] / depth[:, None] + 0.5 * np.array([before.width, before.height]) - 0.5
+    corner = np.floor(at)
+    low, part = corner.astype(np.int64), at - corner
+    inside = ((low >= 0) & (low < np.array([before.width - 1, before.height - 1]))).all(axis=1)
+    inside &= (depths[1].reshape(-1) > 0) & np.isfinite(depth)
+    pixels = np.flatnonzero(inside)
+    low, part, depth = low[pixels], part[pixels], depth[pixels]
+    index = np.stack([(low[:, 1] + y) * before.width + low[:, 0] + x for y in (0, 1) for x in (0, 1)])
+    weight = np.stack(
+        [(part[:, 0] if x else 1 - part[:, 0]) * (part[:, 1] if y else 1 - part[:, 1]) for y in (0, 1) for x in (0, 1)]
+    )
+    same = (np.abs(depths[0].reshape(-1)[index] - depth) < SAME_SURFACE * depth).all(axis=0)
+    return Register(index[:, same], weight[:, same], pixels[same])
+
+
+def measure_flicker(registers: Sequence[Register], films: Sequence[Sequence[F32]]) -> float | None:
+    """The root of the mean square of what changes, over all steps of a film; None where no surface stays in view.
+
+    `films` are one film, or two of the same truth with noise of their own: then the mean product of both changes is
+    taken, in which that noise cancels. Images (H, W, 3) are as they are shown, in the metric space.
+    """
+    total, count = 0.0, 0
+    for step, follow in enumerate(registers):
+        first, second = (follow.change(film[step], film[step + 1]) for film in (films[0], films[-1]))
+        total, count = total + float((first * second).sum()), count + first.size
+    return float(np.sqrt(max(total / count, 0.0))) if count else None

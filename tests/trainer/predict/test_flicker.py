@@ -1,0 +1,52 @@
+"""How much a film flickers, on a wall whose colour follows from the place alone."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import store_samples as samples
+
+from photonfarm.core.records import F32
+from photonfarm.predict.flicker import measure_flicker, register
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import Camera, View
+
+
+def look(spec: SceneSpec, x: float) -> tuple[View, F32, F32]:
+    """A view of the wall z = 0 from 2 units away, its depth, and an image that is smooth over the wall."""
+    view = View(np.float32([x, 0.1, 2]), np.float32([x + 0.05, 0, 0]))
+    camera = Camera.of(view, spec)
+    ray = camera.rays().astype(np.float64)
+    along = camera.origin[2] / -ray[..., 2]
+    place = camera.origin + ray * along[..., None]
+    image = np.stack([np.sin(place[..., 0]), np.cos(place[..., 1]), place[..., 0] * place[..., 1]], axis=-1)
+    return view, (along * (ray @ camera.forward)).astype(np.float32), image.astype(np.float32)
+
+
+def test_a_still_wall_does_not_flicker_and_noise_does() -> None:
+    spec = samples.small_spec(film={"width": 64, "height": 48})
+    frames = [look(spec, 0.07 * step) for step in range(3)]
+    follow = [register(spec, (a[0], b[0]), (a[1], b[1])) for a, b in pairwise(frames)]
+    assert all(len(each.pixels) > 0.9 * 64 * 48 for each in follow)
+    still = [image for *_, image in frames]
+    assert measure_flicker(follow, [still]) == pytest.approx(0, abs=1e-3)
+    rng, noise = np.random.default_rng(0), 0.1
+    noisy = [[image + rng.normal(0, noise, image.shape).astype(np.float32) for image in still] for _ in "AB"]
+    told = measure_flicker(follow, noisy[:1])
+    assert told is not None
+    assert noise < told < 2**0.5 * noise, "that of a pixel, and that of the mean of four before"
+    cancelled = measure_flicker(follow, noisy)
+    assert cancelled is not None
+    assert cancelled < 0.2 * noise
+
+
+def test_what_was_hidden_or_out_of_the_image_does_not_count() -> None:
+    spec = samples.small_spec(film={"width": 64, "height": 48})
+    view, depth, _ = look(spec, 0)
+    nearer = depth.copy()
+    nearer[:, :32] *= 0.5
+    pixels = register(spec, (view, view), (nearer, depth)).pixels
+    assert len(pixels)
+    assert (pixels % 64 >= 32).all()
+    away = View(view.origin, np.float32([0, 0, 9]))
+    assert measure_flicker([register(spec, (away, view), (depth, depth))], [[depth[..., None]] * 2]) is None

@@ -1,0 +1,158 @@
+"""The page of `photonfarm live`: a drag changes the network's picture, and the truth is refined at rest."""
+
+import base64
+import io
+import json
+import threading
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from chromium import Page, chromium, needs_chromium
+from PIL import Image
+from small_room import rendered, trained
+
+from photonfarm.predict import open_run
+from photonfarm.predict.live import TRUTHS, Live, Speed
+from photonfarm.scene.spec import Film
+from photonfarm.scene.spec_loading import load_spec
+from photonfarm.web.server import PageServer
+
+AT_REST = {"place": {}, "without": [], "camera": [-1.6, 1.5, 0.4], "look_at": [0.5, 0.8, -0.2]}
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory: pytest.TempPathFactory) -> Live:
+    folder = tmp_path_factory.mktemp("live")
+    store = rendered(load_spec("room"), folder)
+    run = trained(store, folder / "run", "guided_transport")
+    return Live(lambda: open_run(run, store), most_spp=24)
+
+
+@pytest.fixture(scope="module")
+def address(shown: Live) -> Iterator[str]:
+    with serving(shown) as address:
+        yield address
+
+
+@contextmanager
+def serving(shown: Live) -> Iterator[str]:
+    """The address at which it is served."""
+    with PageServer(shown.routes(), "127.0.0.1", 0, writes=shown.writes()) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_address[1]}/"
+        server.shutdown()
+        thread.join()
+
+
+def ask(
+    address: str, kind: str, state: dict[str, Any] | None = None, method: str = "GET", origin: str = ""
+) -> dict[str, Any]:
+    """What the server tells of a state, also where it refuses."""
+    path = "" if state is None else "/" + base64.urlsafe_b64encode(json.dumps(state).encode()).decode().rstrip("=")
+    asked = urllib.request.Request(
+        f"{address}{kind}{path}", method=method, headers={"Origin": (origin or address).rstrip("/")}
+    )
+    try:
+        with urllib.request.urlopen(asked) as answer:
+            return json.load(answer)
+    except urllib.error.HTTPError as refused:
+        with refused:
+            return json.load(refused)
+
+
+def read_picture(told: dict[str, Any]) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(base64.b64decode(told["picture"]))))
+
+
+def test_pictures_follow_the_state_and_the_truth_goes_on_from_one_request_to_the_next(
+    shown: Live, address: str
+) -> None:
+    room = ask(address, "room")
+    sofa = next(group for group in room["groups"] if group["name"] == "sofa")
+    assert sofa["box"]["min"][0] <= sofa["at"][0] <= sofa["box"]["max"][0]
+    moved = {**AT_REST, "place": {"sofa": sofa["box"]["min"]}, "without": ["vase"]}
+    pictures = [read_picture(ask(address, "full", state)) for state in (AT_REST, moved, AT_REST)]
+    assert pictures[0].shape == (16, 24, 3)
+    assert not np.array_equal(pictures[0], pictures[1])
+    assert np.array_equal(pictures[0], pictures[2])
+    first, second = ask(address, "truth", AT_REST), ask(address, "truth", moved)
+    spp = first["spp"]
+    for _ in range(20):
+        told = ask(address, "truth", AT_REST)
+        assert told["spp"] >= spp, "it is kept while another one is shown"
+        spp = told["spp"]
+        if told["done"]:
+            break
+    assert spp == 24
+    assert "±" in told["error"]
+    assert second["picture"] != told["picture"]
+    assert "--place sofa=" in ask(address, "command", moved)["command"]
+    assert "--without vase" in ask(address, "command", moved)["command"]
+    for step in range(TRUTHS + 2):
+        ask(address, "truth", {**AT_REST, "camera": [-1.6, 1.5, 0.1 * step]})
+    assert len(shown._judged) == TRUTHS
+
+
+def test_what_is_wrong_is_said_and_nothing_can_be_written(address: str) -> None:
+    assert "'sofaa'" in ask(address, "frame", {**AT_REST, "without": ["sofaa"]})["error"]
+    assert "no configuration" in ask(address, "frame/AAAA")["error"]
+    assert "no way to write" in ask(address, "submit", AT_REST, method="POST")["error"]
+
+
+def test_what_is_shown_is_planned_where_that_is_allowed_and_a_page_of_the_server_asks(shown: Live) -> None:
+    scene = shown.run.store.scene(shown.run.scene_id)
+    before, state = len(scene.plans()), {**AT_REST, "without": ["vase"]}
+    allowed = replace(shown, open=lambda: shown.run, may_submit=True)
+    with serving(allowed) as address:
+        assert ask(address, "submit", state, method="POST", origin="http://elsewhere:1/")["error"].startswith(
+            "only a page"
+        )
+        assert len(scene.plans()) == before
+        assert ask(address, "submit", state, method="POST")["said"] == "planned as a sample"
+        assert ask(address, "submit", state, method="POST")["said"] == "planned as a sample before"
+    assert len(scene.plans()) == before + 1
+
+
+def test_images_in_motion_become_smaller_until_they_are_fluent_and_grow_again() -> None:
+    speed = Speed(Film(width=256, height=192))
+    for seconds, film in ((0.9, (128, 96)), (0.3, (64, 48)), (0.16, (64, 48)), (0.05, (64, 48)), (0.02, (128, 96))):
+        speed.learn(seconds)
+        assert (speed.film().width, speed.film().height) == film
+
+
+@needs_chromium
+def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks_and_a_phones_width(
+    address: str,
+) -> None:
+    with chromium() as page:
+        for width in (1280, 390):
+            page.open(address, width, 1500)
+            page.wait_for("document.querySelector('#error').textContent.includes('±')", 60)
+            before = page.value("document.querySelector('#network').toDataURL()")
+            drag_sofa(page)
+            page.wait_for(f"document.querySelector('#network').toDataURL() !== {json.dumps(before)}")
+            page.wait_for("document.querySelector('#of-truth').textContent.startsWith('truth · 24 samples')", 60)
+            page.wait_for("!document.querySelector('#truth').classList.contains('old')")
+            page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Random').click()")
+            page.wait_for("document.querySelector('#truth').classList.contains('old')")
+            page.wait_for("!document.querySelector('#truth').classList.contains('old')", 60)
+            assert page.value("document.documentElement.scrollWidth") <= width
+        assert page.errors == []
+
+
+def drag_sofa(page: Page) -> None:
+    """Drag the sofa by a tenth of the plan towards its middle."""
+    script = (
+        "(() => { const { plan } = window.live, canvas = document.querySelector('#plan').getBoundingClientRect();"
+        "const [x, y] = plan.to(window.live.place.sofa).map((value) => value / plan.ratio);"
+        "return [canvas.left + x, canvas.top + y, canvas.left + canvas.width / 2, canvas.top + canvas.height / 2]; })()"
+    )
+    x, y, middle_x, middle_y = page.value(script)
+    page.press(x, y, (x + 0.05 * (middle_x - x), y), (x + 0.2 * (middle_x - x), y + 0.2 * (middle_y - y)))

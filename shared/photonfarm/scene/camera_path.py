@@ -24,6 +24,7 @@ from photonfarm.core.models import Frozen, sentences
 from photonfarm.core.records import F32, Guides, Photons, ViewBuffers, Visibility, arrays_of
 from photonfarm.scene.arrangement import Arrangement, Point, find_obstacles
 from photonfarm.scene.modification import Modification, rest
+from photonfarm.scene.shot_files import read_cameras
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
 
@@ -53,10 +54,13 @@ class CameraPath(Arrangement):
     closed: bool = False  # from the last view back to the first; a film of it repeats without a jump
 
     @classmethod
-    def load(cls, file: Path) -> CameraPath:
-        """The path in a JSON file; raises SpecError for an invalid file."""
+    def load(cls, file: Path) -> CameraPath | Cameras:
+        """The path in a JSON file, or the cameras of a `transforms.json`; raises SpecError for an invalid file."""
         try:
-            return cls.model_validate(json.loads(file.read_text()))
+            document = json.loads(file.read_text())
+            if isinstance(document, dict) and isinstance(document.get("frames"), list):
+                return Cameras(file=file)
+            return cls.model_validate(document)
         except ValidationError as error:
             raise SpecError(f"{file}: {'; '.join(sentences(error))}; a camera path looks like {FORM}") from error
         except OSError as error:
@@ -78,6 +82,16 @@ class CameraPath(Arrangement):
             if np.array_equal(view.origin, view.target):
                 raise SpecError(f"camera path: in frame {i} the camera stands where it looks at; move a view")
         return views
+
+
+class Cameras(Arrangement):
+    """The cameras of a `transforms.json`, each a frame; it says nothing of what stands where."""
+
+    file: Path
+
+    def sample(self, spec: SceneSpec) -> list[View]:
+        """The views of all frames; raises SpecError as `read_cameras` does."""
+        return read_cameras(self.file, spec)
 
 
 def orbit(spec: SceneSpec, frames: int, modification: Modification | None = None) -> list[View]:

@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.export.snapshot import camera_to_world
+from photonfarm.scene.camera_path import CameraPath, Cameras
 from photonfarm.scene.modification import rest
 from photonfarm.scene.shot_files import read_cameras, read_configurations, read_shots
 from photonfarm.scene.spec import SceneSpec
@@ -42,6 +43,13 @@ def test_cameras_of_a_transforms_json_see_what_they_saw(tmp_path: Path) -> None:
         np.testing.assert_allclose(camera_to_world(found, SPEC), camera_to_world(view, SPEC), atol=1e-5)
     exact = [{"transform_matrix": camera_to_world(v, SPEC).tolist(), "look_at": v.target.tolist()} for v in views(3)]
     for found, view in zip(read_cameras(transforms(tmp_path, frames=exact), SPEC), views(3), strict=True):
+        np.testing.assert_array_equal(found.vector, view.vector)
+
+
+def test_a_transforms_json_is_a_camera_path_of_its_cameras(tmp_path: Path) -> None:
+    path = CameraPath.load(transforms(tmp_path))
+    assert isinstance(path, Cameras)
+    for found, view in zip(path.sample(SPEC), read_cameras(tmp_path / "transforms.json", SPEC), strict=True):
         np.testing.assert_array_equal(found.vector, view.vector)
 
 

@@ -20,7 +20,7 @@ from photonfarm.renderer.jobs.render import (
     visibility_of,
 )
 from photonfarm.scene.arrangement import Arrangement
-from photonfarm.scene.camera_path import CameraPath, Frames, check_clear, orbit
+from photonfarm.scene.camera_path import CameraPath, Cameras, Frames, check_clear, orbit
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
@@ -32,7 +32,7 @@ def find_views(
     store: str | Path,
     scene: str,
     asked: Arrangement,
-    path: CameraPath | int,
+    path: CameraPath | Cameras | int,
     row: int | None = None,
     like: str | None = None,
 ) -> tuple[SceneStore, Modification, list[View]]:
@@ -45,12 +45,13 @@ def find_views(
     stored = opened.scene(scene_named(opened, scene))
     start = find_start(store, stored.scene_id, row, like)
     configuration = start[0] if start else None
-    if isinstance(path, CameraPath):
+    if not isinstance(path, int):
         configuration = path.apply(stored.spec, configuration)
     configuration = asked.apply(stored.spec, configuration)
     if isinstance(path, int):
         return stored, configuration, orbit(stored.spec, path, configuration)
-    return stored, configuration, check_clear(stored.spec, path.sample(), configuration)
+    views = path.sample() if isinstance(path, CameraPath) else path.sample(stored.spec)
+    return stored, configuration, check_clear(stored.spec, views, configuration)
 
 
 def frames_of(

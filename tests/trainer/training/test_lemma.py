@@ -1,10 +1,10 @@
 """Lemma 1 on a rendered scene [supplement 3.2]: noisy targets give, on average, the gradient of the clean image.
 
-The room with objects and lights moved, a view at 32², and a network that has been trained a little, so that no gradient
-is zero. K noisy targets and R converged ones have seeds of their own. For each weight tensor, and for all of them as
-one, the statistic is t = |ḡ − ḡ*| / σ: ḡ is the mean gradient over the K noisy targets, ḡ* that over the R converged
-ones, and σ² = tr Σ/K + tr Σ*/R what |ḡ − ḡ*|² is by noise alone. Without bias t² is a weighted sum of χ² of mean 1, so
-that P(t > 3) ≤ P(χ²₁ > 9) = 0.0027 for each tensor (Székely and Bakirov 2003). Seeds are fixed.
+The room with objects moved and turned, and lights moved, a view at 32², and a network that has been trained a little,
+so that no gradient is zero. K noisy targets and R converged ones have seeds of their own. For each weight tensor, and
+for all of them as one, the statistic is t = |ḡ − ḡ*| / σ: ḡ is the mean gradient over the K noisy targets, ḡ* that over
+the R converged ones, and σ² = tr Σ/K + tr Σ*/R what |ḡ − ḡ*|² is by noise alone. Without bias t² is a weighted sum of
+χ² of mean 1, so that P(t > 3) ≤ P(χ²₁ > 9) = 0.0027 for each tensor (Székely and Bakirov 2003). Seeds are fixed.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from photonfarm.renderer.jobs.estimates import photons_of
 from photonfarm.renderer.jobs.render import lit_points, visibility_of
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.scene.groups import Turn
 from photonfarm.scene.modification import rebuild, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -76,7 +77,9 @@ def seen() -> Seen:
     film = room.film.model_copy(update={"width": SIZE, "height": SIZE})
     transport = room.transport.model_copy(update={"half_spp": 1})
     photons = room.photons.model_copy(update={"paths": 512})
-    spec = room.model_copy(update={"film": film, "transport": transport, "photons": photons, "points": POINTS})
+    objects = tuple(each.model_copy(update={"turn": Turn(min=-180, max=180)}) for each in room.objects)
+    changes = {"film": film, "transport": transport, "photons": photons, "points": POINTS}
+    spec = room.model_copy(update={**changes, "objects": objects})
     scene = LoadedScene.load(spec)
     base = scene.base()
     modification = sample_modification(spec, 0, 2)

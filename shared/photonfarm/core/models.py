@@ -126,6 +126,6 @@ def _table_by_name(value: Any) -> Any:
     return value
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
-    """Up to three known names that resemble an unknown one, for a message."""
-    return ", ".join(difflib.get_close_matches(name, list(known), n=3, cutoff=0.3)) or "none"
+def nearest(name: str, known: Iterable[str], least: float = 0.3) -> str:
+    """Up to three known names that resemble an unknown one, by `least` of 1, for a message."""
+    return ", ".join(difflib.get_close_matches(name, list(known), n=3, cutoff=least)) or "none"

@@ -181,7 +181,9 @@ def find_spec(name: str) -> Path:
             return folder / f"{name}.toml"
     known = sorted({file.stem for folder in folders for file in folder.glob("*.toml")})
     what = "no such spec, as it is a folder" if name and path.is_dir() else "no such spec"
-    raise SpecError(f"{name or 'an empty name'}: {what}; give a .toml file or one of {', '.join(known)}")
+    near = nearest(name, known, least=0.6)
+    resembles = "" if near == "none" else f"; nearest: {near}"
+    raise SpecError(f"{name or 'an empty name'}: {what}; give a .toml file or one of {', '.join(known)}{resembles}")
 
 
 @dataclass(frozen=True, slots=True)

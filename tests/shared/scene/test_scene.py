@@ -154,6 +154,8 @@ def test_an_unknown_name_is_answered_with_all_that_are_known(tmp_path: Path, mon
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes/attic.toml").write_text("")
+    with pytest.raises(SpecError, match="nearest: cornell"):
+        load_spec("cornel")
     with pytest.raises(SpecError, match=r"castle: no such spec; give a \.toml file or one of attic, cornell, room$"):
         load_spec("castle")
     (tmp_path / "spec.toml").write_text("name = ")

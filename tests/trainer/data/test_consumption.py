@@ -18,6 +18,7 @@ from photonfarm.queue.workers import read_consumed, serve
 from photonfarm.store import Store
 from photonfarm.trainer import service, train
 from photonfarm.trainer.runs import devices
+from photonfarm.trainer.runs.run_folder import CHECKPOINT
 from photonfarm.trainer.runs.settings import TrainSettings, make_preset
 from photonfarm.trainer.training import loop
 from photonfarm.trainer.training.loop import Hooks
@@ -158,5 +159,7 @@ def test_a_run_goes_on_as_it_was_begun_and_ends_where_it_ended(
     with pytest.raises(SpecError, match="batch = 8, and 2"):
         call(max_steps=3, preset="small", **settings)
     assert call(max_steps=3).settings == begun.model_copy(update={"max_steps": 3})
+    (run / CHECKPOINT).unlink()  # as if it had been killed before its first one
+    assert call().settings == begun.model_copy(update={"max_steps": 3})
     with pytest.raises(StoreError, match="on which run"):
         service.run(None, store.with_name("moved"), run, None, {}, log=print)

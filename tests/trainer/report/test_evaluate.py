@@ -1,6 +1,7 @@
 """`photonfarm evaluate` on a store: what is measured, on which samples, against which references."""
 
 import json
+import re
 import sys
 import time
 from dataclasses import replace
@@ -197,6 +198,9 @@ def test_the_foot_says_what_the_figures_cannot(measured) -> None:
         assert "the published ones" in foot
     bare = replace(found, rows=tuple(replace(row, metrics=replace(row.metrics, inception=None)) for row in found.rows))
     assert "no weights of the Inception network are installed" in list_notes(bare)[-1]
+    left_out = format_evaluation(replace(bare, has_inception=False))
+    assert "| FLIP |" in left_out
+    assert not re.search("FID|KID|Feature|Inception", left_out), "left out, as asked"
     converged = replace(found, references=replace(found.references, spp=4096))
     assert list_notes(converged)[1].endswith("; converged")
 

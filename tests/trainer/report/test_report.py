@@ -13,11 +13,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic_room_samples import commit_job
+from click.testing import CliRunner
 from matplotlib.axes import Axes
 from matplotlib.container import ErrorbarContainer
 from matplotlib.figure import Figure
 from read_batches import batch_of
 
+from photonfarm.cli.main import umbrella
 from photonfarm.core.archives import Seconds
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.plan.hold_out import rows_held_out
@@ -96,6 +98,18 @@ def test_a_store_is_trained_on_while_it_fills_and_reported(scene, commit, tiny, 
     assert page.count("data:image/svg+xml;base64,") == 2, "curves over samples and everything"
     assert not re.search(r'(src|href)="(?!data:|#)|url\(|@import', page), "nothing is loaded from elsewhere"
     assert not re.search(r"\bnan\b", page)
+
+
+def test_the_verb_ends_with_the_figures_of_a_display_and_where_the_pictures_are(
+    measured, compared, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr("photonfarm.trainer.report.gather_contents", lambda *_, **__: compared)
+    asked = ["--store", str(measured.store), "--run", str(measured.runs[0]), "--out", str(tmp_path)]
+    said = CliRunner().invoke(umbrella, ["report", *asked])
+    metrics = compared.entries[0].row.metrics
+    assert f"MSSIM {metrics.mssim.estimate.mean:.3f}" in said.stderr
+    assert said.stderr.splitlines()[-1] == f"side by side: {tmp_path / 'comparison.png'}"
+    assert (tmp_path / "comparison.png").exists()
 
 
 def test_what_cannot_be_reported_is_refused_before_anything_is_measured(

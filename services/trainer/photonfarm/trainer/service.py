@@ -26,9 +26,9 @@ from photonfarm.trainer.runs.progress import RunProgress, follow_progress
 from photonfarm.trainer.runs.run_folder import (
     CHECKPOINT,
     INITIAL,
+    find_own_settings,
     lock_run,
     note_scene_folder,
-    read_settings,
     write_views,
 )
 from photonfarm.trainer.runs.settings import TrainSettings, make_settings
@@ -52,8 +52,8 @@ def settle_settings(folder: Path, preset: str | None, changes: Mapping[str, Any]
 
     Raises SpecError for changes that cannot be, StoreError for a run's settings that cannot be read.
     """
-    if preset is None and (folder / CHECKPOINT).exists():
-        return make_settings(read_settings(folder), changes)
+    if preset is None and (own := find_own_settings(folder, changes)):
+        return make_settings(own, changes)
     from photonfarm.trainer.runs.devices import AUTO, choose_preset  # loads torch
 
     return make_settings(preset or choose_preset(changes.get("device", AUTO)), changes)
@@ -83,12 +83,14 @@ def run(
     Raises IncompleteError if the time is over before there is anything to train on, and with `until_complete` also if a
     signal stops it; StoreError where a run goes on and the store does not hold its scene.
     """
+    from photonfarm.trainer.networks import find_kind
+    from photonfarm.trainer.predictors.half_filter import settle_filter
     from photonfarm.trainer.runs.devices import describe_device, join_ranks
     from photonfarm.trainer.training.loop import Hooks
     from photonfarm.trainer.training.other_ranks import assist
     from photonfarm.trainer.training.start_from import check_same_network
 
-    settings = settle_settings(folder, preset, changes)
+    settings = settle_filter(settle_settings(folder, preset, changes), folder)
     for key, name in (("architecture", settings.network.architecture), ("loss", settings.loss)):
         if user_code.is_own(name):
             user_code.load(key, name)  # so that a mistake is said before samples are waited for
@@ -101,6 +103,9 @@ def run(
             return
         with ranks.lead():
             log(f"training on {describe_device(device, settings.network.precision)}")
+            if find_kind(settings.network.architecture).needs.passes:
+                also = "and by Open Image Denoise" if settings.network.has_denoiser else "alone"
+                log(f"filter = {settings.network.filter}: noisy halves are filtered by a filter of our own {also}")
             loaded = load_spec(spec) if spec else None
             scene_id = loaded.scene_id if loaded else scene_id
             begun_on, exposure = _read_beginning(folder)

@@ -160,4 +160,11 @@ def report(store: str | Path, runs: tuple[Path, ...], untimed: bool, out: Path, 
     with show_progress() as on_progress:
         figures = write_report(store, list(dict.fromkeys(runs)), out, on_progress=on_progress, timed=not untimed, **how)
     click.echo(figures["verdict"], err=True)
+    if figures["val_mssim"] is not None:
+        click.echo(
+            f"as a display shows it, against the references: MSE {figures['val_mse_metric']:.4f}, MSSIM "
+            f"{figures['val_mssim']:.3f}",
+            err=True,
+        )
+    click.echo(f"side by side: {out / 'comparison.png'}", err=True)
     click.echo(json.dumps(figures, indent=2) if as_json else out / "report.html")

@@ -68,10 +68,11 @@ class TrainCommand(click.Command):
 
     @staticmethod
     def _check_settings(run: Path, preset: str | None, **params: Any) -> None:
-        from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings  # numpy is slow to load
+        from photonfarm.trainer.runs.run_folder import find_own_settings  # numpy is slow to load
 
-        own = preset is None and not params["check"] and Path(run, CHECKPOINT).exists()
-        make_settings(read_settings(run) if own else preset or "small", collect_changes(params))
+        changes = collect_changes(params)
+        own = None if preset or params["check"] else find_own_settings(Path(run), changes)
+        make_settings(own or preset or "small", changes)
 
 
 def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:

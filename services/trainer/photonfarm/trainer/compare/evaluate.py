@@ -105,6 +105,7 @@ class Evaluation:
     references: References | None
     rows: tuple[PredictorRow, ...]
     shown: tuple[Target, ...]
+    has_inception: bool = True  # FID, KID and Feature L1 were asked for
     beside: tuple[HeldOutErrors, ...] = ()  # of the predictors that were measured beside the first one
 
     @property
@@ -219,6 +220,7 @@ def compare(
         threads=first.settings.threads,
         references=References.of(references_by_row, spec.transport.half_spp),
         rows=tuple(rows[number] for number in range(len(predictors))),
+        has_inception=not without_inception,
         shown=tuple(samples.target(row, references_by_row.get(row)) for row in shown),
         beside=tuple(errors_beside),
     )

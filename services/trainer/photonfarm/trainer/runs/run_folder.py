@@ -77,6 +77,16 @@ def make_environment(folder: Path) -> dict[str, str]:
     return {**os.environ, SCENES_VARIABLE: os.pathsep.join(folders)}
 
 
+def find_own_settings(run: Path, changes: Mapping[str, Any]) -> TrainSettings | None:
+    """The settings that a run was begun with; None for a new one, also where another network is to begin anew.
+
+    Raises what `read_settings` does.
+    """
+    if not (run / SETTINGS).exists() or ("architecture" in changes and not (run / CHECKPOINT).exists()):
+        return None
+    return read_settings(run)
+
+
 def read_settings(run: Path) -> TrainSettings:
     """The settings a run was made with.
 

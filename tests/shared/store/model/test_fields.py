@@ -70,7 +70,7 @@ def test_turns_and_light_are_stored_and_found(store: Store) -> None:
     assert (cloud.normal != base.normal).any()
     key = expected.key(scene.spec.radiance_id).hex()
     assert find_samples(store, [scene.scene_id], Query.of(like=key)).count == 2
-    start = find_start(store, scene.scene_id, None, key)
+    start = find_start(store.root, scene.scene_id, None, key)
     assert start is not None
     np.testing.assert_array_equal(start[0].vector, expected.vector)
     assert checked_store.checked(store).exit_code == 0

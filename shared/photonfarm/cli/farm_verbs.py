@@ -75,6 +75,9 @@ def scene_show(spec: str, as_json: bool) -> None:
 )
 @click.option("--no-measure", is_flag=True, help="With --dry-run: leave out cost and suggestion.")
 @click.option(
+    "--workers", type=click.IntRange(1), help="That will render: for the dry run's time and the size of jobs."
+)
+@click.option(
     "--cameras",
     type=click.Path(exists=True, dir_okay=False, path_type=Path),
     help="Plan the views of this transforms.json (of nerfstudio, or of `export --to exr`) instead of random ones.",
@@ -95,6 +98,7 @@ def submit(
     halves_from: str | None,
     dry_run: bool,
     no_measure: bool,
+    workers: int | None,
     cameras: Path | None,
     configurations: Path | None,
     as_json: bool,
@@ -147,9 +151,11 @@ def submit(
     for warning in (*warnings(named), *doubts):
         click.echo(f"warning: {warning}", err=True)
     result: submission.Submission
+    on_card = is_card_wanted(os.environ.get(DEVICE_VARIABLE) or AUTO)
+    how: dict[str, Any] = {"shard_rows": shard_rows, "on_card": on_card}
     if dry_run:
         log = partial(click.echo, err=True)
-        result = dry.rehearse(named, store, wanted, measure=not no_measure, log=log, shard_rows=shard_rows)
+        result = dry.rehearse(named, store, wanted, measure=not no_measure, log=log, workers=workers, **how)
     else:
         url = None if no_queue else redis_url
         result = submission.submit(
@@ -158,9 +164,9 @@ def submit(
             url,
             wanted,
             retry=retry,
-            shard_rows=shard_rows,
-            on_card=is_card_wanted(os.environ.get(DEVICE_VARIABLE) or AUTO),
+            workers=workers or submission.WORKERS,
             halves_from=halves_from,
+            **how,
         )
     show.print_submission(result, as_json)
 
@@ -343,6 +349,7 @@ def redis_server(port: int) -> None:
     show_default=True,
     help="Samples per pixel of each reference.",
 )
+@click.option("--reserve", metavar="SIZE", help="Of the workers, as `work` has it.  [default: 1GB]")
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
@@ -361,7 +368,8 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
     from photonfarm.farm.up import WORKERS, run_farm, trainer_arguments
 
     try:
-        _check_arguments(["work", "--until-complete"], "mitsuba", "render")
+        reserve = ["--reserve", options["reserve"]] if options["reserve"] else []
+        _check_arguments(["work", "--until-complete", *reserve], "mitsuba", "render")
         named = {f"--{name}": options.pop(name) for name in ("preset", "architecture")}
         given = [word for name, value in named.items() if value is not None for word in (name, value)]
         options["train_options"] = [*given, *(word for pair in options.pop("pairs") for word in ("--set", pair))]

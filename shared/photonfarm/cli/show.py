@@ -138,12 +138,15 @@ def print_submission(result: Submission, as_json: bool) -> None:
 def _print_cost(result: DryRun) -> None:
     """Print the size and the cost of what would be planned, and a better use of the same cost."""
     size = f"at most {format_bytes(result.size_bytes)} before compression"
+    if result.card_s is not None:
+        size += f"; about {format_span(result.card_s)} on a card such as an H200, by its pace in other rooms"
     if result.core_s is None or result.wall_s is None:
         click.echo(size)
         return
     core_s = f"{result.core_s:,.0f}" if result.core_s >= 10 else f"{result.core_s:.1f}"
     cores = format_count(result.cores, "core")
-    click.echo(f"{size}; {core_s} core-seconds: {format_span(result.wall_s)} on the {cores} here")
+    where = f"{cores}, a worker each" if result.workers else f"the {cores} here"
+    click.echo(f"{size}; {core_s} core-seconds: {format_span(result.wall_s)} on {where}")
     click.echo(_describe_suggestion(result))
 
 

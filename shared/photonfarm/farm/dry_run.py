@@ -9,7 +9,7 @@ from pathlib import Path
 
 from photonfarm.core.errors import BackendError, StoreError
 from photonfarm.core.processes import can_render, command, usable_cores
-from photonfarm.farm.submission import Submission
+from photonfarm.farm.submission import Submission, estimate_sample_seconds
 from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import Extent, Request
 from photonfarm.plan.sample_costs import Allocation, CostModel, SampleCosts
@@ -44,10 +44,12 @@ class DryRun(Submission):
 
     extent: Extent = field(kw_only=True)
     size_bytes: int = field(kw_only=True)  # before compression
-    cores: int = field(kw_only=True)  # of this machine, as far as this process may use them
+    workers: int | None = field(default=None, kw_only=True)  # as asked for
+    cores: int = field(kw_only=True)  # one for each of these, or those of this machine that this process may use
     costs: SampleCosts | None = field(default=None, kw_only=True)
     core_s: float | None = field(default=None, kw_only=True)  # to render what would be planned
     wall_s: float | None = field(default=None, kw_only=True)  # with a worker on each of the cores
+    card_s: float | None = field(default=None, kw_only=True)  # of one card, where that renders; not measured here
     reduction: float | None = field(default=None, kw_only=True)  # of the excess error, by the best of the same cost
     suggestion: Suggestion | None = field(default=None, kw_only=True)  # that allocation, if it is worth a change
 
@@ -60,8 +62,10 @@ def rehearse(
     measure: bool,
     log: Callable[[str], None],
     shard_rows: int | None = None,
+    workers: int | None = None,
+    on_card: bool = False,
 ) -> DryRun:
-    """What `submission.submit` would plan.
+    """What `submission.submit` would plan, with the time of so many workers, or of this machine's cores; or of a card.
 
     With `measure`, also its cost, and how the same cost would be spent best; `log` is called with the reason if the
     cost is unknown. Nothing is suggested for what a person chose, and if some samples of the request are planned
@@ -74,9 +78,13 @@ def rehearse(
     else:
         planned = Store(store).plan(spec, request, shard_rows=shard_rows, dry_run=True)
         new, known, extent = planned.new, planned.known, planned.extent
-    of, cores = bytes_of_rows(spec), usable_cores()
+    of, cores = bytes_of_rows(spec), workers or usable_cores()
     size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
-    counted = DryRun(spec.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=cores)
+    counted = replace(
+        DryRun(spec.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=cores),
+        workers=workers,
+        card_s=estimate_sample_seconds(spec, on_card=True) * new if on_card else None,
+    )
     if not (measure and new):
         return counted
     try:

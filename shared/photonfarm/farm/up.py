@@ -22,7 +22,7 @@ from photonfarm.farm.progress import FarmProgress
 from photonfarm.farm.redis_server import EmbeddedRedis
 from photonfarm.farm.running_farm import WEB_PORT, announce
 from photonfarm.farm.submission import submit, top_up
-from photonfarm.farm.training import check_run, hold_out_of
+from photonfarm.farm.training import RunFolder, check_run, hold_out_of
 from photonfarm.farm.watch import FarmWatch
 from photonfarm.plan.hold_out import HOLD_OUT
 from photonfarm.plan.request import Request
@@ -31,6 +31,7 @@ from photonfarm.scene.plausibility import warnings
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_spec
 from photonfarm.store import Store
+from photonfarm.store.model.store import scene_status
 
 WORKERS = 2
 """The workers on a processor, unless another number is asked for."""
@@ -72,13 +73,14 @@ def run_farm(
     shard_rows: int | None = None,
     web: bool = True,
     devices: Sequence[str] = (CPU,),
+    reserve: str | None = None,
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
-    The first `reference_views` held-out views get `reference_spp` samples per pixel, and the report compares networks
-    with them. Without a `hold_out` it is the run's, or of a new run the default or just enough for one configuration.
-    With `web`, pages that show all of it are served on this machine until the end. Workers render on the `devices` in
-    turn.
+    The first `reference_views` held-out views get `reference_spp` samples per pixel, which are merged in `out`, and the
+    report compares networks with them. `reserve` is that of the workers. Without a `hold_out` it is the run's, or
+    of a new run the default or just enough for one configuration. With `web`, pages that show all of it are served on
+    this machine until the end. Workers render on the `devices` in turn.
 
     A wrong spec, a run of another scene, a hold-out that leaves one side empty, and references of no valid number are
     refused before anything is written, by a SpecError.
@@ -87,11 +89,12 @@ def run_farm(
     named = NamedSpec.load(spec)
     for warning in warnings(named):
         say(f"warning: {warning}")
-    references = train_steps > 0 and reference_views > 0
+    references = reference_views > 0
     if train_steps:
         check_run(run, named.spec, store)
     asked = hold_out or hold_out_of(run)
-    share = _checked_hold_out(named.spec, store, asked, request, say) if train_steps else asked or HOLD_OUT
+    splits = train_steps or references
+    share = _checked_hold_out(named.spec, store, asked, request, say) if splits else asked or HOLD_OUT
     which = (f"held-out={share}", f"views=first:{reference_views}")  # of the planned views get references
     if references:
         TopUp.of(str(reference_spp), which)
@@ -124,7 +127,7 @@ def run_farm(
         verbs = {}
         for name, device in zip((f"worker-{i + 1}" for i in range(workers)), cycle(devices), strict=False):
             scene = ["--scene", planned.scene_id, "--name", name, "--device", device]
-            verbs[name] = ["work", "--until-complete", *scene]
+            verbs[name] = ["work", "--until-complete", *scene, *([] if reserve is None else ["--reserve", reserve])]
         if train_steps:
             verbs["trainer"] = trainer_arguments(
                 spec, run=run, train_steps=train_steps, hold_out=share, train_options=train_options
@@ -142,14 +145,15 @@ def run_farm(
             watch = FarmWatch(opened, redis.url, [run] if trained else [], scene_id=planned.scene_id)
             with display as show:
                 _watch(running, watch, redis, show, run)
+            beside: list[str] = []
+            if references:
+                passes = -(-reference_spp // spp_per_pass(named.spec))
+                folder = str(out / "references")
+                merge = ["--scene", planned.scene_id, "--least", str(passes), "--out", folder]
+                _call(["store", "merge", *merge], environment)
+                beside = ["--references", folder]
             if train_steps:
-                beside: list[str] = []
-                if references:
-                    passes = -(-reference_spp // spp_per_pass(named.spec))
-                    folder = str(out / "references")
-                    merge = ["--scene", planned.scene_id, "--least", str(passes), "--out", folder]
-                    _call(["store", "merge", *merge], environment)
-                    beside = ["--references", folder]
+                _tell_of_late_samples(run, scene_status(opened.scene(planned.scene_id)).samples_complete, say)
                 _call(["report", "--run", str(run), "--out", str(out), *beside], environment)
         except IncompleteError as error:
             try:
@@ -169,6 +173,17 @@ def _checked_hold_out(spec: SceneSpec, store: str | Path, asked: float | None, r
     if share != HOLD_OUT:
         say(f"hold-out {share:g}, as {HOLD_OUT:g} would not suit so few configurations")
     return share
+
+
+def _tell_of_late_samples(run: Path, samples: int, say: Log) -> None:
+    """Say how many of a scene's complete samples had landed when a run ended, if these were not all."""
+    (folder := RunFolder(run)).look()
+    end = next((record for record in reversed(folder.records) if record["kind"] == "end"), None)
+    if end is not None and end["samples"] < samples:
+        say(
+            f"training ended at step {end['step']}, when {end['samples']} of {samples} samples had landed; the same "
+            "command with more --train-steps trains on with all of them"
+        )
 
 
 @contextmanager

@@ -1,6 +1,7 @@
 """`photonfarm submit --dry-run`: what is planned, how large it is, what it costs, and what would be better."""
 
 import json
+import re
 import stat
 import sys
 from collections.abc import Callable
@@ -15,6 +16,7 @@ from click.testing import CliRunner, Result
 from photonfarm.cli.farm_verbs import submit
 from photonfarm.cli.show import bytes_per_sample
 from photonfarm.farm import dry_run
+from photonfarm.farm.devices import DEVICE_VARIABLE
 from photonfarm.farm.dry_run import DryRun, rehearse
 from photonfarm.plan.request import Extent, Request
 from photonfarm.plan.sample_costs import KAPPA, Allocation, CostModel, SampleCosts
@@ -195,13 +197,19 @@ def test_a_measurement_that_fails_takes_one_line_and_nothing_else(
 # -------------------------------------------------------------------------------------------------------- as printed
 
 
-def test_the_command_prints_what_when_and_what_would_be_better(tmp_path: Path, verb: Verb) -> None:
+def test_the_command_prints_what_when_and_what_would_be_better(
+    tmp_path: Path, verb: Verb, monkeypatch: pytest.MonkeyPatch
+) -> None:
     verb()
     first, second, third = run(spec_file(tmp_path), tmp_path / "none").stdout.splitlines()
     assert first.endswith(": 12 samples would be planned, 0 are already")
     assert second == "at most 0.1 MB before compression; 14 core-seconds: 3 s on the 4 cores here"
     assert third.startswith("suggested at this cost: half_spp = ")
     assert "% less excess error predicted for light_transport" in third
+    monkeypatch.setenv(DEVICE_VARIABLE, "cpu")  # which the command sets
+    others = ["--workers", "6", "--device", "cuda"]
+    assert "on 6 cores, a worker each" in (said := run(spec_file(tmp_path), tmp_path / "none", *others).stdout)
+    assert re.search(r"about .* on a card such as an H200", said)
     assert not (tmp_path / "none").exists()
 
 

@@ -85,3 +85,29 @@ def test_what_failed_first_is_told_and_whether_the_same_command_goes_on(
     assert "says: no work. What is rendered" in said
     assert ("the same command goes on from there" in said) == (code != SpecError.exit_code)
     assert said.endswith("After that, photonfarm preview ended with exit code 4; what it said stands above")
+
+
+def test_references_are_made_without_a_training_too_and_workers_keep_the_reserve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    called: list[tuple[str, ...]] = []
+
+    def command(*arguments: str) -> list[str]:
+        called.append(arguments)
+        return [sys.executable, "-c", ""]
+
+    monkeypatch.setattr(up, "command", command)
+    run_farm(tmp_path, reference_views=1, reference_spp=64, reserve="2GB")
+    (scene,) = Store(tmp_path / "store").scenes()
+    assert [plan.request.kind for plan in scene.plans()] == ["samples", "top-up"]
+    assert [arguments[:2] for arguments in called][1:] == [("store", "merge"), ("preview", scene.scene_id)]
+    assert called[0][-2:] == ("--reserve", "2GB")
+
+
+def test_a_run_that_ended_before_most_samples_had_landed_is_told_of(tmp_path: Path) -> None:
+    said: list[str] = []
+    (tmp_path / "metrics.jsonl").write_text('{"kind": "end", "step": 9, "reason": "steps", "samples": 40}\n')
+    for complete in (40, 96):
+        up._tell_of_late_samples(tmp_path, complete, said.append)
+    (line,) = said
+    assert "step 9, when 40 of 96 samples had landed" in line

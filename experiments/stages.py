@@ -122,8 +122,9 @@ class Stages:
         return [*self.experiment.trained(), *self.experiment.again()]
 
     def _is_trained(self, run: Run) -> bool:
-        """Whether the last checkpoint of a run is its end. Raises StageError where it is not of what is asked for."""
+        """Whether a run has come to its end. Raises StageError where it is not of what is asked for."""
         from photonfarm.trainer.runs import checkpoint  # here, as it brings torch
+        from photonfarm.trainer.runs.run_folder import METRICS, read_log
 
         if not self._checkpoint(run).is_file():
             return False
@@ -140,8 +141,10 @@ class Stages:
                 f"{self.experiment.name}: {self._folder(run)} was trained with {'; '.join(differing)}: move that "
                 "folder away, and it is trained anew"
             )
-        seconds = sum(state["seconds"].values())
-        return bool(state["step"] >= settings["max_steps"] or seconds >= (settings["max_seconds"] or math.inf))
+        seconds, log = sum(state["seconds"].values()), self._folder(run) / METRICS
+        if state["step"] >= settings["max_steps"] or seconds >= (settings["max_seconds"] or math.inf):
+            return True
+        return log.is_file() and any(record.get("reason") == "rounds" for record in read_log(log)[-1:])
 
     def _asked(self, run: Run) -> dict[str, Any]:
         """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""

@@ -371,6 +371,16 @@ def test_a_run_of_other_settings_is_refused_with_its_folder(
         Stages(other, tmp_path / "work", workers=1).train()
 
 
+def test_a_run_that_its_rounds_ended_has_come_to_its_end(tiny: Experiment, tmp_path: Path) -> None:
+    tiny = with_size(tiny, architectures=("light_transport",), seeds=(0,))
+    stages = trained(tiny, tmp_path / "work", step=1)
+    (run,) = tiny.trained()
+    log = tmp_path / "work/runs/light_transport/metrics.jsonl"
+    for reason, is_its_end in (("stopped", False), ("rounds", True)):
+        log.write_text(json.dumps({"step": 1, "kind": "end", "reason": reason}) + "\n")
+        assert stages._is_trained(run) is is_its_end
+
+
 def test_a_run_keeps_every_commit_that_it_was_trained_at_and_the_report_tells_them(
     tiny: Experiment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

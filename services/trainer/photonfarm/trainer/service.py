@@ -111,7 +111,8 @@ def run(
             begun_on, exposure = _read_beginning(folder)
             if scene_id and begun_on and scene_id != begun_on:
                 raise SpecError(
-                    f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder"
+                    f"{folder}: was trained on scene {begun_on}, and {scene_id} is asked for; use another run folder, "
+                    f"in which --start-from {folder} begins with its weights"
                 )
             if begun_on and (is_vacant(store) or not Store(store).has_scene(begun_on)):
                 raise StoreError(

@@ -107,6 +107,7 @@ def test_the_verb_writes_nothing_and_says_the_same_as_json(tmp_path: Path, monke
     printed, as_json = run_verb(*where), run_verb(*where, "--json")
     assert printed.exit_code == as_json.exit_code == 0, printed.output + as_json.output
     assert list(tmp_path.iterdir()) == []
+    assert printed.stderr.splitlines()[-1] == "steps are timed"
     told = json.loads(as_json.stdout)
     assert told["film"] == [16, 16]
     assert f"{told['parameters']:,}" in printed.stdout

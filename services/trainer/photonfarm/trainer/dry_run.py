@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import product
 from typing import Any, Self
@@ -213,14 +214,16 @@ class DryRun:
         return {**asdict(self), **derived}
 
 
-def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
+def rehearse(spec: SceneSpec, settings: TrainSettings, tell: Callable[[str], object] = lambda _: None) -> DryRun:
     """Estimate a training with a scene and settings by some seconds of steps on this machine; nothing is written.
 
-    Raises SpecError for a device that is not there, and for a network that cannot be built or compiled.
+    `tell` is called with each part of the work that begins; at 256² on a core one takes minutes. Raises SpecError for a
+    device that is not there, and for a network that cannot be built or compiled.
     """
     settings = settle_filter(settings)
     torch.set_num_threads(settings.threads)
     scene, network, device = MadeUpScene.of(spec), settings.network, usable_device(settings.device)
+    tell("the network is built, and takes a step of one sample")
     frame = scene.frame(network)
     one_sample = scene.batch(1, network)
     # Work is counted operation by operation as torch runs them, and a compiled network is one operation.
@@ -231,6 +234,7 @@ def rehearse(spec: SceneSpec, settings: TrainSettings) -> DryRun:
         learner = Learner(frame, settings, Ranks())
     most = settings.batch if device.type == "cuda" else int(TIMED_BYTES / activation_bytes)
     with name_compile_errors(settings.compile):
+        tell("steps are timed")
         timed_samples, step_s, peak_bytes = time_steps(learner, scene, settings, device, most)
     return DryRun(
         scene=spec.name,

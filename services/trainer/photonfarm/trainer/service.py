@@ -227,11 +227,13 @@ def summarise(spec: str | None, store: str | Path, settings: TrainSettings) -> s
         return f"{head}\n{format_summary(summarise(scene, network))}"
 
 
-def rehearse(spec: str | None, store: str | Path, settings: TrainSettings, film: int | None) -> DryRun:
+def rehearse(
+    spec: str | None, store: str | Path, settings: TrainSettings, film: int | None, tell: Callable[[str], object]
+) -> DryRun:
     """What a training would take; nothing is written, and of a store only a spec is read.
 
-    `film` is the side of images in pixels, if it shall be another than the spec's. Raises SpecError without a spec,
-    unless the store has one scene, and in one of several processes.
+    `film` is the side of images in pixels, if it shall be another than the spec's; `tell` is that of the estimate.
+    Raises SpecError without a spec, unless the store has one scene, and in one of several processes.
     """
     from photonfarm.core.models import sentences
     from photonfarm.trainer.dry_run import rehearse
@@ -249,7 +251,7 @@ def rehearse(spec: str | None, store: str | Path, settings: TrainSettings, film:
             raise SpecError(f"the film of the dry run: {'; '.join(sentences(error))}") from error
         scene = scene.model_copy(update={"film": square})
     with user_code.name_in_errors(architecture=settings.network.architecture, loss=settings.loss):
-        return rehearse(scene, settings)
+        return rehearse(scene, settings, tell)
 
 
 def _find_spec(spec: str | None, store: str | Path) -> SceneSpec:

@@ -213,7 +213,9 @@ def train(
         click.echo(service.summarise(spec, store, service.settle_settings(run, preset, changes)))
     elif dry_run:
         settings = service.settle_settings(run, preset, changes)
-        show.print_dry_run(service.rehearse(spec, store, settings, film), as_json)
+        with show.show_progress() as on_progress:
+            estimate = service.rehearse(spec, store, settings, film, lambda what: on_progress(what, 0, 0))
+        show.print_dry_run(estimate, as_json)
     else:
         service.run(
             spec,

@@ -1,6 +1,6 @@
 """Where a network's error is, by what pixels show; and networks that were to miss less light, and were not kept.
 
-    python -m experiments.missed_light STORE --run RUN [--run RUN …] [--seeds 8]
+    python -m experiments.missed_light STORE --run RUN [--run RUN …] [--seeds 8] [--light-samples 3 6 12]
     photonfarm train SPEC --architecture experiments.missed_light:AddedLobes …
 
 Runs are of one scene, whose held-out views have at least eight passes; errors are mean squares in the metric space, the
@@ -11,6 +11,7 @@ is rendered anew so many times: what the error loses by the mean of these is the
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +24,7 @@ from torch.nn import functional
 
 from bench.harness import results
 from experiments.one_half import read_views
-from photonfarm.core.keys import make_key
+from photonfarm.core.keys import make_key, view_key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate
 from photonfarm.data.torch_dataset import SceneDataset
@@ -31,8 +32,8 @@ from photonfarm.store import SceneReader
 from photonfarm.trainer.data.feed import read_batch
 from photonfarm.trainer.metrics.image_metrics import metric_space
 from photonfarm.trainer.networks.guided import Guided
-from photonfarm.trainer.networks.guided_denoise import _smooth
 from photonfarm.trainer.networks.inputs import GLOSSY, GuideInputs, Inputs, Needs, SceneFrame, reflectance, require
+from photonfarm.trainer.networks.light_filter import smooth
 from photonfarm.trainer.networks.lit_points import (
     DIFFUSE,
     LEAST_LOGARITHM,
@@ -133,6 +134,36 @@ def render_direct(source: SceneReader, views: list[View], seeds: int) -> dict[in
     return means
 
 
+def try_light_samples(source: SceneReader, run: TrainedRun, views: list[View], numbers: list[int]) -> None:
+    """Print the error of a run, and the CPU time of buffers and guides, with so many shadow rays for each ray."""
+    from photonfarm.renderer.jobs.render import lit_points, load_scene, locate
+
+    scene, cloud = load_scene(locate(source.spec)), source.base()[1]
+    predict = run.predictor(source.spec, source.base(), "cpu").images
+    errors: dict[int, list[float]] = {number: [] for number in numbers}
+    seconds: dict[int, list[float]] = {number: [] for number in numbers}
+    for view in views:
+        sample = source.read(view.row)
+        scene.apply(sample.modification)
+        lit = lit_points(cloud, sample.modification)
+        keys = [view_key(sample.modification.key(source.spec.radiance_id), sample.view.vector)]
+        for number in numbers:
+            wanted = source.spec.guides.model_copy(update={"light_samples": number})
+            if not seconds[number]:
+                scene.inputs([sample.view], keys, wanted, lit)  # compiles
+            began = time.process_time()
+            ((_, made),) = scene.inputs([sample.view], keys, wanted, lit)
+            seconds[number].append(time.process_time() - began)
+            lights = (torch.from_numpy(light * np.float32(source.spec.exposure)) for light in (made.direct, made.gloss))
+            direct, gloss = (light[None] for light in lights)
+            guides = replace(require(view.inputs.guides), direct=direct, gloss=gloss)
+            image = predict(replace(view.inputs, guides=guides))[0].numpy()
+            errors[number].append(float(view.error(image).mean()))
+    for number in numbers:
+        ms = 1e3 * float(np.median(seconds[number]))
+        print(f"with {number} light samples: {np.mean(errors[number]):.6f}, {ms:.1f} ms")
+
+
 @torch.no_grad()
 def main() -> None:
     """Print a table of classes for each run, and its ratio to the first."""
@@ -140,6 +171,7 @@ def main() -> None:
     parser.add_argument("store", type=Path)
     parser.add_argument("--run", type=Path, action="append", required=True)
     parser.add_argument("--seeds", type=int, default=0, help="further seeds of direct light")
+    parser.add_argument("--light-samples", type=int, nargs="*", default=[], help="other numbers of shadow rays to try")
     asked = parser.parse_args()
     torch.set_num_threads(1)
     first: F32 | None = None
@@ -161,6 +193,7 @@ def main() -> None:
             given = {row: (each.direct + each.gloss)[0].numpy() for row, each in stored.items()}
             quiet = [v.error(v.image + lights[v.row].astype(np.float32) - given[v.row]).mean() for v in views]
             print(f"with the mean of {asked.seeds} seeds of direct light: {np.mean(quiet):.6f}")
+        try_light_samples(source, run, views, asked.light_samples)
         means = errors.mean(axis=(1, 2))
         first = means if first is None else first
         gap = Estimate.of(means - first)
@@ -261,7 +294,7 @@ class SmoothedDirect(Guided):
         """The image."""
         further, guides = self.further(inputs), require(inputs.guides)
         reflects = inputs.albedo + guides.throughput * guides.beyond_albedo + 1e-3
-        wide = [_smooth(guides.direct, reflects, size) for size in (3, 7)]
+        wide = [smooth(guides.direct, reflects, size) for size in (3, 7)]
         known = self.known(inputs, further)
         made = self.synthesise(self.channels(inputs, [*further, *map(torch.log1p, wide)]))
         for place, light in enumerate(wide, 3):

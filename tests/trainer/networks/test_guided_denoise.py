@@ -17,8 +17,9 @@ from photonfarm.core.records import F32
 from photonfarm.scene.view import View
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.networks import ARCHITECTURES, build
-from photonfarm.trainer.networks.guided_denoise import filter_light, look_at_half
+from photonfarm.trainer.networks.guided_denoise import look_at_half
 from photonfarm.trainer.networks.inputs import SceneFrame
+from photonfarm.trainer.networks.light_filter import filter_light
 from photonfarm.trainer.predictors import half_filter
 from photonfarm.trainer.predictors.half_filter import FOLDER, HalfFilter, settle_filter
 from photonfarm.trainer.runs.checkpoint import load
@@ -101,7 +102,7 @@ def test_what_it_learned_for_one_pass_fades_by_the_root_of_their_number(make_sou
         return made(told).detach()
 
     known = made.known(inputs, made.further(inputs))
-    half = look_at_half(inputs, replace(noisy, passes=torch.full((1,), 25.0)), made._measure_places(inputs))
+    half = look_at_half(inputs, replace(noisy, passes=torch.full((1,), 25.0)), made.measure_places(inputs))
     coarse = half.filtered[..., 1]
     torch.testing.assert_close(image(1.0), known)
     torch.testing.assert_close(image(25.0), known + 0.8 * (1 - 0.1192 / 5) * (coarse - known), rtol=1e-3, atol=1e-4)

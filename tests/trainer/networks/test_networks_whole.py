@@ -89,6 +89,32 @@ def test_what_reflects_nothing_shows_what_it_emits_and_nothing_else(make_source,
     assert not torch.isclose(made, inputs.guides.emission).all()
 
 
+def test_direct_light_loses_noise_and_keeps_its_edges_by_a_setting(make_source) -> None:
+    """Two walls, of which the left one is lit, with noise, and a black lamp on it; before anything is learned."""
+    source, kind = make_source(1), "guided"
+    inputs = batch_of(source, (0,), kind).inputs
+    guides, lamp = inputs.guides, (slice(None), slice(6, 9), slice(2, 5))
+    for values, value in ((inputs.albedo, 0.5), (inputs.depth, 1), (guides.specular, 0), (guides.gloss, 0)):
+        values[:] = value
+    guides.throughput[:], guides.emission[:], guides.direct[:] = 0, 0, 0.01
+    inputs.normal[:, :, :8], inputs.normal[:, :, 8:] = (
+        inputs.world_to_camera[0, 2, :3],
+        inputs.world_to_camera[0, 0, :3],
+    )
+    noise = torch.randn(guides.direct.shape, generator=torch.Generator().manual_seed(0))
+    guides.direct[:, :, :8] = 1 + 0.2 * noise[:, :, :8]
+    inputs.albedo[lamp], guides.direct[lamp], guides.emission[lamp] = 0, 0, 7
+    made = network(source, kind, filter_direct=True)
+    torch.nn.init.zeros_(made.image_synthesis.out.weight)
+    torch.nn.init.zeros_(made.image_synthesis.out.bias)
+    filtered = image(made, inputs)
+    lit = (slice(None), slice(9, 16), slice(0, 7))
+    assert filtered[lit].std() < 0.6 * guides.direct[lit].std()
+    torch.testing.assert_close(filtered[lit].mean(), guides.direct[lit].mean(), rtol=0.03, atol=0)
+    torch.testing.assert_close(filtered[lamp], guides.emission[lamp])
+    torch.testing.assert_close(filtered[:, :, 8:], guides.direct[:, :, 8:], rtol=0, atol=0.01)
+
+
 @pytest.mark.parametrize("architecture", [name for name in EVERY if name.startswith("guided")])
 def test_black_surfaces_that_shine_have_learned_light_by_a_setting(make_source, architecture: str) -> None:
     """Black glass in the upper left quarter, whose reflection the guides have missed; a matt black surface below."""

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from photonfarm.trainer.networks.inputs import GuideInputs, Inputs, SceneFrame, reflectance, require
+from photonfarm.trainer.networks.light_filter import estimate_variance, filter_light
 from photonfarm.trainer.networks.lit_points import CHANNELS, DIFFUSE, LitPoints
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.networks.photon_map import WINDOWS, PhotonLight
@@ -34,6 +35,13 @@ REFLECTANCE_FLOOR = 0.2
 
 BLACK = 0.05
 """The reflectance below which that floor falls, to 0 for what reflects nothing, such as lamps, and windows at night."""
+
+
+LIGHT = 3
+"""The outputs of the U-Net that are light."""
+
+SHARES_OF_DIRECT = (0.0, 1.0, -1.0)
+"""The logits of direct light before anything is learned: as it is, filtered finely, coarsely."""
 
 
 def floor(albedo: Tensor, guides: GuideInputs) -> Tensor:
@@ -73,10 +81,14 @@ def show_known_light(inputs: Inputs) -> Tensor:
 class Guided(Network):
     """Image synthesis from the guides of a view, added to its emission and direct light.
 
+    If the settings say so, direct light is also given filtered, and added to the image by learned shares of each pixel.
+
     With `transport`, a kind of lit points, its inputs include the light that these send on to each pixel, by diffuse
     reflection and by other lobes, and the diffuse part is added to the image. With `photons` they include the light
     that photons, reflected before, bring to diffuse surfaces, which is added if lit points are not.
     """
+
+    shares_of_direct: Tensor
 
     def __init__(
         self,
@@ -86,19 +98,47 @@ class Guided(Network):
         transport: type[LitPoints] | None = None,
         photons: bool = False,
         further: int = 0,
-        outputs: int = 3,
+        outputs: int = LIGHT,
     ) -> None:
-        """Take `further` channels of a kind of guided network beside those of transport, photons and guides."""
+        """Take `further` channels of a kind of guided network beside those of transport, photons and guides.
+
+        A kind with other `outputs` than light has its own way with noise, and its direct light is not filtered.
+        """
         photon_light = PhotonLight(frame, settings.architecture, bounces=1) if photons else None
         further += (CHANNELS if transport else 0) + (3 * len(WINDOWS) if photons else 0)
+        self.filters_direct = settings.filter_direct and outputs == LIGHT
+        if self.filters_direct:
+            further, outputs = further + 2 * LIGHT, outputs + len(SHARES_OF_DIRECT)
         super().__init__(settings, frame, further=further + GUIDE_CHANNELS, outputs=outputs)
+        self.register_buffer("shares_of_direct", torch.tensor(SHARES_OF_DIRECT), persistent=False)
         self.least_specular = settings.least_specular
         self.lit_points = transport(frame, settings.lit_points) if transport else None
         self.photon_light = photon_light
 
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure, as every network's."""
-        return super().forward(self.raise_specular(inputs))
+        inputs = self.raise_specular(inputs)
+        if not self.filters_direct:
+            return super().forward(inputs)
+        further, guides = self.further(inputs), require(inputs.guides)
+        plain = guides.direct + guides.gloss
+        with torch.no_grad():
+            reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
+            spread, places = estimate_variance(plain, reflects), self.measure_places(inputs)
+            filtered = filter_light(plain, reflects, spread, inputs.normal, places)
+            seen = [torch.log1p((light / reflects).clamp(min=0)) for light in filtered]
+            shows = floor(inputs.albedo, guides) / REFLECTANCE_FLOOR
+        made = self.synthesise(self.channels(inputs, [*further, *seen]))
+        shares = torch.softmax(self.shares_of_direct + made[..., 3:], dim=-1)
+        quieter = torch.stack([shows * (light - plain) for light in filtered], dim=-1) * shares[..., None, 1:]
+        return self.known(inputs, further) + quieter.sum(dim=-1) + self.factor(inputs) * made[..., :3]
+
+    def measure_places(self, inputs: Inputs) -> Tensor:
+        """Where each pixel's surface is, from the eye, over the scene's size, (B, H, W, 3)."""
+        to_camera = inputs.world_to_camera
+        rays = self.optics.rays(to_camera)
+        ahead = (rays * to_camera[:, None, None, 2, :3]).sum(-1)
+        return rays * (inputs.depth / (ahead * self.scale))[..., None]
 
     def raise_specular(self, inputs: Inputs) -> Inputs:
         """The inputs in which whatever shines reflects at least the settings' `least_specular`; without, themselves."""

@@ -32,6 +32,7 @@ from torch.nn import functional
 
 from photonfarm.trainer.networks.guided import REFLECTANCE_FLOOR, Guided, floor
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, SceneFrame, reflectance, require
+from photonfarm.trainer.networks.light_filter import estimate_variance, filter_light, smooth, take_means
 from photonfarm.trainer.networks.lit_points import LitPoints
 from photonfarm.trainer.runs.settings import NetworkSettings
 
@@ -59,9 +60,6 @@ COARSE = (0.0, 1.0, 0.0)
 TINY = 1e-12
 """A squared difference that is none."""
 
-LEVELS = 3
-"""The passes of the filter, with neighbours at 1, 2 and 4 pixels: it is fine after the first, coarse after the last."""
-
 
 class GuidedDenoise(Guided):
     """Image synthesis from guides, lit points and a noisy half of the view, joined with the half and its filtering."""
@@ -85,7 +83,7 @@ class GuidedDenoise(Guided):
         inputs = self.raise_specular(inputs)
         noisy, lit = require(inputs.noisy), self.further(inputs)
         denoised = require(noisy.filtered) if self._has_denoiser else None
-        half = look_at_half(inputs, noisy, self._measure_places(inputs), denoised)
+        half = look_at_half(inputs, noisy, self.measure_places(inputs), denoised)
         known = self.known(inputs, lit)
         made = self.synthesise(self.channels(inputs, [*half.channels, *lit]))
         light, weight = self.factor(inputs) * made[..., :3], torch.sigmoid(START + made[..., 3:4])
@@ -98,17 +96,10 @@ class GuidedDenoise(Guided):
         shows = half.shows + (1 - half.shows) * (1 - fading)
         guess = torch.lerp(known + light, filtered + added, shows)
         apart = noisy.colour - guess
-        further = _mean(apart.detach().mean(dim=-1, keepdim=True) ** 2, 5).clamp(min=TINY)
+        further = take_means(apart.detach().mean(dim=-1, keepdim=True) ** 2, 5).clamp(min=TINY)
         doubt = torch.where(fading < 1, 1 - (1 + 4 * fading**2) * half.variance / further, 0)
         share = torch.maximum(error / (error + half.noise), doubt)
         return guess + shows * share * apart
-
-    def _measure_places(self, inputs: Inputs) -> Tensor:
-        """Where each pixel's surface is, from the eye, over the scene's size, (B, H, W, 3)."""
-        to_camera = inputs.world_to_camera
-        rays = self.optics.rays(to_camera)
-        ahead = (rays * to_camera[:, None, None, 2, :3]).sum(-1)
-        return rays * (inputs.depth / (ahead * self.scale))[..., None]
 
 
 class Half(NamedTuple):
@@ -132,73 +123,16 @@ def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor, denoised: T
     reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
     direct = guides.emission + guides.direct + guides.gloss
     light = noisy.colour - direct
-    spread = _estimate_variance(light, reflects)
+    spread = estimate_variance(light, reflects)
     if noisy.passes is not None and noisy.variance is not None:
         several = noisy.passes[:, None, None, None] > 1
-        spread = torch.where(several, _mean(noisy.variance[..., None], 5), spread)
+        spread = torch.where(several, take_means(noisy.variance[..., None], 5), spread)
     fine, coarse = (direct + image for image in filter_light(light, reflects, spread, inputs.normal, places))
     brightness = coarse.mean(dim=-1, keepdim=True)
     noise = spread / (brightness**2 + DARK**2)
     filtered = [fine, coarse] if denoised is None else [fine, coarse, denoised]
-    averages = [light / reflects, *(_smooth(light, reflects, size) for size in WINDOWS)]
+    averages = [light / reflects, *(smooth(light, reflects, size) for size in WINDOWS)]
     images = [noisy.colour / reflects, *averages, noise]
     images += [image / reflects for each in filtered for image in (each, each - direct)]
     channels = [shows * image.sign() * torch.log1p(image.abs()) for image in images]
     return Half(torch.stack(filtered, dim=-1), spread, noise, shows, channels)
-
-
-def _estimate_variance(light: Tensor, reflects: Tensor) -> Tensor:
-    """The variance of the mean colour from neighbours, (B, H, W, 1): of light over reflectance, as that is smooth.
-
-    The square of a pixel less the mean over 3 × 3 is 8/9 of it, where nothing but noise differs.
-    """
-    rest = (light - reflects * _smooth(light, reflects, 3)).mean(dim=-1, keepdim=True)
-    return 9 / 8 * _mean(rest**2, 5)
-
-
-def _mean(image: Tensor, size: int) -> Tensor:
-    """The mean over windows of size × size pixels, cut at the border, (B, H, W, C)."""
-    planes, reach = image.permute(0, 3, 1, 2).contiguous(), size // 2
-    for window, padding in (((size, 1), (reach, 0)), ((1, size), (0, reach))):
-        planes = functional.avg_pool2d(planes, window, stride=1, padding=padding, count_include_pad=False)
-    return planes.permute(0, 2, 3, 1)
-
-
-def _smooth(light: Tensor, reflects: Tensor, size: int) -> Tensor:
-    """Light over reflectance in windows, (B, H, W, 3): a ratio of sums, in which dark surfaces count the least."""
-    both = _mean(torch.cat([light, reflects], dim=-1), size)
-    return both[..., :3] / both[..., 3:]
-
-
-def filter_light(light: Tensor, reflects: Tensor, variance: Tensor, normal: Tensor, places: Tensor) -> list[Tensor]:
-    """Light filtered by its own noise and the surfaces, finely and coarsely, (B, H, W, 3) each.
-
-    It is an à-trous filter (Dammertz et al., 2010) as a ratio of sums: neighbours, 3 × 3 at growing distances, count by
-    Σ k w light / Σ k w reflectance. w falls with the angle of normals, the distance from the tangent plane, and the
-    difference of brightness over its standard deviation, which goes from pass to pass (Schied et al., SVGF, 2017).
-    """
-    height, width = light.shape[1:3]
-    weighted, weight = light, reflects.mean(dim=-1, keepdim=True).expand_as(light)
-    weighted = weighted / reflects * weight
-    variance, made = variance / weight[..., :1] ** 2, []
-    for level in range(LEVELS):
-        step = 1 << level
-        value = weighted / weight
-        bright = value.mean(dim=-1, keepdim=True)
-        allowed = 4 * _mean(variance, 3).clamp(min=0).sqrt() + 1e-3
-        packed = torch.cat([weighted, weight[..., :1], variance, bright, normal, places], dim=-1)
-        around = functional.pad(packed.permute(0, 3, 1, 2), (step,) * 4, mode="replicate").permute(0, 2, 3, 1)
-        sums = torch.zeros_like(packed[..., :5])
-        for down in (-1, 0, 1):
-            for right in (-1, 0, 1):
-                rows, columns = step * (1 + down), step * (1 + right)
-                there = around[:, rows : rows + height, columns : columns + width]
-                apart = 4 * (there[..., 6:9] - normal).square().sum(-1, keepdim=True)
-                apart += (normal * (there[..., 9:12] - places)).sum(-1, keepdim=True).abs() / (0.01 * step)
-                apart += (there[..., 5:6] - bright).abs() / allowed
-                counts = 0.25 * 0.5 ** (abs(down) + abs(right)) * torch.exp(-apart)
-                sums[..., :4] += counts * there[..., :4]
-                sums[..., 4:] += (counts * there[..., 3:4]) ** 2 * there[..., 4:5]
-        weighted, weight, variance = sums[..., :3], sums[..., 3:4].expand_as(light), sums[..., 4:] / sums[..., 3:4] ** 2
-        made.append(reflects * weighted / weight)
-    return [made[0], made[-1]]

@@ -160,6 +160,8 @@ class NetworkSettings(Frozen):
     least_specular: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of guided networks (ours): what a surface that has
     # any lobe but the diffuse one reflects by it, at least, where it is smooth; 0.04 is glass seen straight on, of
     # which the guides' few samples find nothing
+    filter_direct: bool = False  # of guided networks but guided_denoise (ours): direct light, whose samples are few, is
+    # also filtered by its noise and the surfaces, and each pixel has a learned share of it as it is and as filtered
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it
 
@@ -175,7 +177,7 @@ class NetworkSettings(Frozen):
         return self
 
 
-EARLIER: Mapping[str, Any] = {"least_specular": 0.0}
+EARLIER: Mapping[str, Any] = {"least_specular": 0.0, "filter_direct": False}
 """The settings that a run of before there were any lacks, each with the value by which its network is what it was."""
 
 
@@ -264,6 +266,7 @@ SMALL: Mapping[str, Any] = {
         "maxima": "relative",  # so short a run learns little of lights from absolute ones
         "emission": "log",
         "reflectance": True,  # 39 % less error of denoise_1 in fixed-veach-ajar (docs/results/tables.md)
+        "least_specular": 0.04,  # a black screen had 11 % of the error in one room (docs/results/networks.md)
     },
     "loss": "relative",
     "batch": 2,

@@ -65,7 +65,7 @@ def trained(scene: SceneStore, folder: Path) -> Path:
         for step, held_out in ((0, 1), (50, 2), (100, 2))
     ]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(record) + "\n" for record in records))
-    (folder / "settings.json").write_text('{"max_steps": 200}')
+    (folder / "settings.json").write_text('{"max_steps": 200, "validate_every": 100}')
     about = PngImagePlugin.PngInfo()
     about.add_text("scene", scene.scene_id)
     about.add_text("rows", "0 1")
@@ -313,7 +313,7 @@ def test_a_browser_shows_the_farm_and_a_sample_without_errors_at_a_desks_and_a_p
             assert page.value("document.querySelectorAll('svg.plot circle').length") >= 12
             said = page.value("document.body.innerText")
             assert f"{run.name}: 0.00990 at step 100, on 2 held-out views" in said
-            assert "hollow ones were measured on fewer held-out views" in " ".join(said.split())
+            assert "one every 100 steps; hollow ones were measured on fewer held-out views" in " ".join(said.split())
             told = "[...document.querySelectorAll('circle.hollow')].map((point) => point.textContent)"
             assert page.value(told) == 2 * ["step 0: 1.00000 on 1 held-out view"], "by steps and by seconds"
             assert page.value("document.documentElement.scrollWidth") <= width

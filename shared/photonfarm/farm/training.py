@@ -106,6 +106,11 @@ class RunFolder:
             next((each["seconds"] for each in reversed(self.records) if isinstance(each.get("seconds"), dict)), {}),
         )
 
+    @property
+    def steps_between(self) -> int:
+        """The steps between two validations; 0: not known."""
+        return _number(_read_json(self.folder / SETTINGS).get("validate_every"))
+
     def _read_log(self) -> None:
         try:
             with (self.folder / METRICS).open("rb") as file:

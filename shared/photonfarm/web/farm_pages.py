@@ -307,6 +307,7 @@ def _read_curves(run: RunFolder) -> dict[str, Any]:
     losses = [[r["step"], _sum_seconds(r), r["loss"]] for r in trained]
     return {
         "run": run.folder.name,
+        "steps_between": run.steps_between,
         "validations": _thin_out(validations),
         "losses": _thin_out(losses),
         "steps": steps,

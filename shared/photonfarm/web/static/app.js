@@ -136,13 +136,14 @@ function training(runs) {
   const by = (axis) => runs.map((run, place) => ({ place, points: run.validations.map((each) => [each[axis], each[2], each[3],
     { hollow: each[5] < run.validations.at(-1)[5], title: `step ${count(each[0])}: ${each[2].toFixed(5)} on ${held(each)}` }]) }));
   if (!runs.some((run) => run.validations.length)) return card("half", "Training", null, h("p", { class: "note" }, "No validation yet."));
+  const every = runs.map((run) => run.steps_between).find(Boolean);
   const legend = runs.map((run, place) => {
     const last = run.validations.at(-1);
     return h("span", { class: `run-${place % 6}` }, last ? `${run.run}: ${last[2].toFixed(5)} at step ${count(last[0])}, on ${held(last)}` : run.run);
   });
   return card("half", "Training", "held-out error, noise removed; shaded: its standard error", curves(by(0), "step"),
     curves(by(1), "seconds, with waiting"), h("div", { class: "legend" }, ...legend),
-    h("p", { class: "note" }, "Each point is a validation; hollow ones were measured on fewer held-out views than the last: the others had not been rendered. A pointer on a point tells how many."));
+    h("p", { class: "note" }, `Each point is a validation${every ? `, one every ${count(every)} steps` : ""}; hollow ones were measured on fewer held-out views than the last: the others had not been rendered. A pointer on a point tells how many.`));
 }
 
 const chosen = {}; // the step of each run that is shown; none: the last one

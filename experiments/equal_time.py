@@ -58,6 +58,7 @@ FAMILIES = {
 LOOKS = {"s": "-", "o": "--", "^": "-", "x": ":", "+": "-."}
 """How each family is drawn: its markers and its line."""
 
+LEAST = 1e-9  # of an error that is taken to a power
 COLUMNS = 2
 GREY = "#777777"  # of denoisers; no network has it
 REPLICATES = 4000
@@ -87,7 +88,8 @@ class AtTime:
     beyond: bool = False  # of one alone, which takes less time; so that the family could reach less in that time
 
     def of(self, first: F64, second: F64) -> F64:
-        """The error from those of both."""
+        """The error from those of both; an estimate that noise made negative counts as next to nothing."""
+        first, second = (np.maximum(each, LEAST) for each in (first, second))
         mixed: F64 = first ** (1 - self.share) * second**self.share
         return mixed
 

@@ -157,7 +157,7 @@ def test_the_size_card_runs_to_its_end_and_goes_on_where_its_minutes_were_over(
     assert call_run(monkeypatch, work, "--minutes", "0.2") == IncompleteError.exit_code
     names = [run.name for run in found.trained()]
     begun = [(stages.folder / "logs" / f"train-{name}.log").is_file() for name in names]
-    assert len(names) == 15
+    assert len(names) == 16
     assert begun == sorted(begun, reverse=True), "the most telling come first"
     assert not begun[-1]
     ended = [stages._checkpoint(run) for run in found.trained() if stages._is_trained(run)]
@@ -166,9 +166,10 @@ def test_the_size_card_runs_to_its_end_and_goes_on_where_its_minutes_were_over(
     assert before == [file.stat().st_mtime_ns for file in ended]
 
     report = json.loads((stages.folder / "report/report.json").read_text())
-    amounts = ("1/1", "1/4", "2/1", "4/1", "8/1", "16/1")
-    ready = [f"{denoiser} {amount}" for denoiser in found.size.untrained for amount in amounts]
-    assert [row["name"] for row in report["evaluation"]["rows"]] == [*names, *ready]
+    halves = [f"{count}/1" for count in found.size.halves]
+    several = [f"guided_denoise {amount}" for amount in halves]
+    ready = [f"{name} {amount}" for of in (["1/1", "1/4"], halves) for name in found.size.untrained for amount in of]
+    assert [row["name"] for row in report["evaluation"]["rows"]] == [*names, *several, *ready]
     assert all(run["steps"] == 3 and run["settings"]["batch"] == 8 for run in report["runs"])
     assert all(run["settings"]["network"]["precision"] == "bfloat16" for run in report["runs"])
     page = " ".join(format_page([Room.read(found, stages.folder / "report/report.json", "1234567")], "card").split())

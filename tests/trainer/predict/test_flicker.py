@@ -1,13 +1,11 @@
 """How much a film flickers, on a wall whose colour follows from the place alone."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import store_samples as samples
 
 from photonfarm.core.records import F32
-from photonfarm.predict.flicker import measure_flicker, register
+from photonfarm.predict.flicker import Flicker, register
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View
 
@@ -25,28 +23,29 @@ def look(spec: SceneSpec, x: float) -> tuple[View, F32, F32]:
 
 def test_a_still_wall_does_not_flicker_and_noise_does() -> None:
     spec = samples.small_spec(film={"width": 64, "height": 48})
-    frames = [look(spec, 0.07 * step) for step in range(3)]
-    follow = [register(spec, (a[0], b[0]), (a[1], b[1])) for a, b in pairwise(frames)]
-    assert all(len(each.pixels) > 0.9 * 64 * 48 for each in follow)
-    still = [image for *_, image in frames]
-    assert measure_flicker(follow, [still]) == pytest.approx(0, abs=1e-3)
     rng, noise = np.random.default_rng(0), 0.1
-    noisy = [[image + rng.normal(0, noise, image.shape).astype(np.float32) for image in still] for _ in "AB"]
-    told = measure_flicker(follow, noisy[:1])
-    assert told is not None
-    assert noise < told < 2**0.5 * noise, "that of a pixel, and that of the mean of four before"
-    cancelled = measure_flicker(follow, noisy)
-    assert cancelled is not None
-    assert cancelled < 0.2 * noise
+    films = Flicker(spec)
+    for step in range(3):
+        view, depth, still = look(spec, 0.07 * step)
+        a, b = (still + rng.normal(0, noise, still.shape).astype(np.float32) for _ in "AB")
+        films.add(view, depth, {"still": [still], "noisy": [a], "halves": [a, b]})
+    told = films.result()
+    assert told["still"] == pytest.approx(0, abs=1e-3)
+    assert noise < told["noisy"] < 2**0.5 * noise, "that of a pixel, and that of the mean of four before"
+    assert told["halves"] < 0.2 * noise, "noise that is independent cancels"
 
 
 def test_what_was_hidden_or_out_of_the_image_does_not_count() -> None:
     spec = samples.small_spec(film={"width": 64, "height": 48})
-    view, depth, _ = look(spec, 0)
+    view, depth, image = look(spec, 0)
+    moved = look(spec, 0.07)
+    assert len(register(spec, (view, moved[0]), (depth, moved[1])).pixels) > 0.9 * 64 * 48
     nearer = depth.copy()
     nearer[:, :32] *= 0.5
     pixels = register(spec, (view, view), (nearer, depth)).pixels
     assert len(pixels)
     assert (pixels % 64 >= 32).all()
-    away = View(view.origin, np.float32([0, 0, 9]))
-    assert measure_flicker([register(spec, (away, view), (depth, depth))], [[depth[..., None]] * 2]) is None
+    films = Flicker(spec)
+    for seen in (View(view.origin, np.float32([0, 0, 9])), view):
+        films.add(seen, depth, {"image": [image]})
+    assert films.result() == {}

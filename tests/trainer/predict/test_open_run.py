@@ -19,6 +19,7 @@ from photonfarm.core.pictures import display
 from photonfarm.core.statistics import block_z_test, clean_error
 from photonfarm.farm.devices import Card
 from photonfarm.predict import infer, open_run
+from photonfarm.renderer.jobs.truth import Amount
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.arrangement import Shot
@@ -198,12 +199,19 @@ def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_i
     assert float((empty - image.detach()).abs().mean()) > 0.01
 
 
-def test_a_frame_that_is_not_finite_is_refused_with_its_number(store: Path, tmp_path: Path) -> None:
+def test_a_film_says_how_it_flickers_and_a_frame_that_is_not_finite_is_refused_with_its_number(
+    store: Path, tmp_path: Path
+) -> None:
     opened = open_run(trained(store, tmp_path / "run", "cnn"), store)
     view = sample_view(opened.spec, b"view of a test..", 0, 0)
     broken = View(np.full(3, np.nan, np.float32), view.target)
     with pytest.raises(IncompleteError, match="frame-0000 came out non-finite"):
         infer.show_path(opened, rest(opened.spec), [broken, view], tmp_path / "out")
+    near = View(view.origin + np.float32(0.02), view.target)
+    shown = infer.show_path(opened, rest(opened.spec), [view, near], tmp_path / "out", amount=Amount(spp=32))
+    told = dict(re.findall(r"(the network|the truth|OIDN of 16 samples) ([0-9.e-]+)", shown.sentence))
+    assert set(told) == {"the network", "the truth", "OIDN of 16 samples"}
+    assert all(0 <= float(value) < 0.5 for value in told.values())
 
 
 def test_a_frame_is_asked_for_by_names_and_says_what_the_network_never_saw(store: Path, tmp_path: Path) -> None:

@@ -4,12 +4,12 @@ A surface is followed by depth and camera, which are exact where nothing moves b
 shows may change truly, as in a mirror, and following it rounds to pixels: so the figure of an image is to be read
 beside that of the truth along the same path.
 
-Shape letters: T frames, H W image.
+Shape letters: H W image, N pixels.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -63,14 +63,33 @@ def register(spec: SceneSpec, views: tuple[View, View], depths: tuple[F32, F32])
     return Register(index[:, same], weight[:, same], pixels[same])
 
 
-def measure_flicker(registers: Sequence[Register], films: Sequence[Sequence[F32]]) -> float | None:
-    """The root of the mean square of what changes, over all steps of a film; None where no surface stays in view.
+class Flicker:
+    """What changes from frame to frame of several films of one path, by their names."""
 
-    `films` are one film, or two of the same truth with noise of their own: then the mean product of both changes is
-    taken, in which that noise cancels. Images (H, W, 3) are as they are shown, in the metric space.
-    """
-    total, count = 0.0, 0
-    for step, follow in enumerate(registers):
-        first, second = (follow.change(film[step], film[step + 1]) for film in (films[0], films[-1]))
-        total, count = total + float((first * second).sum()), count + first.size
-    return float(np.sqrt(max(total / count, 0.0))) if count else None
+    def __init__(self, spec: SceneSpec) -> None:
+        """Begin before the first frame."""
+        self._spec = spec
+        self._before: tuple[View, F32, Mapping[str, Sequence[F32]]] | None = None
+        self._sums: dict[str, float] = {}
+        self._count = 0
+
+    def add(self, view: View, depth: F32, images: Mapping[str, Sequence[F32]]) -> None:
+        """Take the next frame: its depth (H, W), and of each film its image (H, W, 3) as it is shown.
+
+        A film may be two images with noise of their own, as the halves of a truth: then the mean product of both
+        changes is taken, in which that noise cancels.
+        """
+        if self._before is not None:
+            seen, deep, shown = self._before
+            follow = register(self._spec, (seen, view), (deep, depth))
+            self._count += 3 * len(follow.pixels)
+            for name, now in images.items():
+                first, second = (follow.change(shown[name][i], now[i]) for i in (0, -1))
+                self._sums[name] = self._sums.get(name, 0.0) + float((first * second).sum())
+        self._before = view, depth, images
+
+    def result(self) -> dict[str, float]:
+        """The root of the mean square of what changed, of each film; empty where no surface stayed in view."""
+        return {
+            name: float(np.sqrt(max(total / self._count, 0.0))) for name, total in self._sums.items() if self._count
+        }

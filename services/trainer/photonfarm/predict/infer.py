@@ -21,10 +21,11 @@ import torch
 from PIL import Image
 
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError, store_errors
-from photonfarm.core.pictures import enlarge, write_png
+from photonfarm.core.pictures import display_values, enlarge, write_png
 from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.plan.hold_out import rows_held_out
+from photonfarm.predict.flicker import Flicker
 from photonfarm.predict.opened_run import OpenRun, never_seen
 from photonfarm.renderer.jobs.truth import Amount, write_beside
 from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot
@@ -36,6 +37,8 @@ from photonfarm.store import Sample, SceneReader, Store
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.data.feed import Feed
 from photonfarm.trainer.networks.inputs import require
+from photonfarm.trainer.predictors.denoisers import PACKAGE as OIDN_PACKAGE
+from photonfarm.trainer.predictors.denoisers import Oidn
 from photonfarm.trainer.predictors.evaluation import choose_error
 from photonfarm.trainer.predictors.trained import TrainedRun
 
@@ -155,34 +158,77 @@ def show_frames(
     _check_frames(run, frames, source.spec)
     predict = run.predictor(source.spec, source.base(), device)
     images = (predict(batch)[0] for batch in _read_frames(run, frames, source))
-    return _show_images(images, len(frames), out, fps, "for the network and what it reads")
+    return _show_images(_time(images), len(frames), out, fps, "for the network and what it reads")
+
+
+def _time(images: Iterator[F32]) -> Iterator[tuple[F32, float]]:
+    """Images with the seconds that each took."""
+    began = time.perf_counter()
+    for image in images:
+        yield image, time.perf_counter() - began
+        began = time.perf_counter()
 
 
 def show_path(
-    opened: OpenRun, modification: Modification, views: Sequence[View], out: Path, *, fps: float = 12.0
+    opened: OpenRun,
+    modification: Modification,
+    views: Sequence[View],
+    out: Path,
+    *,
+    fps: float = 12.0,
+    amount: Amount | None = None,
 ) -> InferResult:
     """Write the network's images of a configuration from some views, whose inputs are rendered: as `show_frames`.
 
-    Raises IncompleteError for an image that is not finite.
+    The sentence says how much they flicker; with an `amount`, beside the truth of each frame, and Open Image Denoise on
+    half of its samples where that is installed. Raises IncompleteError for an image that is not finite.
     """
+    flicker = Flicker(opened.spec)
     with torch.no_grad():
-        images = ((opened.predict(modification, view).radiance * opened.spec.exposure).cpu().numpy() for view in views)
+        images = _follow(opened, modification, views, flicker, amount)
         shown = _show_images(images, len(views), out, fps, "for what the network reads and the network")
-    stands = Arrangement.from_modification(opened.spec, modification)
+    changed = ", ".join(f"{name} {value:.3g}" for name, value in flicker.result().items())
+    stands = Arrangement.from_modification(opened.spec, modification).describe() or "at rest"
+    sentence = (
+        f"{stands}: {shown.sentence}\nflicker, the root mean square change of surfaces that stay in view: {changed}"
+    )
     doubts = never_seen(find_doubts(opened.spec, modification))
-    return InferResult(shown.files, f"{stands.describe() or 'at rest'}: {shown.sentence}", doubts)
+    return InferResult(shown.files, sentence if changed else f"{stands}: {shown.sentence}", doubts)
 
 
-def _show_images(images: Iterator[F32], count: int, out: Path, fps: float, what: str) -> InferResult:
-    """Write exposed images as they come, and the animation of them; `what` says what their time was for."""
+def _follow(
+    opened: OpenRun, modification: Modification, views: Sequence[View], flicker: Flicker, amount: Amount | None
+) -> Iterator[tuple[F32, float]]:
+    """The network's exposed image of each view, and its seconds; `flicker` gets it, and what it is compared with."""
+    exposure = opened.spec.exposure
+    denoise = Oidn() if amount and find_spec(OIDN_PACKAGE) is not None else None
+    for view in views:
+        frame = opened.predict(modification, view)
+        image = (frame.radiance * exposure).cpu().numpy()
+        yield image, sum(frame.seconds.values())
+        films = {"the network": [image]}
+        if amount is not None:
+            truth = opened.truth(modification, view, spp=amount.spp, seconds=amount.seconds)
+            halves = truth.halves * np.float32(exposure)
+            films["the truth"] = [*halves]
+            if denoise is not None:
+                noisy = (torch.from_numpy(halves[0]), frame.inputs.reflects[0].cpu(), frame.inputs.normal[0].cpu())
+                films[f"OIDN of {truth.spp // 2} samples"] = [denoise.denoise(*noisy).numpy()]
+        shown = {name: [display_values(each) for each in film] for name, film in films.items()}
+        flicker.add(view, frame.inputs.depth[0].cpu().numpy(), shown)
+
+
+def _show_images(images: Iterator[tuple[F32, float]], count: int, out: Path, fps: float, what: str) -> InferResult:
+    """Write exposed images as they come, each with the seconds that it took, and the animation of them.
+
+    `what` says what their time was for.
+    """
     with store_errors("make the folder of the pictures", out):
         out.mkdir(parents=True, exist_ok=True)
     files = [out / f"frame-{i:04}.png" for i in range(count)]
     seconds = []
-    for file in files:
-        began = time.perf_counter()
-        image = next(images)
-        seconds.append(time.perf_counter() - began)
+    for file, (image, took_s) in zip(files, images, strict=True):
+        seconds.append(took_s)
         if not np.isfinite(image).all():
             raise IncompleteError(f"{file.stem} came out non-finite; move the camera a little")
         write_png(enlarge(image), file)

@@ -85,9 +85,9 @@ def infer(
     kinds = {"--camera-path": path, "--orbit": orbit, "--buffers": buffers}
     given = [name for name, value in kinds.items() if value is not None]
     of_camera = {"--camera": asked.camera, "--look-at": asked.look_at, "--fov": fov}
-    of_frame = {**of_camera, "--truth": truth, "--store-it": store_it or None}
+    of_frame = {**of_camera, "--store-it": store_it or None, "--truth": truth if buffers else None}
     alone = [name for name, value in of_frame.items() if value is not None]
-    arranged = like is not None or asked != Shot() or bool(alone)
+    arranged = like is not None or asked != Shot() or truth is not None or bool(alone)
     if len(given) > 1 or (given and alone) or (buffers is not None and (arranged or row is not None)):
         others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
         raise click.UsageError(f"{' and '.join(others)} exclude each other")
@@ -106,7 +106,8 @@ def infer(
         changes = Arrangement.of(**asked.model_dump(include=set(Arrangement.model_fields)))
         _, configuration, views = find_views(store, trained.scene_id, changes, along, row, like)
         with tell_waiting(say, f"rendering {len(views)} frames of {trained.scene_id}"):
-            result = shows.show_path(OpenRun(trained, store, device), configuration, views, out, fps=fps)
+            opened = OpenRun(trained, store, device)
+            result = shows.show_path(opened, configuration, views, out, fps=fps, amount=amount)
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
     elif row is not None and not arranged:

@@ -199,9 +199,7 @@ def test_a_frame_is_differentiable_and_follows_a_configuration_that_is_changed_i
     assert float((empty - image.detach()).abs().mean()) > 0.01
 
 
-def test_a_film_says_how_it_flickers_and_a_frame_that_is_not_finite_is_refused_with_its_number(
-    store: Path, tmp_path: Path
-) -> None:
+def test_a_film_flickers_and_a_frame_that_is_not_finite_is_refused_with_its_number(store: Path, tmp_path: Path) -> None:
     opened = open_run(trained(store, tmp_path / "run", "cnn"), store)
     view = sample_view(opened.spec, b"view of a test..", 0, 0)
     broken = View(np.full(3, np.nan, np.float32), view.target)

@@ -163,7 +163,8 @@ function predictions(runs) {
       h("img", { class: "whole", src: `sample/${run.scene_id}/${row}/reference.png`, alt: `reference of row ${row}`, title: `row ${row}` }))));
     references.style.setProperty("--columns", run.rows.length);
     return card("half", `Predictions of ${run.run}`, "of views that training never sees",
-      references, h("p", { class: "note" }, "Above: the mean of all passes of these views. Below: what the network makes of them."), picture,
+      references, h("p", { class: "note" }, "Above: the mean of all passes of these views. Below: what the network makes of them. ",
+        h("code", {}, `photonfarm live --run ${run.run}`), " shows any other configuration beside its truth."), picture,
       h("div", { class: "controls" }, h("input", { type: "range", min: 0, max: last, value: at, "aria-label": "step", oninput: (event) => {
         chosen[place] = +event.target.value === last ? undefined : +event.target.value;
         show(+event.target.value);

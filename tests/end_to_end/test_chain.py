@@ -69,9 +69,7 @@ def test_the_same_again_renders_nothing_and_trains_nothing(photonfarm: Command, 
     assert again.returncode == 0, again.stderr
     assert markers() == before
     assert network() == trained
-    (end,) = records()[len(told) :]
-    assert records()[: len(told)] == told
-    assert (end["kind"], end["step"], end["draws"]) == ("end", 40, told[-1]["draws"])
+    assert records() == told, "a run that has ended stays as it is"
 
 
 def test_the_reading_example_of_the_format_reads_committed_samples_with_plain_zarr(folder: Path) -> None:

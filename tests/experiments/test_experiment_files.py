@@ -70,3 +70,14 @@ def test_some_networks_are_trained_for_longer_too_and_in_three_rooms_from_three_
     }
     chosen = Experiment.load("fixed-veach-ajar", "small").only(["cnn-4000", "guided"])
     assert [run.name for run in chosen.trained()] == ["cnn-4000", "guided"]
+
+
+def test_a_look_has_the_networks_that_are_named_from_the_first_seed() -> None:
+    whole = Experiment.load("fixed-veach-ajar", "small")
+    found = whole.only(["denoise_1_reflectance", "guided"])
+    assert [run.name for run in found.trained()] == ["guided", "denoise_1_reflectance"]
+    settings = {run.name: run.train for run in whole.trained()}
+    assert all(run.train == settings[run.name] and not run.further for run in found.trained())
+    assert not found.again()
+    with pytest.raises(SpecError, match="no network of it is named gided"):
+        whole.only(["guided", "gided"])

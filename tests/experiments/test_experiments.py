@@ -396,14 +396,3 @@ def test_a_run_keeps_every_commit_that_it_was_trained_at_and_the_report_tells_th
     stages._tell_commits(report)
     told = json.loads(report.read_text())
     assert told == {"edit_seconds": 0.1, "trained_at": {first.name: ["1234567", "89abcde"], again.name: []}}
-
-
-def test_a_look_has_the_networks_that_are_named_from_the_first_seed() -> None:
-    whole = Experiment.load("fixed-veach-ajar", "small")
-    found = whole.only(["denoise_1_reflectance", "guided"])
-    assert [run.name for run in found.trained()] == ["guided", "denoise_1_reflectance"]
-    settings = {run.name: run.train for run in whole.trained()}
-    assert all(run.train == settings[run.name] and not run.further for run in found.trained())
-    assert not found.again()
-    with pytest.raises(SpecError, match="no network of it is named gided"):
-        whole.only(["guided", "gided"])

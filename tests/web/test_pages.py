@@ -4,6 +4,7 @@ import http.client
 import io
 import json
 import re
+import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -252,6 +253,18 @@ def test_a_row_that_is_not_complete_is_not_there(server: PageServer, scene: Scen
 @pytest.mark.parametrize("method", ["POST", "DELETE", "NONSENSE"])
 def test_nothing_can_be_written(server: PageServer, method: str) -> None:
     assert asked(server, "/api/state", method)[0] == 501
+
+
+def test_what_a_page_of_elsewhere_posts_is_no_further_request(server: PageServer) -> None:
+    """A body is text of that page's choice, with any headers; browsers send it on a connection that is kept."""
+    inside = b"GET /api/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", server.server_address[1])) as connection:
+        head = f"POST /api/state HTTP/1.1\r\nHost: evil.example\r\nContent-Length: {len(inside)}\r\n\r\n"
+        connection.sendall(head.encode() + inside)
+        with connection.makefile("rb") as answers:
+            answer = answers.read()
+    assert answer.startswith(b"HTTP/1.1 501 ")
+    assert answer.count(b"HTTP/1.1 ") == 1
 
 
 def test_a_name_of_elsewhere_is_refused(server: PageServer) -> None:

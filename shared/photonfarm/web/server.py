@@ -126,11 +126,15 @@ class _Handler(BaseHTTPRequestHandler):
     do_HEAD = do_GET  # noqa: N815 - the library asks for these names
 
     def do_POST(self) -> None:
-        """Do what the path names, if a page of this server asks for it; there is never a body to read."""
-        origin = self.headers.get("Origin")
+        """Do what the path names, if a page of this server asks for it; the connection ends, as no body is read.
+
+        Otherwise what another site's page posts would be taken for further requests, with headers of its choice.
+        """
+        self.close_connection = True
+        _, is_origin, asking = self.headers.get("Origin", "").partition("://")
         if not self.server.writes:
             self._refuse(HTTPStatus.NOT_IMPLEMENTED, "this server has no way to write")
-        elif origin is None or urlsplit(origin).netloc != self.headers.get("Host"):
+        elif not is_origin or asking != self.headers.get("Host"):
             self._refuse(HTTPStatus.FORBIDDEN, "only a page of this server may ask for that")
         else:
             self._find(self.server.writes)
@@ -172,6 +176,8 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", keep)
+        if self.close_connection:
+            self.send_header("Connection", "close")
         self.end_headers()
         if self.command != "HEAD":
             self.wfile.write(content)

@@ -27,7 +27,7 @@ from photonfarm.scene.modification import Modification, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View, sample_view
 from photonfarm.trainer.metrics.image_metrics import metric_space
-from photonfarm.trainer.networks.inputs import require
+from photonfarm.trainer.networks.guided import show_known_light
 
 SEED = 99
 """A master seed that no plan should have."""
@@ -55,8 +55,7 @@ def list_changes(spec: SceneSpec, before: Modification, other: Modification) -> 
 def show(run: OpenRun, modification: Modification, view: View, spp: int) -> F32:
     """The network's image, the light known alone and both halves, (4, H, W, 3) in the metric space."""
     frame, exposure = run.predict(modification, view), run.spec.exposure
-    guides = require(frame.inputs.guides)
-    known = (guides.emission + guides.direct + guides.gloss)[0].cpu().numpy()
+    known = show_known_light(frame.inputs)[0].cpu().numpy()
     truth = run.truth(modification, view, spp=spp).halves * np.float32(exposure)
     shown: F32 = metric_space(np.stack([frame.radiance.cpu().numpy() * exposure, known, *truth])).numpy()
     return shown

@@ -134,6 +134,18 @@ def test_black_surfaces_that_shine_have_learned_light_by_a_setting(make_source, 
     assert torch.equal(inputs.guides.specular, stored)
 
 
+@pytest.mark.parametrize("architecture", ["guided_transport", "guided_denoise"])
+def test_what_reflects_more_by_a_setting_leaves_the_number_of_glossy_pixels(make_source, architecture: str) -> None:
+    """A red metal that is not quite glossy: for a card glossy pixels are counted before a network sees the guides."""
+    source = make_source(1)
+    inputs = batch_of(source, (0,), architecture).inputs
+    inputs.guides.specular[:, :8], inputs.guides.roughness[:, :8] = torch.tensor([0.58, 0.0, 0.0]), 0.1
+    counted = replace(inputs, guides=replace(inputs.guides, glossy_count=inputs.guides.count_glossy()))
+    assert counted.guides.reflect_at_least(0.04).count_glossy() > counted.guides.glossy_count
+    made = network(source, architecture, least_specular=0.04)
+    assert torch.equal(image(made, counted), image(made, inputs))
+
+
 def test_a_scene_far_from_the_origin_gives_the_same_image(make_source) -> None:
     source, kind, offset = make_source(1), "guided_transport", np.float32(1024)
     chosen = NetworkSettings(width=4, architecture=kind)

@@ -117,10 +117,10 @@ class Guided(Network):
 
     def forward(self, inputs: Inputs) -> Tensor:
         """The image, (B, H, W, 3), linear radiance × exposure, as every network's."""
-        inputs = self.raise_specular(inputs)
+        further, inputs = self.further(inputs), self.raise_specular(inputs)
         if not self.filters_direct:
-            return super().forward(inputs)
-        further, guides = self.further(inputs), require(inputs.guides)
+            return self.known(inputs, further) + self.factor(inputs) * self.synthesise(self.channels(inputs, further))
+        guides = require(inputs.guides)
         plain = guides.direct + guides.gloss
         with torch.no_grad():
             reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
@@ -141,7 +141,10 @@ class Guided(Network):
         return rays * (inputs.depth / (ahead * self.scale))[..., None]
 
     def raise_specular(self, inputs: Inputs) -> Inputs:
-        """The inputs in which whatever shines reflects at least the settings' `least_specular`; without, themselves."""
+        """The inputs in which whatever shines reflects at least the settings' `least_specular`; without, themselves.
+
+        Not for `further`, as glossy pixels are counted before [inputs.Inputs.to], by what the guides found.
+        """
         if not self.least_specular:
             return inputs
         return replace(inputs, guides=require(inputs.guides).reflect_at_least(self.least_specular))

@@ -30,7 +30,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from photonfarm.trainer.networks.guided import REFLECTANCE_FLOOR, Guided, floor
+from photonfarm.trainer.networks.guided import REFLECTANCE_FLOOR, Guided, floor, show_known_light
 from photonfarm.trainer.networks.inputs import Inputs, NoisyColour, SceneFrame, reflectance, require
 from photonfarm.trainer.networks.light_filter import estimate_variance, filter_light, smooth, take_means
 from photonfarm.trainer.networks.lit_points import LitPoints
@@ -80,8 +80,8 @@ class GuidedDenoise(Guided):
 
         Of one pass, what reflects nothing shows what it emits.
         """
-        inputs = self.raise_specular(inputs)
-        noisy, lit = require(inputs.noisy), self.further(inputs)
+        lit, inputs = self.further(inputs), self.raise_specular(inputs)
+        noisy = require(inputs.noisy)
         denoised = require(noisy.filtered) if self._has_denoiser else None
         half = look_at_half(inputs, noisy, self.measure_places(inputs), denoised)
         known = self.known(inputs, lit)
@@ -121,7 +121,7 @@ def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor, denoised: T
     guides = require(inputs.guides)
     shows = floor(inputs.albedo, guides) / REFLECTANCE_FLOOR
     reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
-    direct = guides.emission + guides.direct + guides.gloss
+    direct = show_known_light(inputs)
     light = noisy.colour - direct
     spread = estimate_variance(light, reflects)
     if noisy.passes is not None and noisy.variance is not None:

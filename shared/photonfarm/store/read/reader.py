@@ -41,7 +41,6 @@ from photonfarm.store.read.batch import Batch, Sample
 REPAIR = "`photonfarm store check --repair` sets its job aside, and workers render it again"
 """The remedy for damaged samples."""
 
-
 REMEMBERED_S = 0.2  # for which a look counts that finds the scene not forgotten: too short to render it anew
 
 
@@ -53,10 +52,8 @@ class SceneReader:
 
         With an `exposure`, the spec has that one, as a training run keeps the one that it began with.
         """
-        self._storage = open_storage(root)
-        self._exposure = exposure
-        self._scene_id = scene_id
-        self._name = f"{SCENES}/{scene_id}"
+        self._storage, self._name = open_storage(root), f"{SCENES}/{scene_id}"
+        self._scene_id, self._exposure = scene_id, exposure
         self._spec: SceneSpec | None = None
         self._arrays: dict[str, schema.ArraySchema] = {}
         self._markers = FollowedMarkers(self._storage, self._name)
@@ -67,8 +64,10 @@ class SceneReader:
         self._inputs, self._key = PlannedContent(), np.zeros((0, KEY_BYTES), np.uint8)
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
         self._shards: dict[tuple[str, int], Shard] = {}  # open ones, by array and job
-        self._lock = threading.Lock()
-        self._remembered_s = -REMEMBERED_S  # when it was last seen that the scene is not forgotten
+        self._lock, self._remembered_s = (
+            threading.Lock(),
+            -REMEMBERED_S,
+        )  # when it was last seen that the scene is not forgotten
         self._base: tuple[Geometry, BasePointCloud] | None = None
 
     @property

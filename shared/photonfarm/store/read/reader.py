@@ -64,10 +64,8 @@ class SceneReader:
         self._inputs, self._key = PlannedContent(), np.zeros((0, KEY_BYTES), np.uint8)
         self._view_row = self._modification_row = self._pass = np.zeros(0, np.int64)  # (R,) of each sample
         self._shards: dict[tuple[str, int], Shard] = {}  # open ones, by array and job
-        self._lock, self._remembered_s = (
-            threading.Lock(),
-            -REMEMBERED_S,
-        )  # when it was last seen that the scene is not forgotten
+        self._lock = threading.Lock()
+        self._remembered_s = -REMEMBERED_S  # when it was last seen that the scene is not forgotten
         self._base: tuple[Geometry, BasePointCloud] | None = None
 
     @property

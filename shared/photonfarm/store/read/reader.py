@@ -99,8 +99,7 @@ class SceneReader:
     def refresh(self) -> NDArray[np.int64]:
         """Look for new samples; returns the rows of those completed since the last refresh, none without a scene.
 
-        Costs one listing of the plans, and what `FollowedMarkers` costs. Raises StoreError for a store of another
-        format.
+        Costs a listing of the plans, and what `FollowedMarkers` costs. StoreError for a store of another format.
         """
         if self._spec is None and not self._storage.exists(f"{self._name}/spec.json"):
             if not self._storage.exists(FORMAT_FILE):

@@ -150,11 +150,12 @@ class Live:
         """The network's picture: in motion as large as is fluent, else of the spec's size."""
         began, film = time.perf_counter(), self.run.spec.film if full else self.speed.film()
         frame = self._predict(asked, film)
+        radiance = frame.radiance.numpy(force=True)  # waits for a card
         seconds = time.perf_counter() - began
         if not full:
             self.speed.learn(seconds)
         return {
-            "picture": self._draw(frame.radiance.numpy(force=True)),
+            "picture": self._draw(radiance),
             "ms": 1e3 * seconds,
             "full": film == self.run.spec.film,
             "warnings": frame.doubts,

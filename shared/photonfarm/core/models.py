@@ -28,7 +28,7 @@ def _check_name(name: str) -> str:
 Name = Annotated[str, AfterValidator(_check_name)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Count = Annotated[int, Field(ge=1)]
-Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Factor = Annotated[float, Field(ge=0, le=1e30, allow_inf_nan=False)]  # as float32 holds it
 
 INPUT_SHOWN = 100
 """The most characters of a wrong value that a message repeats, as the value may be a whole file."""

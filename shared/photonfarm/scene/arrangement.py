@@ -11,7 +11,7 @@ from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, FiniteFloat, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Factor, Frozen, nearest, sentences
@@ -29,7 +29,10 @@ def _as_list(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else value
 
 
-Point = Annotated[tuple[FiniteFloat, FiniteFloat, FiniteFloat], BeforeValidator(_as_list)]
+Number = Annotated[float, Field(ge=-1e18, le=1e18)]
+"""A number of which float32 holds the square, too."""
+
+Point = Annotated[tuple[Number, Number, Number], BeforeValidator(_as_list)]
 
 
 COLUMNS_OF = {
@@ -52,12 +55,12 @@ class Arrangement(Frozen):
     place: dict[str, Point] = Field(default_factory=dict)  # where a group's `at` shall stand, scene units
     move: dict[str, Point] = Field(default_factory=dict)  # by how much it goes from where it stands
     without: tuple[str, ...] = ()  # groups that are removed
-    turn: dict[str, FiniteFloat] = Field(default_factory=dict)  # from how it was modelled, degrees about the up axis
+    turn: dict[str, Number] = Field(default_factory=dict)  # from how it was modelled, degrees about the up axis
     power: dict[str, Factor] = Field(default_factory=dict)  # factor on what a light emits
     colour: dict[str, tuple[Factor, Factor, Factor]] = Field(default_factory=dict)  # further ones, on red, green, blue
 
     @classmethod
-    def of(cls, **values: Any) -> Self:
+    def of(cls, /, **values: Any) -> Self:
         """The checked values; raises SpecError with a sentence for each that is impossible."""
         try:
             return cls(**values)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core.errors import SpecError
-from photonfarm.scene.arrangement import Shot
+from photonfarm.scene.arrangement import Arrangement, Shot
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View, sample_view
@@ -64,21 +64,22 @@ def read_cameras(file: Path, spec: SceneSpec) -> list[View]:
     frames = document.get("frames") if isinstance(document, Mapping) else None
     if not isinstance(frames, list) or not frames:
         raise SpecError(f"{file}: has no frames; a transforms.json has a list of them, each with a transform_matrix")
-    return [_read_camera({**document, **frame}, spec, f"{file}: frame {n}") for n, frame in enumerate(frames)]
+    return [_read_camera(document, frame, spec, f"{file}: frame {n}") for n, frame in enumerate(frames)]
 
 
-def _read_camera(camera: Mapping[str, Any], spec: SceneSpec, where: str) -> View:
+def _read_camera(document: Mapping[str, Any], frame: Any, spec: SceneSpec, where: str) -> View:
     """The view of a frame, with what is said of all frames; its own `look_at` if it has one."""
     try:
+        camera = {**document, **frame}
         to_world = np.array(camera["transform_matrix"], np.float64)[:3, :4]
         fov_deg = _read_fov(camera)
         lens = [float(camera.get(name, 0)) for name in DISTORTED]
         aspect = float(camera.get("w", spec.film.width)) / float(camera.get("h", spec.film.height))
-        look_at = None if (said := camera.get("look_at")) is None else np.array(said, np.float32).reshape(3)
+        look_at = camera.get("look_at")
     except (KeyError, TypeError, ValueError, IndexError, ZeroDivisionError) as error:
         raise SpecError(f"{where}: is no camera: {error!r}; a transform_matrix of 4 × 4 numbers is required") from error
-    if to_world.shape != (3, 4) or not np.isfinite(to_world).all():
-        raise SpecError(f"{where}: transform_matrix: 4 × 4 finite numbers are required")
+    if to_world.shape != (3, 4) or not (np.isfinite(to_world).all() and to_world[:, :3].any(axis=0).all()):
+        raise SpecError(f"{where}: transform_matrix: 4 × 4 finite numbers are required, of a rotation and a place")
     if fov_deg is not None and abs(fov_deg - spec.view.fov_deg) > FOV_SLACK_DEG:
         raise SpecError(f"{where}: has a field of view of {fov_deg:.2f}°, and the spec of {spec.view.fov_deg:g}°")
     if abs(aspect - spec.film.width / spec.film.height) > 1e-3 * aspect:
@@ -90,8 +91,11 @@ def _read_camera(camera: Mapping[str, Any], spec: SceneSpec, where: str) -> View
         middle = 0.5 * (spec.view.look_at.low + spec.view.look_at.high)
         ahead = -backward / np.linalg.norm(backward)
         distance = float((middle - origin) @ ahead)
-        look_at = (origin + ahead * (distance if distance > spec.view.near else 1.0)).astype(np.float32)
-    view = View(origin.astype(np.float32), look_at)
+        look_at = origin + ahead * (distance if distance > spec.view.near else 1.0)
+    try:
+        view = Shot.of(camera=origin, look_at=look_at).view(spec)
+    except SpecError as error:
+        raise SpecError(f"{where}: {error}") from error
     made = Camera.of(view, spec)
     off = max(_angle_between(made.right, right), _angle_between(-made.forward, backward))
     if off > ROLL_SLACK_DEG:
@@ -137,12 +141,11 @@ def read_configurations(
             fov_deg = entry.pop("fov", spec.view.fov_deg)
             if fov_deg != spec.view.fov_deg:
                 raise SpecError(f"fov = {fov_deg}: samples of this spec have {spec.view.fov_deg:g}")
-            shot = Shot.of(**_fill_places(entry, spec) if is_table else entry)
-            modification = shot.apply(spec, start)
-            found.append((modification, None if shot.camera is None else shot.view(spec)))
+            shot = Shot.of(**_fill_places(entry, spec, start) if is_table else entry)
+            own = shot.view(spec) if shot.camera or shot.look_at else None
+            found.append((shot.apply(spec, start), own))
         except SpecError as error:
-            where = f"line {number + 2}" if is_table else f"configuration {number}"
-            raise SpecError(f"{file}: {where}: {error}") from error
+            raise SpecError(f"{file}: {'row' if is_table else 'configuration'} {number}: {error}") from error
     return found
 
 
@@ -167,27 +170,32 @@ def _read_table(file: Path) -> Iterator[dict[str, Any]]:
     """The rows of a CSV file, by names and coordinates."""
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
-            for row in csv.DictReader(lines, restval=""):
+            for number, row in enumerate(csv.DictReader(lines, restval="")):
+                if None in row:
+                    raise SpecError(f"{file}: row {number}: has more cells than the first line has names")
                 yield {name.strip(): cell.strip() for name, cell in row.items() if name and cell and cell.strip()}
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SpecError(f"{file}: cannot be read: {error}") from error
 
 
-def _fill_places(cells: Mapping[str, str], spec: SceneSpec) -> dict[str, Any]:
-    """The cells of a row as a `Shot` has them; coordinates of a group that are not said are those at rest."""
-    at = {group.name: group.at for group in spec.groups}
+def _fill_places(cells: Mapping[str, str], spec: SceneSpec, start: Modification | None) -> dict[str, Any]:
+    """The cells of a row as a `Shot` has them; what they do not say of a group that they name is as at the start."""
+    before = Arrangement.from_modification(spec, rest(spec) if start is None else start)
+    at = {group.name: group.at for group in spec.groups} | before.place
     entry: dict[str, Any] = {"place": {}, "colour": {}, "turn": {}, "power": {}, "without": []}
     for key, cell in cells.items():
         name, _, what = key.rpartition(".")
         number = _read_number(key, cell)
         if name in ("camera", "look_at") and what in "xyz":
             entry.setdefault(name, [None, None, None])["xyz".index(what)] = number
-        elif name and what == "present":
-            entry["without"] += [name] * (number == 0)
-        elif name and what in ("x", "y", "z"):
-            entry["place"].setdefault(name, [*at.get(name, (0.0, 0.0, 0.0))])["xyz".index(what)] = number
+        elif name and what == "present" and number == 0:
+            entry["without"] += [name]
+        elif name and what in ("x", "y", "z", "present"):
+            place = entry["place"].setdefault(name, [*at.get(name, (0.0, 0.0, 0.0))])
+            if what != "present":
+                place["xyz".index(what)] = number
         elif name and what in COLOURS:
-            entry["colour"].setdefault(name, [1.0, 1.0, 1.0])[COLOURS.index(what)] = number
+            entry["colour"].setdefault(name, [*before.colour.get(name, (1.0, 1.0, 1.0))])[COLOURS.index(what)] = number
         elif name and what in ("turn", "power"):
             entry[what][name] = number
         else:

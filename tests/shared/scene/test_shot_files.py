@@ -12,6 +12,7 @@ from click.testing import CliRunner
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.export.snapshot import camera_to_world
+from photonfarm.scene.arrangement import Arrangement
 from photonfarm.scene.camera_path import CameraPath, Cameras
 from photonfarm.scene.modification import rest
 from photonfarm.scene.shot_files import read_cameras, read_configurations, read_shots
@@ -67,6 +68,11 @@ ROLLED = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
         ({"frames": []}, "no frames"),
         ({"frames": [{}]}, "frame 0: is no camera"),
         ({"frames": [{"transform_matrix": [[1, 2], [3, 4]]}]}, "4 × 4"),
+        ({"frames": [{"transform_matrix": [[0] * 4] * 4}]}, "4 × 4 finite numbers are required, of a rotation"),
+        ({"frames": [1]}, "frame 0: is no camera"),
+        ({"look_at": [float("nan"), 0, 0]}, "frame 0: look_at.0 = nan: a finite number"),
+        ({"frames": [{"transform_matrix": np.diag([1, 1, 1, 0]).tolist()}], "look_at": [0, 0, 0]}, "where it looks at"),
+        ({"frames": [{"transform_matrix": (np.eye(4) + np.diag([1e39], 3)).tolist()}]}, "camera.0 = 1e\\+39"),
     ],
 )
 def test_cameras_that_the_spec_cannot_have_are_refused(tmp_path: Path, changes: dict[str, Any], says: str) -> None:
@@ -97,6 +103,23 @@ def test_configurations_are_read_by_names_from_json_and_csv_alike(tmp_path: Path
     assert len(read_shots(SPEC, None, tables, views=2)) == 1 + 2 + 2
 
 
+def test_what_a_row_leaves_empty_is_as_at_the_start(tmp_path: Path) -> None:
+    (file := tmp_path / "rooms.csv").write_text("object.x, object.present\n0.5,\n, 1\n")
+    moved = Arrangement.of(place={"object": (0, 0, 0.25)}).apply(SPEC)
+    (first, _), (second, _) = read_configurations(file, SPEC, moved)
+    np.testing.assert_array_equal(first.vector, np.float32([[0.5, 0, 0.25, 1]]))
+    np.testing.assert_array_equal(second.vector, moved.vector)
+    (_, _), (back, _) = read_configurations(file, SPEC, rest(SPEC).without_groups())
+    assert back.present.all(), "it is said to be there"
+
+
+def test_a_row_that_says_where_to_look_alone_is_seen_from_the_first_camera(tmp_path: Path) -> None:
+    (file := tmp_path / "rooms.csv").write_text("look_at.x, look_at.y, look_at.z\n0, 0.25, 0\n")
+    ((_, camera),) = read_configurations(file, SPEC)
+    assert camera is not None
+    np.testing.assert_array_equal(camera.target, np.float32([0, 0.25, 0]))
+
+
 @pytest.mark.parametrize(
     ("text", "says"),
     [
@@ -115,7 +138,14 @@ def test_a_configuration_that_the_scene_cannot_have_is_refused(tmp_path: Path, t
 
 
 @pytest.mark.parametrize(
-    ("text", "says"), [("object.x\nfar", "line 2: column 'object.x': 'far'"), ("object\n1", "NAME.x"), ("", "no conf")]
+    ("text", "says"),
+    [
+        ("object.x\nfar", "row 0: column 'object.x': 'far'"),
+        ("object\n1", "NAME.x"),
+        ("", "no conf"),
+        ("object.x,object.z\n\n0,0\n0,5,0,5", "row 1: has more cells"),
+        ("lamp.present\n1", "'lamp' is no"),
+    ],
 )
 def test_a_table_that_cannot_be_meant_is_refused(tmp_path: Path, text: str, says: str) -> None:
     (file := tmp_path / "rooms.csv").write_text(text)

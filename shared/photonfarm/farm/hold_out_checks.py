@@ -100,7 +100,10 @@ def _find_least(request: Request, suffices: Callable[[Request], bool]) -> int | 
 
 
 def _list_units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> set[Key]:
-    """The keys by which what is planned and requested is held out: of configurations, or of a static scene's views."""
+    """The keys by which what is planned and requested is held out: of configurations, or of a static scene's views.
+
+    What a person chose has none, as it is never held out.
+    """
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:
         wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
@@ -109,7 +112,8 @@ def _list_units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> s
     new_rows = expand(spec, wanted, known, first_job=first_job, shard_rows=shard_rows).rows
     new_plans = [] if new_rows is None else [(first_job * shard_rows, new_rows)]
     views = PlannedViews.of(spec, PlannedContent([*known.plans, *new_plans]))
-    return set(units_of(views, np.arange(len(views.view_row))))
+    every = np.arange(len(views.view_row))
+    return set(units_of(views, every[views.are_uniform(every)]))
 
 
 def _read_plans(spec: SceneSpec, store: str | Path) -> list[StoredPlan]:

@@ -264,9 +264,9 @@ def expand_views(
     first_job: int,
     shard_rows: int,
 ) -> Expansion:
-    """The rows of what is new of so many passes of views (V, 6), in the order of their modifications (V,) of (M, G, 4).
+    """The rows of what is new of so many passes of views (V, 6), in the order of their modifications (V,) of (M, G, C).
 
-    `density` is that of all of them, as `PlannedRows` has it.
+    `density` is that of all of them, as `PlannedRows` has it; a static scene's only configuration has 1.
     """
     modification_row = _look_up(known.modifications, contents(modifications))
     view_row = _look_up(known.views, view_contents(modification_row[of_view], views))
@@ -285,7 +285,8 @@ def expand_views(
         view[new],
         pass_[new],
         np.frombuffer(b"".join(keys[i] for i in new.tolist()), np.uint8).reshape(-1, KEY_BYTES),
-        *(np.full(len(vectors), density, np.float32) for vectors in (modifications, views)),
+        np.full(len(modifications), density if spec.groups else 1, np.float32),
+        np.full(len(views), density, np.float32),
     )
     planned = len(distinct) - len(new)
     return expand_samples(candidates, first_job=first_job, shard_rows=shard_rows, known=planned)

@@ -11,10 +11,15 @@ import pytest
 from photonfarm.core.errors import SpecError
 from photonfarm.farm.hold_out_checks import check_hold_out, choose_hold_out
 from photonfarm.farm.submission import submit
+from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.plan.request import Request
+from photonfarm.plan.top_up import PlannedViews
+from photonfarm.scene.arrangement import Shot
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec, load_spec
 from photonfarm.store import SceneReader, Store
+from photonfarm.store.model.plans import content
 
 
 @pytest.mark.parametrize("spec", ["room", "cornell"])
@@ -40,6 +45,30 @@ def test_numbers_that_a_refused_hold_out_names_are_enough_and_what_is_planned_co
             check_hold_out(room, none, HOLD_OUT, wanted)
     submit(NamedSpec.load("room"), tmp_path / "store", None, Request(modifications=64))
     check_hold_out(room, tmp_path / "store", HOLD_OUT, Request(seed=1, modifications=1))
+
+
+@pytest.mark.parametrize("name", ["room", "cornell"])
+def test_what_a_person_chose_is_no_hold_out_and_takes_none_away(tmp_path: Path, name: str) -> None:
+    spec = load_spec(name)
+    shots = [Shot(camera=(x, 1, 1), look_at=(0, 1, 0)) for x in (0.1, 0.2, 0.3)]
+    shots += [Shot(move={"sofa": (0, 0, x)}) for x in np.linspace(0, 0.1, 20) if spec.groups]
+    store = Store(tmp_path / "store", create=True)
+    scene_id = store.plan(spec, Chosen(shots=tuple(shots))).scene_id
+    with pytest.raises(SpecError, match="planned: one to train on"):
+        choose_hold_out(spec, store.root, Request(modifications=1))
+    few = next(n for n in range(2, 64) if is_split(spec, tmp_path / "none", Request(modifications=n)))
+    check_hold_out(spec, store.root, HOLD_OUT, wanted := Request(modifications=few))
+    store.plan(spec, wanted)
+    views = PlannedViews.of(spec, content(store.scene(scene_id).plans()))
+    assert any(rows_held_out(views, np.arange(len(views.view_row)), HOLD_OUT))
+
+
+def is_split(spec: SceneSpec, store: Path, request: Request) -> bool:
+    try:
+        check_hold_out(spec, store, HOLD_OUT, request)
+    except SpecError:
+        return False
+    return True
 
 
 @pytest.mark.parametrize("spec", ["room", "cornell"])

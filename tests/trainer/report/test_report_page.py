@@ -14,7 +14,7 @@ from photonfarm.core.archives import Seconds
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors, read_in_turn
 from photonfarm.trainer.report.contents import ReportContents, ReportEntry
-from photonfarm.trainer.report.data_and_runs import LIGHT, NOTHING, show_given
+from photonfarm.trainer.report.data_and_runs import LIGHT, NOTHING, name_given, show_given
 from photonfarm.trainer.report.frame_times import FrameTime
 from photonfarm.trainer.report.page import LARGEST_HALF, MOST_LIGHT, Verdict, encode_half_floats, encode_light
 from photonfarm.trainer.report.views import Layer, ShownView, make_light_layer
@@ -76,9 +76,9 @@ def test_a_network_that_is_given_light_is_compared_with_that_light_and_with_deno
     assert f"that of one colour for every pixel is {colour:.3g}" in verdict.further[0]
     assert len(verdict.further) == 2, "no time, so no denoiser of its time"
 
-    def timed(milliseconds: float, error: float, architecture: str | None = None) -> ReportEntry:
+    def timed(milliseconds: float, error: float, architecture: str | None = None, views: int = 2) -> ReportEntry:
         entry, time = contents.entries[0], FrameTime({"network": Seconds(milliseconds / 1e3, 0.0, 1.0)})
-        row = replace(entry.row, held_out=errors(error, error))
+        row = replace(entry.row, held_out=errors(*[error] * views))
         return replace(entry, name=f"{error}", architecture=architecture, row=row, time=time)
 
     def compared(*denoisers: ReportEntry) -> str:
@@ -87,15 +87,16 @@ def test_a_network_that_is_given_light_is_compared_with_that_light_and_with_deno
 
     assert compared(timed(5, 0.9), timed(19, 0.2), timed(15, 0.3), timed(21, 0.01)).startswith("0.2, in 19")
     assert compared(timed(40, 0.01), timed(30, 0.2)).startswith("0.2, in 30"), "none is so quick: the quickest"
+    assert compared(timed(5, 0.9), timed(6, 0.1, views=1)).startswith("0.9, in 5"), "on other views"
 
 
 def test_what_a_network_is_given_is_shown_as_it_is(measured, trained) -> None:
     run = trained(network={"architecture": "guided", "width": 4})
-    name, show = show_given(run, "cpu")
+    show = show_given(run, "cpu")
     (batch,) = read_in_turn(measured.reader(), [0, 1], 2, run.needs)
-    assert name == LIGHT
+    assert name_given(run) == LIGHT
     np.testing.assert_array_equal(show(batch), batch.inputs.guides.direct, "nothing shines or mirrors there")
-    assert show_given(trained(), "cpu") == (NOTHING, None)
+    assert (name_given(trained()), show_given(trained(), "cpu")) == (NOTHING, None)
 
 
 def test_the_page_holds_the_verdict_and_the_light_of_the_store_to_the_bit(measured, reported) -> None:

@@ -163,6 +163,6 @@ def list_predictors(
         raise SpecError(
             f"halves = {asked}: no run is of a network of halves, as guided_denoise, and no denoiser is named"
         )
-    amounts = [*((*choice, 1) for choice in denoisers)]
+    amounts = [(*choice, 1) for choice in denoisers]
     amounts += [(name, 1, count) for name in dict.fromkeys(name for name, _ in denoisers) for count in halves]
     return [*runs, *several, *(ReadyPredictor(name, k, runs[0].settings, count) for name, k, count in amounts)]

@@ -27,8 +27,8 @@ from photonfarm.trainer.report.data_and_runs import (
     DatasetCard,
     RunStory,
     make_baselines,
+    name_given,
     shorten_names,
-    show_given,
 )
 from photonfarm.trainer.report.frame_times import (
     FrameTime,
@@ -201,7 +201,7 @@ def gather_contents(
     return ReportContents(
         card=card,
         stories=tuple(RunStory.of(name, run, card.samples.core_seconds) for name, run in zip(names, runs, strict=True)),
-        baselines=Baselines(show_given(first, "cpu")[0], *evaluation.beside),
+        baselines=Baselines(name_given(first), *evaluation.beside),
         evaluation=evaluation,
         entries=tuple(entries),
         costs=costs,

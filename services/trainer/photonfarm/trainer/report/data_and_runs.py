@@ -264,13 +264,18 @@ class Baselines:
     given: HeldOutErrors  # what that is given, shown as it is: training's own share is what is below this
 
 
-def show_given(run: TrainedRun, device: str) -> tuple[str, DevicePredictor | None]:
-    """What a run's network is given that is an image, and a predictor that shows it as it is; None for NOTHING."""
-    place = usable_device(device)
-    if uses_denoiser(run.settings):
+def name_given(run: TrainedRun) -> str:
+    """What a run's network is given that is an image: HALF, LIGHT or NOTHING."""
+    return HALF if uses_denoiser(run.settings) else LIGHT if run.needs.guides else NOTHING
+
+
+def show_given(run: TrainedRun, device: str) -> DevicePredictor | None:
+    """A predictor that shows what a run's network is given as it is; None for NOTHING."""
+    place, given = usable_device(device), name_given(run)
+    if given == HALF:
         filtered = HalfFilter(run.settings, place)
-        return HALF, DevicePredictor(lambda inputs: require(require(filtered(inputs).noisy).filtered), place)
-    return (LIGHT, DevicePredictor(show_known_light, place)) if run.needs.guides else (NOTHING, None)
+        return DevicePredictor(lambda inputs: require(require(filtered(inputs).noisy).filtered), place)
+    return DevicePredictor(show_known_light, place) if given == LIGHT else None
 
 
 def make_baselines(
@@ -295,4 +300,4 @@ def make_baselines(
     colours = average_colours(read())
     untrained = TrainedRun.load(run.folder, INITIAL).predictor(source.spec, source.base(), device)
     mean, shown_mean = map(make_constant_predictor, colours)
-    return [mean, shown_mean, untrained, show_given(run, device)[1] or mean]
+    return [mean, shown_mean, untrained, show_given(run, device) or mean]

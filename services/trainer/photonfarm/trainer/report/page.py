@@ -74,9 +74,13 @@ EXPLAINED = {
 
 
 def _compare_with_denoiser(contents: ReportContents) -> list[str]:
-    """The sentence on the best ready denoiser whose frame takes no longer than the first network's, or the quickest."""
+    """The sentence on the best ready denoiser whose frame takes no longer than the first network's, or the quickest.
+
+    Of those that are given several halves, only where all views have as many passes: other views are not comparable.
+    """
     entry = contents.entries[0]
-    ready = {each: each.time.total for each in contents.entries if each.architecture is None and each.time}
+    alike = (each for each in contents.entries if each.row.held_out.units == entry.row.held_out.units)
+    ready = {each: each.time.total for each in alike if each.architecture is None and each.time}
     if entry.time is None or not ready:
         return []
     total, quickest = entry.time.total, min(ready, key=lambda each: ready[each])

@@ -183,17 +183,18 @@ def read_estimate(row: Mapping[str, Any], metric: str) -> Estimate | None:
 def _read_further_seeds(experiment: Experiment, file: Path) -> dict[str, list[list[float]]]:
     """MSE of each image by each further seed, of each network's rows.
 
-    Raises IncompleteError where they were not measured.
+    Raises IncompleteError where they were not measured, or others were.
     """
+    remedy = f"`python experiments/run.py {experiment.name}` makes it"
     if not file.is_file():
-        raise IncompleteError(f"{file}: not there; `python experiments/run.py {experiment.name}` makes it")
+        raise IncompleteError(f"{file}: not there; {remedy}")
     rows = json.loads(file.read_text(encoding="utf-8"))["rows"]  # the runs, then those of several halves run by run
     again, several = experiment.again(), experiment.size.halves
     names = [run.name for run in again]
     names += [name_halves(run.name, halves) for run in again if run.is_given_halves for halves in several]
-    errors = {
-        name: row["metric_space"]["mse"]["values"] for name, row in zip(names, rows, strict=len(rows) > len(again))
-    }
+    if len(rows) not in (len(again), len(names)):
+        raise IncompleteError(f"{file}: is of {len(rows)} rows, and the experiment has {len(names)}; {remedy} anew")
+    errors = {name: row["metric_space"]["mse"]["values"] for name, row in zip(names, rows, strict=False)}
     by_row: dict[str, list[list[float]]] = {}
     for run in experiment.trained():
         for halves in (1, *several):

@@ -211,6 +211,17 @@ def test_gaps_are_of_the_mean_of_all_seeds_and_told_apart_only_where_these_agree
     assert said.endswith("not told apart")
 
 
+def test_rows_of_fewer_runs_are_not_taken_for_those_of_further_seeds(tmp_path: Path) -> None:
+    """As an evaluation has them that was made before the experiment got another network."""
+    found, folder = Experiment.load("fixed-living-room", "small"), tmp_path / "fixed-living-room"
+    leave(folder, "small", report())
+    evaluated = folder / "runs" / found.again()[0].name / "evaluation.json"
+    rows = json.loads(evaluated.read_text())["rows"]
+    evaluated.write_text(json.dumps({"rows": rows[: len(found.again()) - 1]}))
+    with pytest.raises(IncompleteError, match="makes it anew"):
+        Room.read(found, folder / "report/report.json", "1234567")
+
+
 def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_here(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,7 +13,7 @@ from photonfarm.trainer.cli import train_verb as cli
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint, run_folder
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, INITIAL, METRICS, lock_run, read_settings
-from photonfarm.trainer.runs.settings import NetworkSettings
+from photonfarm.trainer.runs.settings import EARLIER, NetworkSettings
 from photonfarm.trainer.training.loop import train
 
 
@@ -114,7 +114,7 @@ def test_a_run_of_before_there_was_a_setting_is_what_it_was(make_source, tiny, r
     train(make_source(24), tiny(max_steps=1), run)
     written, state = json.loads((run / "settings.json").read_text()), checkpoint.load(run / CHECKPOINT)
     for network in (written["network"], state["settings"]["network"]):
-        assert network.pop("least_specular") == 0
+        assert {key: network.pop(key) for key in EARLIER} == EARLIER
     (run / "settings.json").write_text(json.dumps(written))
     checkpoint.save(run / CHECKPOINT, state)
     assert TrainedRun.load(run).settings == tiny(max_steps=1)

@@ -195,6 +195,31 @@ def test_a_light_that_cannot_change_so_is_refused(file_scene: Loader, folder: Pa
         file_scene(folder, KINDS["area"][1], lights=[{"name": "lamp", "shapes": ["Lamp"]}])
 
 
+@pytest.mark.parametrize(
+    ("kind", "changes", "columns"),
+    [
+        ("envmap", {"power": {"min": 0, "max": 4}}, {"red": 0.5}),
+        ("bitmap", {"at": (0, 0, 0), "box": EVERYWHERE, "turn": {"min": 0, "max": 9}}, {"power": 2.0}),
+    ],
+)
+def test_a_change_by_hand_that_a_light_cannot_have_is_refused_before_anything_is_edited(
+    file_scene: Loader, folder: Path, kind: str, changes: dict[str, Any], columns: dict[str, float]
+) -> None:
+    name, light = KINDS[kind]
+    if kind == "bitmap":
+        backend.load(threads=1).Bitmap(np.full((4, 4, 3), 99, np.uint8)).write(str(folder / "slide.png"))
+        light = light.replace("sky.pfm", "slide.png")
+    block = {"name": "block", "shapes": ["Block"], "at": (0, 0, 0), "box": EVERYWHERE}
+    scene = file_scene(folder, BLOCK + light, objects=[block], lights=[{"name": "light", "shapes": [name], **changes}])
+    before = scene.render_half(FROM_ABOVE, 3)
+    vector = rest(scene.spec).vector
+    vector[0, 0], vector[1] = 0.5, changed(scene, **columns).vector[0]
+    with pytest.raises(SpecError, match="light 'light'"):
+        scene.apply(Modification.from_vector(vector))
+    scene.apply(rest(scene.spec))
+    np.testing.assert_array_equal(scene.render_half(FROM_ABOVE, 3), before)
+
+
 def test_a_check_tries_angles_and_the_plan_shows_them(file_scene: Loader, tmp_path: Path) -> None:
     """A beam that stays clear of a wall until it turns."""
     block = '<shape type="cube" id="{}"><transform name="to_world"><scale {}/><translate {}/></transform></shape>'

@@ -115,16 +115,27 @@ class LightSwitch:
 
     def __init__(self, emitter: Any, what: str, power: bool, colour: bool) -> None:
         """Take a light, and whether its power and its colour are to change; SpecError where they cannot."""
-        self._parameters = mi.traverse(emitter)
+        self._parameters, self._what, self._kind = mi.traverse(emitter), what, emitter.class_name()
         self._power, self._colour = _dimmed_by(self._parameters), _coloured_by(self._parameters)
         changed = dict.fromkeys([*self._power, *(self._colour if colour else ())])
         values = {key: self._parameters[key] for key in changed}
         self._lit = {key: type(value)(value) for key, value in values.items()}  # references change with the scene
-        for key in self._power if power else ():
-            _check_factor(key, values[key], 0.5, what)
-        can_colour = bool(self._colour) and all(_holds_colour(values.get(key)) for key in self._colour)
-        if (power and not self._power) or (colour and not can_colour):
-            raise SpecError(f"{what} cannot change so: it is a {emitter.class_name()}; give it an rgb radiance")
+        if power:
+            self.check(0.5 * LIT)
+        if colour:
+            self.check(np.float32([1, 0.5, 0.25]))
+
+    def check(self, light: F32) -> None:
+        """Raise SpecError for factors on red, green and blue, (3,), that the light cannot have."""
+        is_grey = (light == light[0]).all()
+        if is_grey and light[0] in (0, 1):
+            return
+        can_colour = bool(self._colour) and all(_holds_colour(self._lit.get(key)) for key in self._colour)
+        if is_grey:
+            for key in self._power:
+                _check_factor(key, self._lit[key], float(light[0]), self._what)
+        if not (self._power if is_grey else can_colour):
+            raise SpecError(f"{self._what} cannot change so: it is a {self._kind}; give it an rgb radiance")
 
     def shine(self, light: F32) -> None:
         """Multiply the red, green and blue that the light emits as modelled by `light`, (3,)."""
@@ -191,6 +202,11 @@ class MovableGroup:
         turned = Turned(degrees, self._up, self._at) if degrees else None
         for placement in self._placements:
             placement.move(translation, turned)
+
+    def check(self, light: F32) -> None:
+        """Raise SpecError for factors that a light of the group cannot have."""
+        for each in self._lights:
+            each.check(light)
 
     def shine(self, light: F32) -> None:
         """Multiply the red, green and blue that the group emits as modelled by `light`, (3,)."""

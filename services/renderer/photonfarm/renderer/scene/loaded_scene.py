@@ -105,8 +105,13 @@ class LoadedScene:
         return loaded
 
     def apply(self, modification: Modification) -> None:
-        """Bring the scene from any configuration into this one; only groups that change are edited."""
+        """Bring the scene from any configuration into this one; only groups that change are edited.
+
+        Raises SpecError for light that cannot be made by factors, before anything is edited.
+        """
         before, turn, light = self._state, modification.turn, modification.light
+        for group, factors in zip(self._groups, light, strict=True):
+            group.check(factors)
         for i, group in enumerate(self._groups):
             present, was_present = bool(modification.present[i]), bool(before.present[i])
             stays = np.array_equal(modification.translation[i], before.translation[i]) and turn[i] == before.turn[i]

@@ -1,8 +1,8 @@
 """How much a film flickers: what changes of the surfaces that stay in view from one frame to the next.
 
 A surface is followed by depth and camera, which are exact where nothing moves but the camera. What a still surface
-shows may change truly, as in a mirror, and following it rounds to pixels: so the figure of an image is to be read
-beside that of the truth along the same path.
+shows may change truly, as in a mirror, and following it interpolates between pixels: so the figure of an image is to be
+read beside that of the truth along the same path.
 
 Shape letters: H W image, N pixels.
 """
@@ -54,11 +54,11 @@ def register(spec: SceneSpec, views: tuple[View, View], depths: tuple[F32, F32])
     inside = ((low >= 0) & (low < np.array([before.width - 1, before.height - 1]))).all(axis=1)
     inside &= (depths[1].reshape(-1) > 0) & np.isfinite(depth)
     pixels = np.flatnonzero(inside)
-    low, part, depth = low[pixels], part[pixels], depth[pixels]
-    index = np.stack([(low[:, 1] + y) * before.width + low[:, 0] + x for y in (0, 1) for x in (0, 1)])
-    weight = np.stack(
-        [(part[:, 0] if x else 1 - part[:, 0]) * (part[:, 1] if y else 1 - part[:, 1]) for y in (0, 1) for x in (0, 1)]
-    )
+    depth = depth[pixels]
+    columns, rows = (np.stack([first, first + 1]) for first in low[pixels].T)
+    right, below = (np.stack([1 - share, share]) for share in part[pixels].T)
+    index = (rows[:, None] * before.width + columns).reshape(4, -1)
+    weight = (below[:, None] * right).reshape(4, -1)
     same = (np.abs(depths[0].reshape(-1)[index] - depth) < SAME_SURFACE * depth).all(axis=0)
     return Register(index[:, same], weight[:, same], pixels[same])
 

@@ -214,9 +214,10 @@ def rebuild_surfaces(base: BasePointCloud, modification: Modification) -> tuple[
     return normal, emission
 
 
-def turn_matrix(degrees: float, up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rotation (3, 3) by an angle about the unit vector `up`, counter-clockwise as seen from above (Rodrigues)."""
-    angle, cross = np.radians(float(degrees)), np.cross(np.eye(3), up)
+def turn_matrix(degrees: float | F32, up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rotations (…, 3, 3) by angles (…,) about the unit vector `up`, counter-clockwise from above (Rodrigues)."""
+    angle = np.radians(np.asarray(degrees, np.float64))[..., None, None]
+    cross = np.cross(np.eye(3), up)
     turned: NDArray[np.float64] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
     return turned
 

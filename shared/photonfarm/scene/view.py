@@ -157,8 +157,7 @@ def are_in_group(spec: SceneSpec, g: int, origins: F32, modifications: F32) -> N
     low, high = np.array(space.groups[group.name])
     offset = origins.astype(np.float64) - (np.array(group.at) + modifications[:, g, :3])
     if modifications.shape[-1] > len(FIELDS):  # as seen from the group
-        up = np.array(spec.view.up, np.float64)
-        back = np.stack([turn_matrix(-degrees, up) for degrees in modifications[:, g, len(FIELDS)]])
+        back = turn_matrix(-modifications[:, g, len(FIELDS)], np.array(spec.view.up, np.float64))
         offset = np.einsum("nij,nj->ni", back, offset)
     within: NDArray[np.bool_] = ((low <= offset) & (offset <= high)).all(axis=1) & (modifications[:, g, 3] != 0)
     return within

@@ -103,6 +103,7 @@ def test_pictures_follow_the_state_and_the_truth_goes_on_from_one_request_to_the
 def test_what_is_wrong_is_said_and_nothing_can_be_written(address: str) -> None:
     assert "'sofaa'" in ask(address, "frame", {**AT_REST, "without": ["sofaa"]})["error"]
     assert "no configuration" in ask(address, "frame/AAAA")["error"]
+    assert "view: unknown key" in ask(address, "frame", {**AT_REST, "view": 1})["error"]
     assert "no way to write" in ask(address, "submit", AT_REST, method="POST")["error"]
 
 

@@ -217,7 +217,8 @@ def _serve_file(path: Path) -> Callable[[], Answer]:
 def _read(asked: str) -> dict[str, Any]:
     """What a path asks for. Raises SpecError for what is no state of the page."""
     try:
-        return dict(json.loads(base64.urlsafe_b64decode(asked + "=" * (-len(asked) % 4))))
+        document = dict(json.loads(base64.urlsafe_b64decode(asked + "=" * (-len(asked) % 4))))
+        return Shot.of(**document).model_dump()
     except (ValueError, TypeError) as error:
         raise SpecError(f"the path says no configuration and camera: {error}") from error
 

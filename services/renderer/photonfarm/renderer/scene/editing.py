@@ -123,7 +123,7 @@ class LightSwitch:
         if power:
             self.check(0.5 * LIT)
         if colour:
-            self.check(np.float32([1, 0.5, 0.25]))
+            self.check(np.array([1, 0.5, 0.25], np.float32))
 
     def check(self, light: F32) -> None:
         """Raise SpecError for factors on red, green and blue, (3,), that the light cannot have."""

@@ -113,6 +113,7 @@ def test_an_image_is_rendered_of_a_spec_without_a_store_and_of_a_scene_of_a_stor
     assert {*tmp_path.rglob("*")} - {*before} == {tmp_path / "b.png"}
     for arguments, kind in (
         (("cornel", "--spp", "8"), StoreError),
+        (("cornel", "--store", "none"), SpecError),
         (("room", "--like", "0" * 32), StoreError),
         (("room", "--without", "piano"), SpecError),
         (("room", "--spp", "soon"), SpecError),

@@ -30,6 +30,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import find_spec, load_spec, scene_folder
 from photonfarm.scene.view import View
 from photonfarm.store import Store
+from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.read.find import find_start, is_spec_file, scene_or_spec
 
 if TYPE_CHECKING:
@@ -225,8 +226,8 @@ def load_named(store: str | Path, named: str) -> SceneSpec:
         except StoreError as missing:
             try:
                 find_spec(named)
-            except SpecError:
-                raise missing from None
+            except SpecError as unknown:
+                raise (unknown if is_vacant(store) else missing) from None
     spec = load_spec(named)
     folder = scene_folder(named, spec)
     if folder is None:

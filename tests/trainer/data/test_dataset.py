@@ -60,6 +60,8 @@ def test_what_was_not_drawn_uniformly_is_never_held_out_nor_trained_on_beside_wh
     assert all(kept_apart[part].any() for part in (slice(0, 16), slice(16, 24), slice(24, 28), slice(28, 32)))
     held_out = [row for row in range(16) if kept_apart[row]]
     assert stream.held_out == held_out
+    assert set(stream.training_rows) == drawn, "the others do not count where training begins"
+    assert len(stream.arrived) == 32, "but as used, or workers would wait for ever"
     assert drawn == set(np.flatnonzero(~kept_apart).tolist())
     opened = open_scene(scene.storage.root, scene.scene_id)
     assert opened.split("held-out", hold_out=0.4).rows.tolist() == held_out

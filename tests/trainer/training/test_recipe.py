@@ -107,7 +107,7 @@ def test_whatever_predicts_from_a_run_has_its_averaged_weights(make_source, tiny
     assert not same(found["averaged"], found["raw"])
     assert held_out_errors(lambda: make_source(24), run).last == pytest.approx(outcome.last_error, rel=1e-6)
     with Feed(make_source(24), trained.settings) as feed:
-        base, rows = feed.base, [row for row, held in feed.arrivals()[0] if held]
+        base, rows = feed.base, [row for row, side in feed.arrivals()[0] if side == "held-out"]
         batch = next(read_batches(feed, rows, 3))
         network = trained.network(feed.spec, base)
         network.load_state_dict(found["raw"])

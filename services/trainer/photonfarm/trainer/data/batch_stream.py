@@ -125,18 +125,18 @@ class BatchStream:
 
     @property
     def training_rows(self) -> list[int]:
-        """The rows that have arrived and are not held out, in order of arrival."""
+        """The rows that have arrived and are to train on, in order of arrival."""
         return self._sampler.rows
 
     def look(self) -> None:
         """Take in the rows that have arrived."""
         arrived, self.complete = self._feed.arrivals()
-        if new := {row: is_held_out for row, is_held_out in arrived if row not in self._known}:
+        if new := {row: side for row, side in arrived if row not in self._known}:
             self._known.update(new)
             self.arrived.extend(new)
             self.growth.append((self.drawn, len(self.arrived)))
-            self.held_out.extend(row for row, is_held_out in new.items() if is_held_out)
-            self._sampler.add(row for row, is_held_out in new.items() if not is_held_out)
+            self.held_out.extend(row for row, side in new.items() if side == "held-out")
+            self._sampler.add(row for row, side in new.items() if side == "train")
         ends = self.complete and self._rounds < math.inf
         last_step = int(self._rounds * self._count_left()) // self._settings.batch if ends else None
         if last_step != self.last_step:

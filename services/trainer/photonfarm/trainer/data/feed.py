@@ -19,7 +19,7 @@ from photonfarm.core.keys import Key, Stream
 from photonfarm.core.records import F32
 from photonfarm.core.waiting import pause_after_look
 from photonfarm.data.torch_dataset import SceneDataset
-from photonfarm.plan.hold_out import enough, sides_of, units_of
+from photonfarm.plan.hold_out import Side, enough, sides_of, units_of
 from photonfarm.scene.poor_views import are_near, hand_of, is_unlit
 from photonfarm.store import SceneReader
 from photonfarm.store.read.batch import Batch
@@ -69,13 +69,13 @@ class Feed:
         points = settings.network.points
         self._dataset = SceneDataset(source, self._needs.fields, exposure=self.spec.exposure, points=points)
         self._lock = threading.Lock()
-        self._arrived: list[tuple[int, bool]] = []
+        self._arrived: list[tuple[int, Side]] = []
         self._plans: list[dict[str, Any]] = []
-        self._sides: set[bool] = set()  # whether samples so far are held out
+        self._sides: set[Side] = set()  # of samples so far
         self._units: set[Key] = set()  # what is held out as one, until some are and some are not
         self._views: dict[int, Key] = {}  # of held-out rows, by row
         self._known: set[int] = set()  # rows that have arrived
-        self._skipped: dict[int, bool] = {}  # by row, of those that were asked for or are on no side
+        self._skipped: dict[int, bool] = {}  # by row, of those that were asked for
         self._missing: set[int] = set()  # rows that are known, and were set aside and are not complete again yet
         self._complete = False
         self._error: BaseException | None = None
@@ -154,8 +154,8 @@ class Feed:
         self._raise()
         return len(self._missing)
 
-    def arrivals(self) -> tuple[list[tuple[int, bool]], bool]:
-        """The rows that became complete since the last call, each with whether it is held out; and whether all have.
+    def arrivals(self) -> tuple[list[tuple[int, Side]], bool]:
+        """The rows that became complete since the last call, each with its side; and whether all have.
 
         Raises the errors of reading.
         """
@@ -184,14 +184,14 @@ class Feed:
             return enough(self._units, least=0.0)
 
     def is_skipped(self, row: int) -> bool:
-        """Whether a row is never trained on: it is on no side, or by `skip_views`, for which it is read once."""
+        """Whether a row is never trained on, by `skip_views`; its sample is read for that, once."""
         kinds = self._settings.skip_views
         if kinds and row not in self._skipped:
             (sample,) = self._source.read_samples([row], Batch.empty(self.spec, 1, guides=True))
             lit_by = sample.images, sample.view.origin, sample.seen_photons, lambda: sample.photons
             is_near = "near" in kinds and bool(are_near(hand_of(self.spec), sample.images["depth"]))
             self._skipped[row] = is_near or ("unlit" in kinds and is_unlit(*lit_by))
-        return self._skipped.get(row, False)
+        return bool(kinds) and self._skipped[row]
 
     def _raise(self) -> None:
         if self._error is not None:
@@ -227,15 +227,14 @@ class Feed:
 
     def _poll(self) -> None:
         new = [int(row) for row in self._source.refresh()]
-        sides = sides_of(self._source, new, self._settings.hold_out)
-        units, held_out = units_of(self._source, new), [side == "held-out" for side in sides]
-        kept = [row for row, held in zip(new, held_out, strict=True) if held]
+        arrived = list(zip(new, sides_of(self._source, new, self._settings.hold_out), strict=True))
+        units = units_of(self._source, [row for row, side in arrived if side is not None])
+        kept = [row for row, side in arrived if side == "held-out"]
         views = self._source.view_keys(kept)
         with self._lock:
-            self._skipped.update((row, True) for row, side in zip(new, sides, strict=True) if side is None)
             self._views.update(zip(kept, views, strict=True))
-            self._arrived.extend(zip(new, held_out, strict=True))
-            self._sides.update(held_out)
+            self._arrived.extend(arrived)
+            self._sides.update(side for _, side in arrived if side is not None)
             self._units = set() if len(self._sides) > 1 else self._units.union(units)
             self._plans = list(self._source.plan_requests)
             self._known.update(new)

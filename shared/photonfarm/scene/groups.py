@@ -131,8 +131,8 @@ class Light(Movable):
         stays = self.shapes and (self.power or self.colour) and not self.turn
         if lacks and not (len(lacks) == 2 and stays):
             raise ValueError(
-                f"lacks {lacks[0]}; at and box are required, but of a light of the scene that stays where it is, "
-                "and has a power or colours"
+                f"lacks {lacks[0]}; at and box are required, except of a light of the scene that stays where it is and "
+                "has a power or colours"
             )
         return self
 

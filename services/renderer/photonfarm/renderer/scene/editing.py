@@ -135,7 +135,10 @@ class LightSwitch:
             for key in self._power:
                 _check_factor(key, self._lit[key], float(light[0]), self._what)
         if not (self._power if is_grey else can_colour):
-            raise SpecError(f"{self._what} cannot change so: it is a {self._kind}; give it an rgb radiance")
+            is_told = all(key in self._lit for key in self._colour)  # texels are kept where the spec has colours
+            remedy = "give it an rgb radiance" if is_grey or is_told else "list its colours in the spec"
+            changed = "power" if is_grey else "colour"
+            raise SpecError(f"{self._what} cannot change its {changed}, as it is a {self._kind}; {remedy}")
 
     def shine(self, light: F32) -> None:
         """Multiply the red, green and blue that the light emits as modelled by `light`, (3,)."""

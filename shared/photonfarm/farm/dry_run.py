@@ -11,12 +11,13 @@ from photonfarm.core.errors import BackendError, StoreError
 from photonfarm.core.processes import can_render, command, usable_cores
 from photonfarm.farm.submission import Submission, estimate_sample_seconds
 from photonfarm.plan.chosen import Chosen
-from photonfarm.plan.request import Extent, Request
+from photonfarm.plan.request import SHARD_ROWS, Extent, Request
 from photonfarm.plan.sample_costs import Allocation, CostModel, SampleCosts
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
 from photonfarm.store.format.schema import bytes_of_rows
 from photonfarm.store.io.storage import is_vacant
+from photonfarm.store.model.plans import expand_request
 
 VERB = ("scene", "cost")  # of the renderer
 
@@ -73,11 +74,14 @@ def rehearse(
     StoreError as `submit` does.
     """
     spec = named.spec
-    if is_vacant(store):
-        new, known, extent = request.samples, 0, request.extent(spec)
-    else:
+    if not is_vacant(store):
         planned = Store(store).plan(spec, request, shard_rows=shard_rows, dry_run=True)
         new, known, extent = planned.new, planned.known, planned.extent
+    elif isinstance(request, Chosen):
+        chosen = expand_request(spec, request, [], first_job=0, shard_rows=SHARD_ROWS)
+        new, known, extent = chosen.new, chosen.known, chosen.extent
+    else:
+        new, known, extent = request.samples, 0, request.extent(spec)
     of, cores = bytes_of_rows(spec), workers or usable_cores()
     size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
     counted = replace(

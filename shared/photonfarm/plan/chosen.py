@@ -13,7 +13,7 @@ from pydantic import Field
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Frozen
-from photonfarm.plan.request import MAX_SAMPLES, Expansion, Extent, PlannedContent, SampleCount, contents, expand_views
+from photonfarm.plan.request import MAX_SAMPLES, Expansion, PlannedContent, SampleCount, contents, expand_views
 from photonfarm.scene.arrangement import Shot, list_shot
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
@@ -50,11 +50,6 @@ class Chosen(Frozen):
     def views_per_modification(self) -> int:
         """The views that each configuration has at least."""
         return 1
-
-    def extent(self, spec: SceneSpec) -> Extent:
-        """The extent of the request in a scene without plans."""
-        modifications = len({shot.apply(spec).vector.tobytes() for shot in self.shots})
-        return Extent(modifications, modifications, len(self.shots))
 
 
 def expand_chosen(

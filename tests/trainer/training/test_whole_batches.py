@@ -89,7 +89,7 @@ def test_a_step_on_a_card_reads_nothing_and_is_handed_nothing(
 ) -> None:
     monkeypatch.setattr(optimizer, "_get_fused_kernels_supported_devices", lambda: ["cpu", "meta"])
     source = make_source(3, photons=64)
-    learner = learner_of(source, architecture, precision=precision)
+    learner = learner_of(source, architecture, precision=precision, filter_direct=precision == "bfloat16")
     batch = batch_with_metal(source, architecture, 3).to(META)
     assert learner.average is not None
     for each in (learner.network, learner.average.network):

@@ -124,8 +124,8 @@ class Guided(Network):
         plain = guides.direct + guides.gloss
         with torch.no_grad():
             reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
-            spread, places = estimate_variance(plain, reflects), self.measure_places(inputs)
-            filtered = filter_light(plain, reflects, spread, inputs.normal, places)
+            variance, places = estimate_variance(plain, reflects), self.measure_places(inputs)
+            filtered = filter_light(plain, reflects, variance, inputs.normal, places)
             seen = [torch.log1p((light / reflects).clamp(min=0)) for light in filtered]
             shows = floor(inputs.albedo, guides) / REFLECTANCE_FLOOR
         made = self.synthesise(self.channels(inputs, [*further, *seen]))

@@ -123,16 +123,16 @@ def look_at_half(inputs: Inputs, noisy: NoisyColour, places: Tensor, denoised: T
     reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
     direct = show_known_light(inputs)
     light = noisy.colour - direct
-    spread = estimate_variance(light, reflects)
+    variance = estimate_variance(light, reflects)
     if noisy.passes is not None and noisy.variance is not None:
         several = noisy.passes[:, None, None, None] > 1
-        spread = torch.where(several, take_means(noisy.variance[..., None], 5), spread)
-    fine, coarse = (direct + image for image in filter_light(light, reflects, spread, inputs.normal, places))
+        variance = torch.where(several, take_means(noisy.variance[..., None], 5), variance)
+    fine, coarse = (direct + image for image in filter_light(light, reflects, variance, inputs.normal, places))
     brightness = coarse.mean(dim=-1, keepdim=True)
-    noise = spread / (brightness**2 + DARK**2)
+    noise = variance / (brightness**2 + DARK**2)
     filtered = [fine, coarse] if denoised is None else [fine, coarse, denoised]
     averages = [light / reflects, *(smooth(light, reflects, size) for size in WINDOWS)]
     images = [noisy.colour / reflects, *averages, noise]
     images += [image / reflects for each in filtered for image in (each, each - direct)]
     channels = [shows * image.sign() * torch.log1p(image.abs()) for image in images]
-    return Half(torch.stack(filtered, dim=-1), spread, noise, shows, channels)
+    return Half(torch.stack(filtered, dim=-1), variance, noise, shows, channels)

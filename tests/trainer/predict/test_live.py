@@ -121,6 +121,13 @@ def test_what_is_shown_is_planned_where_that_is_allowed_and_a_page_of_the_server
     assert len(scene.plans()) == before + 1
 
 
+def test_the_fewest_samples_make_a_truth_too(shown: Live) -> None:
+    with serving(replace(shown, open=lambda: shown.run, most_spp=1)) as address:
+        told = ask(address, "truth", {**AT_REST, "camera": [-1.5, 1.4, 0.3]})
+    assert told["done"]
+    assert "±" in told["error"]
+
+
 def test_images_in_motion_become_smaller_until_they_are_fluent_and_grow_again() -> None:
     speed = Speed(Film(width=256, height=192))
     for seconds, film in ((0.9, (128, 96)), (0.3, (64, 48)), (0.16, (64, 48)), (0.05, (64, 48)), (0.02, (128, 96))):

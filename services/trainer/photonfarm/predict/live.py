@@ -175,7 +175,7 @@ class Live:
         while len(self._judged) > TRUTHS:
             self._judged.popitem(last=False)
         judged, until = self._judged[asked], time.perf_counter() + SLICE_S
-        while judged.refined.spp < self.most_spp and (time.perf_counter() < until or not judged.refined.is_enough):
+        while not judged.refined.is_enough or (judged.refined.spp < self.most_spp and time.perf_counter() < until):
             self.run.refine(judged.refined, judged.frame)
         truth = judged.refined.result()
         error = truth.error(judged.frame.radiance.numpy(force=True))

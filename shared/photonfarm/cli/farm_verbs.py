@@ -139,6 +139,7 @@ def submit(
         modification = asked.apply(named.spec, start[0])
         if cameras or configurations:
             _refuse_given("files say what is planned", "modifications", "camera", "look_at")
+            _refuse_given("is of random views; --cameras has them all", *(("views", "seed") if cameras else ()))
             many = {"views": request.views_per_modification, "seed": request.seed}
             chosen = read_shots(named.spec, cameras, configurations, modification, **many)
         else:

@@ -12,7 +12,7 @@ import numpy as np
 from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.formatting import format_count
 from photonfarm.core.keys import Key
-from photonfarm.plan.hold_out import HOLD_OUT, are_held_out, enough, units_of
+from photonfarm.plan.hold_out import HOLD_OUT, are_held_out, enough, sides_of, units_of
 from photonfarm.plan.request import SHARD_ROWS, PlannedContent, Request, expand
 from photonfarm.plan.top_up import PlannedViews
 from photonfarm.scene.spec import SceneSpec
@@ -72,7 +72,8 @@ def _find_fault(spec: SceneSpec, plans: list[StoredPlan], share: float, request:
     """What is wrong with a share for what is planned and requested, and the numbers that would do, in words."""
 
     def is_split(wanted: Request) -> bool:
-        return len(set(are_held_out(_list_units(spec, plans, wanted), share))) == 2
+        views = _list_views(spec, plans, wanted)
+        return {*sides_of(views, np.arange(len(views.view_row)), share)} >= {"train", "held-out"}
 
     if is_split(request):
         return None
@@ -104,6 +105,13 @@ def _list_units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> s
 
     What a person chose has none, as it is never held out.
     """
+    views = _list_views(spec, plans, request)
+    every = np.arange(len(views.view_row))
+    return set(units_of(views, every[views.are_uniform(every)]))
+
+
+def _list_views(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> PlannedViews:
+    """What is planned and requested, as far as it decides what is held out."""
     wanted = request.model_copy(update={"passes": 1})
     if spec.groups:
         wanted = wanted.model_copy(update={"views_per_modification": 1})  # the configuration alone decides
@@ -111,9 +119,7 @@ def _list_units(spec: SceneSpec, plans: list[StoredPlan], request: Request) -> s
     first_job, shard_rows = (plans[-1].end_job, plans[0].shard_rows) if plans else (0, SHARD_ROWS)
     new_rows = expand(spec, wanted, known, first_job=first_job, shard_rows=shard_rows).rows
     new_plans = [] if new_rows is None else [(first_job * shard_rows, new_rows)]
-    views = PlannedViews.of(spec, PlannedContent([*known.plans, *new_plans]))
-    every = np.arange(len(views.view_row))
-    return set(units_of(views, every[views.are_uniform(every)]))
+    return PlannedViews.of(spec, PlannedContent([*known.plans, *new_plans]))
 
 
 def _read_plans(spec: SceneSpec, store: str | Path) -> list[StoredPlan]:

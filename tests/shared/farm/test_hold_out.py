@@ -16,7 +16,6 @@ from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.plan.top_up import PlannedViews
 from photonfarm.scene.arrangement import Shot
-from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec, load_spec
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.model.plans import content
@@ -47,8 +46,11 @@ def test_numbers_that_a_refused_hold_out_names_are_enough_and_what_is_planned_co
     check_hold_out(room, tmp_path / "store", HOLD_OUT, Request(seed=1, modifications=1))
 
 
-@pytest.mark.parametrize("name", ["room", "cornell"])
-def test_what_a_person_chose_is_no_hold_out_and_takes_none_away(tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize(("name", "held_out", "enough"), [("room", 39, 4), ("cornell", 5, 8)])
+def test_what_a_person_chose_is_no_hold_out_and_takes_none_away(
+    tmp_path: Path, name: str, held_out: int, enough: int
+) -> None:
+    """The seed of one that is held out alone, and the number of those of seed 0 of which one is."""
     spec = load_spec(name)
     shots = [Shot(camera=(x, 1, 1), look_at=(0, 1, 0)) for x in (0.1, 0.2, 0.3)]
     shots += [Shot(move={"sofa": (0, 0, x)}) for x in np.linspace(0, 0.1, 20) if spec.groups]
@@ -56,19 +58,14 @@ def test_what_a_person_chose_is_no_hold_out_and_takes_none_away(tmp_path: Path, 
     scene_id = store.plan(spec, Chosen(shots=tuple(shots))).scene_id
     with pytest.raises(SpecError, match="planned: one to train on"):
         choose_hold_out(spec, store.root, Request(modifications=1))
-    few = next(n for n in range(2, 64) if is_split(spec, tmp_path / "none", Request(modifications=n)))
-    check_hold_out(spec, store.root, HOLD_OUT, wanted := Request(modifications=few))
+    with pytest.raises(SpecError, match="all are held out"):
+        check_hold_out(spec, tmp_path / "none", HOLD_OUT, Request(seed=held_out))
+    check_hold_out(spec, store.root, HOLD_OUT, Request(seed=held_out))
+    check_hold_out(spec, tmp_path / "none", HOLD_OUT, wanted := Request(modifications=enough))
+    check_hold_out(spec, store.root, HOLD_OUT, wanted)
     store.plan(spec, wanted)
     views = PlannedViews.of(spec, content(store.scene(scene_id).plans()))
     assert any(rows_held_out(views, np.arange(len(views.view_row)), HOLD_OUT))
-
-
-def is_split(spec: SceneSpec, store: Path, request: Request) -> bool:
-    try:
-        check_hold_out(spec, store, HOLD_OUT, request)
-    except SpecError:
-        return False
-    return True
 
 
 @pytest.mark.parametrize("spec", ["room", "cornell"])

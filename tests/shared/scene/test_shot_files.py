@@ -162,6 +162,9 @@ def test_submit_plans_the_samples_of_files_and_says_what_no_random_one_shows(tmp
     assert "warning: table stands at 9,0,0, outside its box" in done.stderr
     again = CliRunner().invoke(umbrella, [*room, "--configurations", str(tmp_path / "rooms.csv"), "--views", "3"])
     assert "0 samples planned" in again.stdout
+    refused = CliRunner().invoke(umbrella, [*room, "--cameras", str(transforms(tmp_path)), "--views", "3"])
+    assert refused.exit_code == 2
+    assert "--views: is of random views" in refused.stderr
 
 
 def test_options_say_where_cameras_of_a_file_look(tmp_path: Path) -> None:

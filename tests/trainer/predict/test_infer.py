@@ -213,7 +213,7 @@ def test_the_verb_shows_a_row_or_a_file_of_buffers(
     ("arguments", "said"),
     [
         (["--camera-path", __file__, "--orbit", "3"], "--camera-path and --orbit"),
-        (["--orbit", "3", "--truth", "8"], "--orbit and --truth"),
+        (["--buffers", __file__, "--truth", "8"], "--buffers and --truth"),
         (["--buffers", __file__, "--without", "sofa"], "--buffers and what stands where"),
         (["--orbit", "0"], "'--orbit'"),
         (["--place", "sofa"], "NAME=X,Y,Z"),

@@ -88,6 +88,23 @@ def combine_options(*options: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda command: reduce(lambda decorated, option: option(decorated), reversed(options), command)
 
 
+address_options = combine_options(
+    click.option(
+        "--host",
+        default="localhost",
+        show_default=True,
+        help="The address to listen on; whoever reaches any other one sees all that is served.",
+    ),
+    click.option(
+        "--name",
+        "names",
+        multiple=True,
+        help="A name, beside the host's, by which others may ask; may be repeated.",
+    ),
+)
+"""The options that say where pages are served."""
+
+
 def _check_password(ctx: click.Context, param: click.Parameter, url: str | None) -> str | None:
     if url and ctx.get_parameter_source(param.name or "") is ParameterSource.COMMANDLINE:
         from photonfarm.queue.connection import has_password

@@ -17,7 +17,7 @@ from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import Camera, View, sample_view
 
 FOV_SLACK_DEG, ROLL_SLACK_DEG = 0.05, 0.5
-"""By how much a camera may differ from the spec's field of view, and from one that stands upright."""
+"""How far a camera may be from the spec's field of view, and from one that stands upright."""
 
 COLOURS = ("red", "green", "blue")
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from photonfarm.cli.options import combine_options, names_redis, redis_option, store_option
+from photonfarm.cli.options import address_options, combine_options, names_redis, redis_option, store_option
 from photonfarm.farm.running_farm import METRICS_PORT, WEB_PORT
 
 if TYPE_CHECKING:
@@ -24,18 +24,7 @@ _watch_options = combine_options(
         multiple=True,
         help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or run]",
     ),
-    click.option(
-        "--host",
-        default="localhost",
-        show_default=True,
-        help="The address to listen on; whoever reaches any other one sees all that is served.",
-    ),
-    click.option(
-        "--name",
-        "names",
-        multiple=True,
-        help="A name, beside the host's, by which others may ask; may be repeated.",
-    ),
+    address_options,
 )
 """The options that say which farm is watched, and where that is served."""
 

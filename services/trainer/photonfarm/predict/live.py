@@ -204,9 +204,9 @@ class Live:
 
 
 def format_error(error: float, deviation: float | None, power: float) -> str:
-    """A mean squared error with its 95 % interval, and as a share of a black image's."""
+    """A mean squared error with its 95 % interval, and as a share of the image's mean square."""
     interval = "" if deviation is None else f" ± {1.96 * deviation:.2g}"
-    share = f", {error / power:.2%} of a black image's" if power > 0 else ""
+    share = f", {100 * error / power:.2g} % of the image's mean square" if power > 0 else ""
     return f"{error:.3g}{interval} (mean square of radiance × exposure, 95 %){share}"
 
 

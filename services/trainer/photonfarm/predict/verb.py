@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from photonfarm.cli.options import arrangement_options, fov_option, start_options, store_option
+from photonfarm.cli.options import address_options, arrangement_options, fov_option, start_options, store_option
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.trainer.cli.evaluation_verbs import device_option
 from photonfarm.trainer.cli.train_verb import run_option
@@ -131,8 +131,7 @@ def infer(
 @store_option
 @run_option
 @device_option
-@click.option("--host", default="localhost", show_default=True, help="The address to listen on.")
-@click.option("--name", "names", multiple=True, help="A name by which others may ask; may be repeated.")
+@address_options
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),

@@ -1,6 +1,8 @@
 // Points in 3-D that a mouse or a finger turns, drawn by hand into an image: some ten thousand points need no more,
 // and it works on every machine, also where a browser has no graphics card to itself.
 
+import { listenToPointers } from "./pointers.js";
+
 // The bytes of a point: position as three float32; colour, and whether it is seen, as four uint8; normal as three int8.
 const SIZE = 20, FLOATS = SIZE / 4, COLOUR = 12, SEEN = 15, NORMAL = 16;
 
@@ -61,36 +63,16 @@ export class PointView {
   }
 
   listen() {
-    const { canvas } = this, held = new Map();
-    let apart = 0;
-    const spread = () => { const [a, b] = [...held.values()]; return Math.hypot(a.x - b.x, a.y - b.y); };
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      if (held.size === 2) apart = spread();
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      const before = held.get(event.pointerId);
-      if (!before) return;
-      const dx = event.clientX - before.x, dy = event.clientY - before.y;
-      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      if (held.size === 2) {
-        this.distance *= apart / (apart = spread() || 1);
-        this.slide(dx / 2, dy / 2);
-      } else if (event.shiftKey || event.buttons === 2) this.slide(dx, dy);
-      else {
+    const { canvas } = this;
+    listenToPointers(canvas, {
+      turn: (dx, dy) => {
         this.yaw -= dx / 180;
         this.pitch = Math.min(1.55, Math.max(-1.55, this.pitch + dy / 180));
-      }
-      this.draw();
+        this.draw();
+      },
+      slide: (dx, dy) => { this.slide(dx, dy); this.draw(); },
+      approach: (factor) => { this.distance *= factor; this.draw(); },
     });
-    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => held.delete(event.pointerId));
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.distance *= Math.exp(event.deltaY / 700);
-      this.draw();
-    }, { passive: false });
     canvas.addEventListener("keydown", (event) => {
       const turn = { ArrowLeft: [.1, 0], ArrowRight: [-.1, 0], ArrowUp: [0, .1], ArrowDown: [0, -.1] }[event.key];
       if (turn) { this.yaw += turn[0]; this.pitch = Math.min(1.55, Math.max(-1.55, this.pitch + turn[1])); }

@@ -2,6 +2,7 @@
 // and, as soon as nothing moves any more, for the truth, which the server refines from one request to the next.
 
 import { Plan } from "./plan.js";
+import { listenToPointers } from "./pointers.js";
 
 const REST_MS = 150; // without a change, after which the truth is rendered
 const WALK = .02; // of the room's size, a step
@@ -142,31 +143,14 @@ class Live {
   }
 
   listen(canvas) {
-    const held = new Map();
-    let apart = 1;
-    const spread = () => { const [a, b] = [...held.values()]; return Math.hypot(a.x - b.x, a.y - b.y) || 1; };
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      if (held.size === 2) apart = spread();
+    listenToPointers(canvas, {
+      turn: (dx, dy) => this.orbit(dx, dy),
+      slide: (dx, dy) => {
+        const size = this.axes().distance / canvas.clientWidth;
+        this.slide(-dx * size, dy * size, 0);
+      },
+      approach: (factor) => this.approach(factor),
     });
-    canvas.addEventListener("pointermove", (event) => {
-      const before = held.get(event.pointerId);
-      if (!before) return;
-      const dx = event.clientX - before.x, dy = event.clientY - before.y, size = this.axes().distance / canvas.clientWidth;
-      held.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      if (held.size === 2) {
-        this.approach(apart / (apart = spread()));
-        this.slide(-dx * size / 2, dy * size / 2, 0);
-      } else if (event.shiftKey || event.buttons === 2) this.slide(-dx * size, dy * size, 0);
-      else this.orbit(dx, dy);
-    });
-    for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, (event) => held.delete(event.pointerId));
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      this.approach(Math.exp(event.deltaY / 700));
-    }, { passive: false });
     canvas.addEventListener("keydown", (event) => {
       const step = WALK * Math.hypot(...add(this.room.high, this.room.low, -1));
       const by = { w: [0, 0, -step], s: [0, 0, step], a: [-step, 0, 0], d: [step, 0, 0], q: [0, -step, 0], e: [0, step, 0] }[event.key.toLowerCase()];

@@ -89,7 +89,7 @@ class GoodState:
         return None
 
     def _add_untrained_loss(self, number: int, batch: TrainingBatch) -> None:
-        """In the first steps, add what the loss of this batch is without any."""
+        """Add, during the first steps, what the loss of this batch is without any."""
         if number >= FEW:
             self._first_network = None
             return

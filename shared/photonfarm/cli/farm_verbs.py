@@ -22,6 +22,7 @@ from photonfarm.cli.options import (
     request_options,
     retry_option,
     run_option,
+    shot_file_options,
     start_options,
     store_option,
 )
@@ -77,16 +78,7 @@ def scene_show(spec: str, as_json: bool) -> None:
 @click.option(
     "--workers", type=click.IntRange(1), help="That will render: for the dry run's time and the size of jobs."
 )
-@click.option(
-    "--cameras",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Plan the views of this transforms.json (of nerfstudio, or of `export --to exr`) instead of random ones.",
-)
-@click.option(
-    "--configurations",
-    type=click.Path(exists=True, dir_okay=False, path_type=Path),
-    help="Plan the configurations of this JSON or CSV file, by the names of groups, instead of random ones.",
-)
+@shot_file_options
 @device_option
 @json_option
 def submit(
@@ -115,8 +107,8 @@ def submit(
     Where something is said to stand somewhere, or a camera, --passes of that one view are planned: all others stay at
     rest, or as --row or --like has them.
 
-    --cameras and --configurations plan what files say: each configuration by its own camera, or by all of --cameras, or
-    from --views random places.
+    --cameras and --configurations plan what files say instead of random samples: each configuration by its own camera,
+    or by all of --cameras, or from --views random places.
     """
     from photonfarm.cli import show
     from photonfarm.farm import dry_run as dry
@@ -140,8 +132,8 @@ def submit(
         if cameras or configurations:
             _refuse_given("files say what is planned", "modifications", "camera", "look_at")
             _refuse_given("is of random views; --cameras has them all", *(("views", "seed") if cameras else ()))
-            many = {"views": request.views_per_modification, "seed": request.seed}
-            chosen = read_shots(named.spec, cameras, configurations, modification, **many)
+            views, seed = request.views_per_modification, request.seed
+            chosen = read_shots(named.spec, cameras, configurations, modification, views=views, seed=seed)
         else:
             _refuse_given("is of random samples; one view of one configuration is asked for", *RANDOM)
             chosen = [(modification, asked.view(named.spec, start[1]))]

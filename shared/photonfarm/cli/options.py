@@ -300,6 +300,22 @@ start_options = combine_options(
 )
 """What an arrangement changes, as `find_start` takes it; by default the scene at rest."""
 
+shot_file_options = combine_options(
+    click.option(
+        "--cameras",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="FILE",
+        help="The cameras of this transforms.json, of nerfstudio or of `export --to exr`.",
+    ),
+    click.option(
+        "--configurations",
+        type=click.Path(exists=True, dir_okay=False, path_type=Path),
+        metavar="FILE",
+        help="The configurations of this JSON or CSV file, by the names of groups.",
+    ),
+)
+"""Files of what stands where and of what looks at it, as `read_shots` takes them."""
+
 fov_option = click.option(
     "--fov", type=click.FloatRange(1, 170), metavar="DEGREES", help="Field of view along the width.  [default: spec's]"
 )

@@ -33,20 +33,21 @@ def read_shots(
     *,
     views: int = 1,
     seed: int = 0,
+    otherwise: View | None = None,
 ) -> list[tuple[Modification, View]]:
     """The views of a spec that two files say, each with its configuration.
 
     Configurations change `start`, by default the scene at rest, which is the only one without their file. Each is seen
-    by its own camera if it has one, else by all `cameras`; without that file by so many random `views`, of a master
-    seed. Raises SpecError for what is no such file, and for what the spec cannot have.
+    by its own camera if it has one, else by all `cameras`; without that file from one view `otherwise`, or else by so
+    many random `views`, of a master seed. Raises SpecError for what is no such file, and for what the spec cannot have.
     """
-    seen_by = [] if cameras is None else read_cameras(cameras, spec)
+    seen_by = read_cameras(cameras, spec) if cameras else [otherwise] if otherwise else []
     start = rest(spec) if start is None else start
     arranged = [(start, None)] if configurations is None else read_configurations(configurations, spec, start)
     shots: list[tuple[Modification, View]] = []
     for modification, own in arranged:
         key = modification.key(spec.radiance_id)
-        drawn = () if own or cameras else (sample_view(spec, key, seed, i, modification) for i in range(views))
+        drawn = () if own or seen_by else (sample_view(spec, key, seed, i, modification) for i in range(views))
         shots += [(modification, view) for view in ([own] if own else [*seen_by, *drawn])]
     return shots
 

@@ -3,6 +3,7 @@
 import json
 import re
 import shutil
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -299,6 +300,34 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
         again = CliRunner().invoke(umbrella, [*place, *asked[:-2], "--store-it"], catch_exceptions=False)
         assert words in again.stderr.splitlines()
     assert len(Store(other).scene(scene_id).plans()) == 2
+
+
+def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path, tmp_path: Path) -> None:
+    run, out = trained(store, tmp_path / "run", "guided"), tmp_path / "out"
+    (rooms := tmp_path / "rooms.csv").write_text(
+        "sofa.x,sofa.present,camera.x,camera.y,camera.z\n0.9,,-1.9,1.6,1.7\n,0,,,\n"
+    )
+    place = ["infer", "--store", str(store), "--run", str(run), "--out", str(out), "--configurations", str(rooms)]
+    asked = ["--without", "vase", "--camera", "1.9,1.6,1.7", "--fov", "50", "--truth", "4"]
+    done = CliRunner().invoke(umbrella, [*place, *asked], catch_exceptions=False)
+    assert done.exit_code == 0
+    assert Counter(Path(line).parent.name for line in done.stdout.split()) == {"frame-0000": 6, "frame-0001": 6}
+    said = [json.loads((out / f"frame-{i:04}/frame.json").read_text()) for i in range(2)]
+    assert [each["without"] for each in said] == [["vase"], ["sofa", "vase"]]
+    assert [each["place"] for each in said] == [{"sofa": [0.9, 0, 0.3]}, {}]
+    assert [each["camera"] for each in said] == [[-1.9, 1.6, 1.7], [1.9, 1.6, 1.7]]
+    opened = open_run(run, store, fov=50)
+    for number, each in enumerate(said):
+        shot = {name: each[name] for name in ("place", "without", "camera", "look_at")}
+        with torch.no_grad(), np.load(out / f"frame-{number:04}/frame.npz") as layers:
+            np.testing.assert_array_equal(layers["prediction"], opened.predict(**shot).radiance.numpy())
+            np.testing.assert_array_equal(layers["truth"], opened.truth(**shot, spp=4).radiance)
+    matrix = [[1, 0, 0, 1.9], [0, 1, 0, 1.6], [0, 0, 1, 1.7], [0, 0, 0, 1]]
+    (cameras := tmp_path / "transforms.json").write_text(json.dumps({"frames": 2 * [{"transform_matrix": matrix}]}))
+    done = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras)], catch_exceptions=False)
+    assert len({Path(line).parent.name for line in done.stdout.split()}) == 1 + 2, "the first has its own camera"
+    refused = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras), "--camera", "0,1,0"])
+    assert "--cameras and --camera exclude each other" in refused.stderr
 
 
 def test_the_lines_of_the_page_make_a_frame_and_its_truth(

@@ -10,12 +10,20 @@ from typing import TYPE_CHECKING
 
 import click
 
-from photonfarm.cli.options import address_options, arrangement_options, fov_option, start_options, store_option
+from photonfarm.cli.options import (
+    address_options,
+    arrangement_options,
+    fov_option,
+    shot_file_options,
+    start_options,
+    store_option,
+)
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.trainer.cli.evaluation_verbs import device_option
 from photonfarm.trainer.cli.train_verb import run_option
 
 if TYPE_CHECKING:
+    from photonfarm.predict.infer import InferResult
     from photonfarm.scene.arrangement import Shot
 
 
@@ -34,6 +42,7 @@ LIVE_PORT = 8430
     help="Render it by bdpt beside the network's image, with so many samples per pixel (256) or for so long (20s).",
 )
 @click.option("--store-it", is_flag=True, help="Plan it as a sample, too; else the store stays as it is.")
+@shot_file_options
 @click.option(
     "--camera-path",
     "path",
@@ -60,6 +69,8 @@ def infer(
     fov: float | None,
     truth: str | None,
     store_it: bool,
+    cameras: Path | None,
+    configurations: Path | None,
     path: Path | None,
     orbit: int | None,
     buffers: Path | None,
@@ -72,22 +83,29 @@ def infer(
     What stands where is said by names; all others stay at rest, or as --row or --like has them. --row alone shows the
     sample that is stored. Inputs are rendered where the renderer is installed; for a path, a file may have them. PNG,
     NPZ, JSON and, with the package OpenEXR, EXR; of a path PNG, GIF and, with the extra `video`, MP4.
+
+    --configurations and --cameras show all that files say, each in a folder: a configuration by its own camera, or by
+    all of --cameras, or by that of the other options.
     """
     from photonfarm.predict import infer as shows
     from photonfarm.predict.opened_run import OpenRun, require_renderer
     from photonfarm.renderer.jobs.truth import Amount
-    from photonfarm.scene.arrangement import Arrangement, Shot
+    from photonfarm.scene.arrangement import Arrangement, Shot, with_fov
     from photonfarm.scene.camera_path import CameraPath, Frames
+    from photonfarm.scene.shot_files import read_shots
     from photonfarm.store.read.find import find_start
     from photonfarm.trainer.predictors.trained import TrainedRun
 
     began = time.perf_counter()
+    files = cameras or configurations
     kinds = {"--camera-path": path, "--orbit": orbit, "--buffers": buffers}
+    kinds |= {"--cameras" if cameras else "--configurations": files}
     given = [name for name, value in kinds.items() if value is not None]
-    of_camera = {"--camera": asked.camera, "--look-at": asked.look_at, "--fov": fov}
-    of_frame = {**of_camera, "--store-it": store_it or None, "--truth": truth if buffers else None}
+    of_frame: dict[str, object] = {"--store-it": store_it or None, "--truth": truth if buffers else None}
+    if given != ["--configurations"]:
+        of_frame |= {"--camera": asked.camera, "--look-at": asked.look_at, "--fov": None if files else fov}
     alone = [name for name, value in of_frame.items() if value is not None]
-    arranged = like is not None or asked != Shot() or truth is not None or bool(alone)
+    arranged = like is not None or asked != Shot() or truth is not None or fov is not None or store_it
     if len(given) > 1 or (given and alone) or (buffers is not None and (arranged or row is not None)):
         others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
         raise click.UsageError(f"{' and '.join(others)} exclude each other")
@@ -108,6 +126,19 @@ def infer(
         with tell_waiting(say, f"rendering {len(views)} frames of {trained.scene_id}"):
             opened = OpenRun(trained, store, device)
             result = shows.show_path(opened, configuration, views, out, fps=fps, amount=amount)
+    elif files is not None:
+        require_renderer(trained)
+        spec = with_fov(trained.source(store).spec, fov)
+        begin, camera = find_start(store, trained.scene_id, row, like) or (None, None)
+        changed, view = asked.apply(spec, begin), asked.view(spec, camera)
+        shots = read_shots(spec, cameras, configurations, changed, otherwise=view)
+        with tell_waiting(say, f"rendering {len(shots)} images of {trained.scene_id}"):
+            opened = OpenRun(trained, store, device, fov)
+            load_s = time.perf_counter() - began
+            for number, shot in enumerate(shots):
+                folder = out / f"frame-{number:04}"
+                _tell(shows.show_frame(opened, Shot(), shot, folder, amount, load_s), f"{folder.name}: ")
+        return
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
     elif row is not None and not arranged:
@@ -120,11 +151,16 @@ def infer(
             opened = OpenRun(trained, store, device, fov)
             load_s = time.perf_counter() - began
             result = shows.show_frame(opened, asked, start, out, amount, load_s, store_it=store_it)
+    _tell(result)
+
+
+def _tell(result: InferResult, where: str = "") -> None:
+    """Print the files on standard output, and what is said of them on standard error."""
     for doubt in result.doubts:
-        say(f"warning: {doubt}")
+        click.echo(f"warning: {where}{doubt}", err=True)
     for file in result.files:
         click.echo(file)
-    say(result.sentence)
+    click.echo(f"{where}{result.sentence}", err=True)
 
 
 @click.command()

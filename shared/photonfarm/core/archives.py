@@ -125,6 +125,8 @@ class FrameCosts:
 def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
     """Write an image with layers by name, (H, W, 3) or (H, W), float16 or float32; "" is the one shown first.
 
+    Whole numbers become float32, which has all of a few million.
+
     Channels are R, G, B of colours, X, Y, Z of normals, Z of depths, and V of other single values. Raises StoreError
     if OpenEXR is not installed, or the disk refuses.
     """
@@ -143,7 +145,8 @@ def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Map
 
 def _channels(layers: Mapping[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
     channels: dict[str, NDArray[Any]] = {}
-    for layer, values in layers.items():
+    for layer, given in layers.items():
+        values = given.astype(np.float32) if given.dtype.kind in "iu" else given
         if values.ndim == 3:
             names, planes = "XYZ" if "normal" in layer else "RGB", np.moveaxis(values, -1, 0)
         else:

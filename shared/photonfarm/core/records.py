@@ -24,6 +24,9 @@ A smaller cloud has all its points there.
 STATIC = -1
 """The group index of what never moves."""
 
+NOTHING = -1
+"""What an image of groups has where nothing is met; there 0 is what never moves, and g + 1 group g of the spec."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Geometry:

@@ -168,6 +168,10 @@ class Frames:
     photon_seen: NDArray[np.bool_]  # (F, K)
     photons: Photons | None  # of the configuration; None for a scene without
     guides: Guides  # (F, …) of all views
+    group: NDArray[np.int16] | None = (
+        None  # (F, H, W) what the pixels' centres show, by its place in `names`; −1: nothing
+    )
+    names: tuple[str, ...] = ()  # of what never moves, "", and of the groups; both are missing in older files
 
     def __len__(self) -> int:
         """How many frames there are."""
@@ -194,6 +198,8 @@ class Frames:
             **{name: getattr(self, name) for name in _OF_VIEWS},
             **{f"guide_{name}": array for name, array in arrays_of(self.guides).items()},
         }
+        if self.group is not None:
+            arrays |= {"group": self.group, "group_names": np.array(self.names)}
         if self.photons is not None:
             arrays |= {f"photon_{name}": array for name, array in arrays_of(self.photons).items()}
         write_arrays(file, arrays, "buffers")
@@ -208,5 +214,7 @@ class Frames:
                 photons = Photons(*(stored[f"photon_{field.name}"] for field in fields(Photons)))
             guides = Guides(*(stored[f"guide_{field.name}"] for field in fields(Guides)))
             modification = Modification.from_vector(stored["modification"])
-            of_views = {name: stored[name] for name in _OF_VIEWS}
+            of_views: dict[str, Any] = {name: stored[name] for name in _OF_VIEWS}
+            if "group" in stored:
+                of_views |= {"group": stored["group"], "names": tuple(stored["group_names"].tolist())}
             return cls(str(stored["scene_id"]), modification, views, photons=photons, guides=guides, **of_views)

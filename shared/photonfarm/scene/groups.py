@@ -5,6 +5,7 @@ Lengths are in scene units, angles in degrees.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Self
 
 import numpy as np
@@ -160,6 +161,11 @@ class Light(Movable):
     def shape_ids(self) -> tuple[str, ...]:
         """The ids of its shapes in the loaded scene."""
         return self.shapes or (self.name,)
+
+
+def names_of_ids(groups: Sequence[Movable]) -> list[str]:
+    """The names of what an image of groups shows, by the numbers there, from 0 on: "" is what never moves."""
+    return ["", *(group.name for group in groups)]
 
 
 def shape_ids(group: Movable) -> tuple[str, ...]:

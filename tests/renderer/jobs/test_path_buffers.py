@@ -67,6 +67,9 @@ def test_the_verb_writes_a_path_and_leaves_the_store_as_it_is(tmp_path: Path, sp
     assert frames.depth.shape == (3, spec.film.height, spec.film.width)
     assert frames.point_seen.shape == (3, spec.points)
     assert frames.photon_seen.shape == (3, spec.photons.slots)
+    assert frames.names == ("", *(group.name for group in spec.groups))
+    assert {0, 1 + [group.name for group in spec.groups].index("sofa")} < set(frames.group.ravel().tolist())
+    assert (frames.group.dtype, frames.group.shape) == (np.int16, frames.depth.shape)
     np.testing.assert_array_equal(frames.modification.vector, rest(spec).vector)
     assert sorted(tmp_path.rglob("*")) == sorted([*before, tmp_path / "out.npz"])
     for arguments in ([], ["--orbit", "3", "--camera-path", "file"]):
@@ -85,6 +88,8 @@ def test_buffers_that_are_not_finite_are_not_written(spec: SceneSpec, room: Load
         def apply(self, _) -> None: ...
 
         def photons(self, _) -> None: ...
+
+        find_groups = room.find_groups
 
         def sees(self, views, position):
             return room.sees(views, position)

@@ -104,6 +104,9 @@ def test_an_image_is_rendered_of_a_spec_without_a_store_and_of_a_scene_of_a_stor
     with np.load("a.npz") as image:
         assert image["A"].shape == image["B"].shape == (16, 24, 3)
         assert not np.array_equal(image["A"], image["B"])
+        shown = {said["groups"][number] for number in np.unique(image["group"])}
+    assert "table" in shown
+    assert "sofa" not in shown
     store = Store(tmp_path / "store", create=True)
     store.plan(small(load_spec("room")), Request(modifications=2), shard_rows=2)
     before = sorted(tmp_path.rglob("*"))

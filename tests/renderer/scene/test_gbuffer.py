@@ -1,13 +1,17 @@
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from photonfarm.core.records import ViewBuffers
+from photonfarm.core.records import NOTHING, ViewBuffers
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.gbuffer import view_buffers
+from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.scene.arrangement import Arrangement
+from photonfarm.scene.groups import names_of_ids
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.spec_loading import load_spec, parse_spec
 from photonfarm.scene.view import Camera, View
 
 COLOUR = (0.2, 0.4, 0.6)
@@ -75,6 +79,43 @@ def test_albedo_is_the_mean_over_the_pixel_and_depth_that_of_its_centre() -> Non
         assert buffers.depth[8, column] == pytest.approx(3.1, abs=1e-5)
     np.testing.assert_allclose(buffers.albedo[1, 5], 0.75**2 * np.array(COLOUR), atol=1e-6)
     assert not buffers.albedo[8, 4].any()
+
+
+def test_the_numbers_of_groups_go_with_what_moves_and_are_those_of_the_spec(
+    small: Callable[..., SceneSpec], somewhere: View
+) -> None:
+    """What a number shows lies in the box of that group's shapes, wherever a configuration has put it."""
+    room = LoadedScene.load(small(load_spec("room"), 48, 32))
+    names = names_of_ids(room.spec.groups)
+    seen = {}
+    for label, change in {
+        "rest": {},
+        "moved": {"move": {"sofa": (-0.4, 0, 0.3)}},
+        "without": {"without": ["sofa"]},
+    }.items():
+        standing = Arrangement.of(**change).apply(room.spec)
+        room.apply(standing)
+        (seen[label],) = room.find_groups([somewhere])
+        depth, rays = room.buffers(somewhere).depth, Camera.of(somewhere, room.spec).rays()
+        met = somewhere.origin + rays * (depth / (rays @ Camera.of(somewhere, room.spec).forward))[..., None]
+        np.testing.assert_array_equal(seen[label] == NOTHING, depth == 0)
+        for number in range(1, len(names)):
+            of_group = [room._group_of.get(shape.id()) == number - 1 for shape in room.scene.shapes()]
+            low, high = room.boxes[of_group, 0].min(axis=0) - 1e-3, room.boxes[of_group, 1].max(axis=0) + 1e-3
+            shown = met[seen[label] == number] - standing.translation[number - 1]
+            assert ((low <= shown) & (shown <= high)).all(), names[number]
+    sofa = names.index("sofa")
+    assert sofa in seen["rest"]
+    assert (seen["rest"] == sofa).sum() > 20 < (seen["moved"] == sofa).sum()
+    assert ((seen["rest"] == sofa) != (seen["moved"] == sofa)).any()
+    assert sofa not in seen["without"]
+    assert 0 in seen["rest"]
+
+
+def test_a_view_that_meets_nothing_shows_no_group(small: Callable[..., SceneSpec]) -> None:
+    room = LoadedScene.load(small(load_spec("room")))
+    outside = View(np.array([0, 50, 0], np.float32), np.array([1, 90, 0], np.float32))
+    assert (room.find_groups([outside]) == NOTHING).all()
 
 
 def test_images_lie_in_memory_of_numpy_which_any_thread_may_free() -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from click.testing import CliRunner
@@ -293,6 +294,15 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
         truth = (layers["A"] + layers["B"]) / 2
         np.testing.assert_allclose(layers["truth"], truth, rtol=1e-6)
         np.testing.assert_allclose(layers["difference"], layers["prediction"] - truth, atol=1e-6)
+        shown = layers["group"]
+    groups = open_run(run, store).find_groups(
+        asked_again, View(np.float32(said["camera"]), np.float32(said["look_at"]))
+    )
+    np.testing.assert_array_equal(shown, groups)
+    assert said["groups"] == ["", *(group.name for group in spec_of(store).groups)]
+    assert said["groups"].index("vase") not in shown
+    with OpenEXR.File(str(tmp_path / "out/frame.exr"), separate_channels=True) as image:
+        np.testing.assert_array_equal(image.channels()["group.V"].pixels, shown)
     other = tmp_path / "other"
     shutil.copytree(store, other)
     place[2] = str(other)

@@ -30,6 +30,7 @@ from photonfarm.predict.opened_run import OpenRun, never_seen
 from photonfarm.renderer.jobs.truth import Amount, write_beside
 from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot
 from photonfarm.scene.camera_path import Frames
+from photonfarm.scene.groups import names_of_ids
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
@@ -87,6 +88,7 @@ def show_frame(
         "scene": opened.scene_id,
         **list_shot(*shot),
         "doubts": [*frame.doubts, *opened.look_closer(frame.configuration, frame.view)],
+        "groups": names_of_ids(opened.spec.groups),
         "seconds": seconds,
     }
     said = [describe_shot(*shot)]
@@ -104,7 +106,8 @@ def show_frame(
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
     if store_it:
         said.append(opened.plan_sample(*shot[1:]))
-    files = write_beside(out, image, truth, opened.spec.exposure, about)
+    groups = opened.find_groups(frame.configuration, frame.view)
+    files = write_beside(out, image, groups, truth, opened.spec.exposure, about)
     return InferResult(tuple(files), "\n".join(said), tuple(about["doubts"]))
 
 

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from photonfarm.core.errors import SpecError
@@ -197,6 +198,16 @@ class OpenRun:
 
         configuration, view = self.stage(configuration, view, **asked)
         return never_seen(look_closer(self._scene, configuration, view))
+
+    def find_groups(
+        self, configuration: Modification | None = None, view: View | None = None, **asked: Any
+    ) -> NDArray[np.int16]:
+        """The number of the group that each pixel's centre shows, (H, W), as `predict`: 0 is what never moves.
+
+        Others are those of `spec.groups`, in their order, from 1 on, and −1 is nothing.
+        """
+        _, view = self.stage(configuration, view, **asked)
+        return self._scene.find_groups([view])[0]
 
     def stage(
         self, configuration: Modification | None = None, view: View | None = None, **asked: Any

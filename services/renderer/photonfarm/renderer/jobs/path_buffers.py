@@ -21,6 +21,7 @@ from photonfarm.renderer.jobs.render import (
 )
 from photonfarm.scene.arrangement import Arrangement
 from photonfarm.scene.camera_path import CameraPath, Cameras, Frames, check_clear, orbit
+from photonfarm.scene.groups import names_of_ids
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.view import View
@@ -72,7 +73,7 @@ def frames_of(
     photons, _ = photons_of(scene, key := modification.key(spec.radiance_id))
     cloud = cloud or scene.base()[1]
     points, lit = rebuild(cloud, modification), lit_points(cloud, modification)
-    buffers, guides, seen = [], [], []
+    buffers, guides, seen, groups = [], [], [], []
     for first in range(0, len(views), scene.samples_at_once):
         together = views[first : first + scene.samples_at_once]
         keys = [view_key(key, view.vector) for view in together]
@@ -80,14 +81,16 @@ def frames_of(
             buffers.append(of_view[0])
             guides.append(of_view[1])
         seen += visibility_of(scene, together, points, photons)
+        groups += [*scene.find_groups(together)]
     images = _stack(buffers)
     for name, values in images.items():
         if not np.isfinite(values).all():
             raise IncompleteError(f"{name} of these views came out non-finite; move the camera a little")
     visible = _stack(seen)
-    images |= {"point_seen": visible["points"], "photon_seen": visible["photons"]}
+    images |= {"point_seen": visible["points"], "photon_seen": visible["photons"], "group": np.stack(groups)}
     stacked = Guides(**_stack(guides))
-    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=stacked, **images)
+    names = tuple(names_of_ids(spec.groups))
+    return Frames(spec.scene_id, modification, tuple(views), photons=photons, guides=stacked, names=names, **images)
 
 
 def _stack(records: Sequence[ViewBuffers] | Sequence[Guides] | Sequence[Visibility]) -> dict[str, NDArray[Any]]:

@@ -25,6 +25,7 @@ from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, clean_error, jackknife
 from photonfarm.renderer.jobs.estimates import halves_of
 from photonfarm.scene.arrangement import Shot, describe_shot, find_doubts, list_shot, with_fov
+from photonfarm.scene.groups import names_of_ids
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import find_spec, load_spec, scene_folder
@@ -174,12 +175,14 @@ class RenderedImage:
     configuration: Modification
     view: View
     truth: Truth
+    groups: NDArray[np.int16]  # (H, W) as `LoadedScene.find_groups` has them
     doubts: tuple[str, ...]  # what no sample of the spec shows, each a sentence
 
     def document(self) -> dict[str, Any]:
         """What was rendered, for JSON; what stands where is said by names."""
         effort = {"spp": self.truth.spp, "seconds": self.truth.seconds, "doubts": list(self.doubts)}
-        return {"scene": self.spec.name, **list_shot(self.spec, self.configuration, self.view), **effort}
+        shot = list_shot(self.spec, self.configuration, self.view)
+        return {"scene": self.spec.name, **shot, **effort, "groups": names_of_ids(self.spec.groups)}
 
     def line(self) -> str:
         """What was rendered, in words."""
@@ -188,7 +191,8 @@ class RenderedImage:
 
     def write(self, file: Path) -> None:
         """Write it, as `write_halves` does."""
-        write_halves(file, self.truth.halves, self.spec.exposure, {"about": json.dumps(self.document())})
+        about = {"about": json.dumps(self.document())}
+        write_halves(file, self.truth.halves, self.spec.exposure, about, self.groups)
 
 
 def render_asked(
@@ -213,7 +217,8 @@ def render_asked(
     scene.apply(configuration)
     doubts = [*find_doubts(spec, configuration, view), *look_closer(scene, configuration, view)]
     key = view_key(configuration.key(spec.radiance_id), view.vector)
-    return RenderedImage(spec, configuration, view, render_truth(scene, key, view, amount), tuple(doubts))
+    truth = render_truth(scene, key, view, amount)
+    return RenderedImage(spec, configuration, view, truth, scene.find_groups([view])[0], tuple(doubts))
 
 
 def load_named(store: str | Path, named: str) -> SceneSpec:
@@ -241,18 +246,22 @@ def check_suffix(file: Path) -> None:
         raise SpecError(f"--out {file}: names of {', '.join(SUFFIXES)} files are allowed")
 
 
-def write_halves(file: Path, halves: F32, exposure: float, about: dict[str, Any]) -> None:
+def write_halves(
+    file: Path, halves: F32, exposure: float, about: dict[str, Any], groups: NDArray[np.int16] | None = None
+) -> None:
     """Write A and B, (2, H, W, 3), as an archive or an image with layers; as a PNG, their mean as a display shows it.
 
-    Raises StoreError if the disk refuses or OpenEXR is missing.
+    The first two also have `groups`, (H, W), where they are known. Raises StoreError if the disk refuses or OpenEXR is
+    missing.
     """
     mean = (halves[0] + halves[1]) / np.float32(2)
+    more = {} if groups is None else {"group": groups}
     if file.suffix == ".npz":
         arrays = {name: np.asarray(value) for name, value in about.items()}
-        write_arrays(file, {"A": halves[0], "B": halves[1], **arrays}, "rendered pass")
+        write_arrays(file, {"A": halves[0], "B": halves[1], **more, **arrays}, "rendered pass")
     elif file.suffix == ".exr":
         said = {name: str(value) for name, value in about.items()}
-        write_layers(file, {"": mean, "A": halves[0], "B": halves[1]}, said)
+        write_layers(file, {"": mean, "A": halves[0], "B": halves[1], **more}, said)
     else:
         from PIL import Image
 
@@ -260,13 +269,21 @@ def write_halves(file: Path, halves: F32, exposure: float, about: dict[str, Any]
             Image.fromarray(pictures.display(mean, exposure)).save(part, "PNG")
 
 
-def write_beside(out: Path, prediction: F32, truth: Truth | None, exposure: float, about: dict[str, Any]) -> list[Path]:
+def write_beside(
+    out: Path,
+    prediction: F32,
+    groups: NDArray[np.int16],
+    truth: Truth | None,
+    exposure: float,
+    about: dict[str, Any],
+) -> list[Path]:
     """Write a network's image, (H, W, 3), linear radiance, and the truth beside it, into a folder; returns the files.
 
     Pictures are as a display shows them, and of the difference red where the network is too bright, blue where it is
-    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance; frame.json is `about`.
+    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance, and the
+    `groups`, (H, W), as `LoadedScene.find_groups` has them; frame.json is `about`.
     """
-    layers = {"prediction": prediction}
+    layers: dict[str, NDArray[Any]] = {"prediction": prediction, "group": groups}
     shown = {"prediction": pictures.enlarge(prediction * np.float32(exposure))}
     if truth is not None:
         clean = truth.radiance

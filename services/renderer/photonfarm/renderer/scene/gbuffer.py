@@ -37,7 +37,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.records import F32, ViewBuffers
 from photonfarm.renderer.bdpt.recording import call_recorded
-from photonfarm.renderer.scene.arrays import floats, points
+from photonfarm.renderer.scene.arrays import floats, points, shape_numbers
 from photonfarm.renderer.scene.view_rays import (
     Columns,
     PixelRay,
@@ -121,6 +121,26 @@ def diffuse_reflectance(si: Any, active: Any) -> Any:
     bsdf = si.bsdf()
     is_diffuse = active & mi.has_flag(bsdf.flags(), mi.BSDFFlags.DiffuseReflection)
     return dr.select(is_diffuse, bsdf.eval_diffuse_reflectance(si, is_diffuse), 0)
+
+
+def find_shapes(
+    scene: Any, views: Sequence[View], spec: SceneSpec, recorders: Recorders | None = None
+) -> NDArray[np.int64]:
+    """The number, in the scene's order, of the shape that the ray through each pixel's centre meets, (K, H, W).
+
+    It is −1 where the buffers have nothing; an image of edges is not smoothed.
+    """
+    cameras = ViewCameras.of(views, spec)
+    registered = call_recorded(recorders, trace_shapes, cameras.kind, scene, None, cameras)
+    return shape_numbers(scene)[np.array(registered)].reshape(len(views), cameras.height, cameras.width)
+
+
+def trace_shapes(scene: Any, _: Any, cameras: ViewCameras) -> Any:
+    """The number in Dr.Jit's registry of the shape that the ray through each pixel's centre meets (UInt32); 0: none."""
+    hit = scene.ray_intersect_preliminary(cameras.pixels().ray(0.5, 0.5).ray)
+    shape = dr.select(hit.is_valid(), dr.reinterpret_array(mi.UInt32, hit.shape), 0)
+    dr.eval(shape)
+    return shape
 
 
 SELF_HIT = 1e-4

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import Key, seed_of
-from photonfarm.core.records import F32, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
+from photonfarm.core.records import F32, NOTHING, STATIC, BasePointCloud, Geometry, Guides, Photons, ViewBuffers
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.groups import shape_ids
 from photonfarm.scene.modification import Modification, rest
@@ -237,6 +237,16 @@ class LoadedScene:
         from photonfarm.renderer.scene.gbuffer import find_seen_points
 
         return find_seen_points(self.scene, views, self.spec, position, self._recorders)
+
+    def find_groups(self, views: Sequence[View]) -> NDArray[np.int16]:
+        """What the rays through the pixels' centres meet in the present configuration, (K, H, W): numbers of groups.
+
+        0 is what never moves, g + 1 group g of the spec, and −1 where the buffers have nothing.
+        """
+        from photonfarm.renderer.scene.gbuffer import find_shapes
+
+        of_shapes = [self._group_of.get(shape.id(), STATIC) + 1 for shape in self.scene.shapes()]
+        return np.array([*of_shapes, NOTHING], np.int16)[find_shapes(self.scene, views, self.spec, self._recorders)]
 
     @cached_property
     def hollow(self) -> NDArray[np.bool_]:

@@ -46,7 +46,15 @@ COLUMNS_OF = {
 """The columns of the modification vector that each field of an arrangement is about; column 3 says what is there."""
 
 BESIDE_PLACE = ("turn", "power", "colour")
-"""The fields that a scene may lack."""
+"""The fields beside where a group stands."""
+
+GIVEN_BY = {
+    "place": "at = [0, 0, 0] and box = { min = [-1, 0, -1], max = [1, 0, 1] }",
+    "turn": "turn = { min = -45, max = 45 }",
+    "power": "power = { min = 0.2, max = 2 }",
+    "colour": "colour = [[1, 1, 1], [1, 0.8, 0.5]]",
+}
+"""What in a group's table of the spec lets each of its fields change."""
 
 
 class Arrangement(Frozen):
@@ -88,16 +96,16 @@ class Arrangement(Frozen):
         """The configuration that this makes of another one, by default of the scene at rest.
 
         A group that is named is there, even if it was removed, unless it is left out. Raises SpecError for a name that
-        no group has, for a group that is named twice, and for a change that the scene does not know.
+        no group has, for what contradicts itself, and for a turn, power or colour of a group whose spec has none.
         """
         made = (rest(spec) if start is None else start).vector.copy()
         number = {group.name: g for g, group in enumerate(spec.groups)}
         for name, key in self._list_named():
             if name not in number:
                 raise SpecError(f"{name!r} is no movable group of {spec.name}; nearest: {nearest(name, number)}")
-            keys = [other for named, other in self._list_named() if named == name]
-            if (len(keys) > 1 and {"without"} & {*keys}) or {"place", "move"} <= {*keys}:
-                raise SpecError(f"{name!r} is named twice; place it, move it or leave it out")
+            keys = dict.fromkeys(other for named, other in self._list_named() if named == name)
+            if (len(keys) > 1 and "without" in keys) or {"place", "move"} <= {*keys}:
+                raise SpecError(f"{name!r}: {' and '.join(keys)} contradict each other; give one of them")
             g = number[name]
             if key == "without":  # at rest, so that equal configurations have equal keys
                 made[g] = rest(spec).vector[g]
@@ -105,10 +113,11 @@ class Arrangement(Frozen):
                 made[g, :3] += np.array(self.move[name], np.float32)
             elif key == "place":
                 made[g, :3] = np.array(self.place[name]) - np.array(spec.groups[g].at)
-            elif not spec.further_changes:
-                raise SpecError(f"{key} of {name!r}: nothing in {spec.name} turns or changes its light, by its spec")
             else:
+                _check_changes(spec, name, key)
                 made[g, COLUMNS_OF[key]] = getattr(self, key)[name]
+            if spec.groups[g].stays and made[g, :3].any():
+                _check_changes(spec, name, "place")
             made[g, 3] = key != "without"
         return Modification.from_vector(made)
 
@@ -163,6 +172,17 @@ class Shot(Arrangement):
         if np.array_equal(made.origin, made.target):
             raise SpecError(f"camera = {_text(_shorten(made.origin))}: is where it looks at; give another look_at")
         return made
+
+
+def _check_changes(spec: SceneSpec, name: str, key: str) -> None:
+    """Raise SpecError, with what to add, if this cannot change of a group by its spec."""
+    able = [each.name for each in spec.groups if (not each.stays if key == "place" else getattr(each, key, None))]
+    if name not in able:
+        where = "a light's table" if key in ("power", "colour") else "its table"
+        raise SpecError(
+            f"{key} of {name!r}: the spec of {spec.name} gives one to {', '.join(able) or 'no group'}; "
+            f"{GIVEN_BY[key]} in {where} adds it, and makes another scene"
+        )
 
 
 def describe_shot(spec: SceneSpec, modification: Modification, view: View) -> str:
@@ -244,7 +264,8 @@ def _find_beyond(group: Movable, now: NDArray[np.float32]) -> Iterator[str]:
         for what, value, usual, limits in (("turn", now[4], 0, group.turn), ("power", now[5], 1, power)):
             low, high = (limits.min, limits.max) if limits else (usual, usual)
             if not low - SLACK <= value <= high + SLACK:
-                yield f"{what} of {group.name} is {value:g}, outside {low:g} to {high:g}"
+                beyond = f"outside {low:g} to {high:g}" if limits else "and the spec gives it none"
+                yield f"{what} of {group.name} is {value:g}, {beyond}"
         if not any(np.allclose(now[6:], colour) for colour in colours or [(1, 1, 1)]):
             yield f"colour of {group.name} is {_text(_shorten(now[6:]))}, which is none of its spec"
 

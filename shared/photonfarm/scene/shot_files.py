@@ -24,6 +24,9 @@ COLOURS = ("red", "green", "blue")
 DISTORTED = ("k1", "k2", "k3", "k4", "p1", "p2")
 """The coefficients of lenses, which must be 0."""
 
+FOUND = ("scene", "doubts", "seconds", "spp", "squared_error", "interval", "mean_square")
+"""What `infer` and `render` write of a configuration beside what it is."""
+
 
 def read_shots(
     spec: SceneSpec,
@@ -65,7 +68,8 @@ def read_cameras(file: Path, spec: SceneSpec) -> list[View]:
     frames = document.get("frames") if isinstance(document, Mapping) else None
     if not isinstance(frames, list) or not frames:
         raise SpecError(f"{file}: has no frames; a transforms.json has a list of them, each with a transform_matrix")
-    return [_read_camera(document, frame, spec, f"{file}: frame {n}") for n, frame in enumerate(frames)]
+    count = len(frames)
+    return [_read_camera(document, frame, spec, f"{file}: frame {n} of {count}") for n, frame in enumerate(frames, 1)]
 
 
 def _read_camera(document: Mapping[str, Any], frame: Any, spec: SceneSpec, where: str) -> View:
@@ -127,17 +131,17 @@ def read_configurations(
 ) -> list[tuple[Modification, View | None]]:
     """The configurations in a file, by names, as changes of `start`, each with its camera if it has one.
 
-    JSON is a list of tables as `photonfarm infer` writes them, with the fields of a `Shot`. CSV has a column for each
+    JSON is a table with the fields of a `Shot`, as `photonfarm infer` writes it, or a list. CSV has a column for each
     number: `sofa.x`, `sofa.y` and `sofa.z` are where that stands, `sofa.present` is 0 where it is not there,
     `sofa.turn`, `lamp.power`, `lamp.red`, `lamp.green`, `lamp.blue` are as the modification vector has them, `camera.x`
     … `look_at.z` the camera's; an empty cell changes nothing.
     """
     is_table = file.suffix.lower() == ".csv"
-    entries = list(_read_table(file)) if is_table else _read_list(file)
+    entries = dict(_read_table(file) if is_table else _read_list(file))
     if not entries:
         raise SpecError(f"{file}: has no configurations")
     found: list[tuple[Modification, View | None]] = []
-    for number, entry in enumerate(entries):
+    for where, entry in entries.items():
         try:
             fov_deg = entry.pop("fov", spec.view.fov_deg)
             if fov_deg != spec.view.fov_deg:
@@ -146,16 +150,19 @@ def read_configurations(
             own = shot.view(spec) if shot.camera or shot.look_at else None
             found.append((shot.apply(spec, start), own))
         except SpecError as error:
-            raise SpecError(f"{file}: {'row' if is_table else 'configuration'} {number}: {error}") from error
+            raise SpecError(f"{file}: {where}: {error}") from error
     return found
 
 
-def _read_list(file: Path) -> list[dict[str, Any]]:
+def _read_list(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The tables of a JSON file, without what was found of them, each with where it stands."""
     document = _read_json(file)
     entries = document if isinstance(document, list) else [document]
     if not all(isinstance(entry, dict) for entry in entries):
         raise SpecError(f"{file}: a list of tables is required, each with place, move, without, camera or look_at")
-    return entries
+    for number, entry in enumerate(entries, 1):
+        said = {key: value for key, value in entry.items() if key not in FOUND}
+        yield f"configuration {number} of {len(entries)}", said
 
 
 def _read_json(file: Path) -> Any:
@@ -167,14 +174,18 @@ def _read_json(file: Path) -> Any:
         raise SpecError(f"{file}: is not valid JSON: {error}") from error
 
 
-def _read_table(file: Path) -> Iterator[dict[str, Any]]:
-    """The rows of a CSV file, by names and coordinates."""
+def _read_table(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The rows of a CSV file, by names and coordinates, each with its line; the first line has the names."""
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
-            for number, row in enumerate(csv.DictReader(lines, restval="")):
+            for row in (rows := csv.DictReader(lines, restval="")):
+                where = f"line {rows.line_num}"
                 if None in row:
-                    raise SpecError(f"{file}: row {number}: has more cells than the first line has names")
-                yield {name.strip(): cell.strip() for name, cell in row.items() if name and cell and cell.strip()}
+                    raise SpecError(f"{file}: {where}: has more cells than the first line has names")
+                yield (
+                    where,
+                    {name.strip(): cell.strip() for name, cell in row.items() if name and cell and cell.strip()},
+                )
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SpecError(f"{file}: cannot be read: {error}") from error
 

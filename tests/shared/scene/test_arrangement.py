@@ -6,7 +6,7 @@ import pytest
 from photonfarm.core.errors import SpecError
 from photonfarm.core.statistics import Estimate, jackknife
 from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot, with_fov
-from photonfarm.scene.groups import Power, Turn
+from photonfarm.scene.groups import Light, Power, Turn
 from photonfarm.scene.modification import rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -79,22 +79,41 @@ def test_angles_powers_and_colours_have_names_too(spec: SceneSpec, turning: Scen
     (off,) = Arrangement.of(turn={"sofa": 25}).fits(turning, made.vector[None])
     assert off == 5
     beyond = {
-        "turn": {"sofa": 90, "lamp": 5},
+        "turn": {"sofa": 90},
         "power": {"ceiling-light-1": 3},
         "colour": {"ceiling-light-1": (0, 1, 0)},
     }
-    assert len(find_doubts(turning, Arrangement.of(**beyond).apply(turning))) == 4
+    assert len(find_doubts(turning, Arrangement.of(**beyond).apply(turning))) == 3
     gone = Arrangement.of(without=["sofa"]).apply(turning, made)
     assert gone.turn[number(spec, "sofa")] == 0
-    with pytest.raises(SpecError, match="nothing in room turns"):
-        Arrangement.of(turn={"sofa": 30}).apply(spec)
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ({"turn": {"lamp": 5}}, r"turn of 'lamp': the spec of room gives one to sofa; turn = \{.*\} in its table adds"),
+        ({"power": {"sofa": 2}}, r"gives one to ceiling-light-1, sky; power = \{.*\} in a light's table"),
+        ({"colour": {"sky": (1, 0, 0)}}, r"gives one to ceiling-light-1; colour = \["),
+        (
+            {"move": {"sky": (1, 0, 0)}},
+            r"place of 'sky': the spec of room gives one to table, .*ceiling-light-2; at = ",
+        ),
+    ],
+)
+def test_what_a_group_lacks_in_the_spec_cannot_change(turning: SceneSpec, asked: dict[str, object], said: str) -> None:
+    sky = Light(name="sky", shapes=("environment",), power=Power(min=0, max=1))
+    spec = turning.model_copy(update={"lights": (*turning.lights, sky)})
+    with pytest.raises(SpecError, match=said):
+        Arrangement.of(**asked).apply(spec)
+    assert Arrangement.of(place={"sky": (0, 0, 0)}, without=["vase", "vase"]).apply(spec).present[-1]
 
 
 @pytest.mark.parametrize(
     ("asked", "said"),
     [
         ({"place": {"soffa": (0, 0, 0)}}, "'soffa' is no movable group of room; nearest: sofa"),
-        ({"place": {"sofa": (0, 0, 0)}, "without": ["sofa"]}, "'sofa' is named twice"),
+        ({"place": {"sofa": (0, 0, 0)}, "without": ["sofa"]}, "'sofa': place and without contradict"),
+        ({"turn": {"sofa": 30}}, "the spec of room gives one to no group; turn = "),
         ({"place": {"sofa": (0, 0)}}, "place.sofa"),
         ({"place": {"sofa": (0, 0, np.nan)}}, "finite number"),
         ({"place": {"sofa": (0, 0, 1e39)}}, "1e\\+18 or less"),

@@ -60,17 +60,17 @@ ROLLED = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"frames": [{"transform_matrix": ROLLED.tolist()}]}, "frame 0: is turned by 90.0°"),
+        ({"frames": [{"transform_matrix": ROLLED.tolist()}]}, "frame 1 of 1: is turned by 90.0°"),
         ({"fl_x": 100}, "field of view"),
         ({"camera_angle_x": 1.0, "fl_x": None, "w": 8}, "no camera"),
         ({"h": 4}, "2.000 times as wide"),
         ({"k1": 0.1}, "distorts"),
         ({"frames": []}, "no frames"),
-        ({"frames": [{}]}, "frame 0: is no camera"),
+        ({"frames": [{}]}, "frame 1 of [13]: is no camera"),
         ({"frames": [{"transform_matrix": [[1, 2], [3, 4]]}]}, "4 × 4"),
         ({"frames": [{"transform_matrix": [[0] * 4] * 4}]}, "4 × 4 finite numbers are required, of a rotation"),
-        ({"frames": [1]}, "frame 0: is no camera"),
-        ({"look_at": [float("nan"), 0, 0]}, "frame 0: look_at.0 = nan: a finite number"),
+        ({"frames": [1]}, "frame 1 of [13]: is no camera"),
+        ({"look_at": [float("nan"), 0, 0]}, "frame 1 of [13]: look_at.0 = nan: a finite number"),
         ({"frames": [{"transform_matrix": np.diag([1, 1, 1, 0]).tolist()}], "look_at": [0, 0, 0]}, "where it looks at"),
         ({"frames": [{"transform_matrix": (np.eye(4) + np.diag([1e39], 3)).tolist()}]}, "camera.0 = 1e\\+39"),
     ],
@@ -123,7 +123,7 @@ def test_a_row_that_says_where_to_look_alone_is_seen_from_the_first_camera(tmp_p
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('[{"place": {"sofa": [0, 0, 0]}}]', "configuration 0: 'sofa' is no movable group of small; nearest"),
+        ('[{"place": {"sofa": [0, 0, 0]}}]', "configuration 1 of 1: 'sofa' is no movable group of small; nearest"),
         ('[{"fov": 10}]', "fov = 10"),
         ('[{"plaice": {}}]', "plaice"),
         ("[1]", "list of tables"),
@@ -140,10 +140,10 @@ def test_a_configuration_that_the_scene_cannot_have_is_refused(tmp_path: Path, t
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ("object.x\nfar", "row 0: column 'object.x': 'far'"),
+        ("object.x\nfar", "line 2: column 'object.x': 'far'"),
         ("object\n1", "NAME.x"),
         ("", "no conf"),
-        ("object.x,object.z\n\n0,0\n0,5,0,5", "row 1: has more cells"),
+        ("object.x,object.z\n\n0,0\n0,5,0,5", "line 4: has more cells"),
         ("lamp.present\n1", "'lamp' is no"),
     ],
 )

@@ -27,6 +27,7 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.arrangement import Shot
 from photonfarm.scene.groups import Power, Turn
 from photonfarm.scene.modification import rest
+from photonfarm.scene.shot_files import read_configurations
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import View, sample_view
@@ -310,6 +311,17 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
         again = CliRunner().invoke(umbrella, [*place, *asked[:-2], "--store-it"], catch_exceptions=False)
         assert words in again.stderr.splitlines()
     assert len(Store(other).scene(scene_id).plans()) == 2
+    ((configuration, seen),) = read_configurations(tmp_path / "out/frame.json", spec_of(store))
+    np.testing.assert_array_equal(configuration.vector, asked_again.vector)
+    assert seen is not None
+    np.testing.assert_array_equal(seen.vector[:3], np.float32([-1.9, 1.6, 1.7]))
+    (mine := tmp_path / "out/frame-of-mine.png").touch()
+    for more, left in (
+        (["--without", "vase"], names - {"truth.png", "difference.png"}),
+        (["--row", "1"], {"target.png"}),
+    ):
+        CliRunner().invoke(umbrella, [*place, *more], catch_exceptions=False)
+        assert {file.name for file in (tmp_path / "out").iterdir()} == {"prediction.png", mine.name, *left}
 
 
 def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path, tmp_path: Path) -> None:
@@ -336,6 +348,10 @@ def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path,
     (cameras := tmp_path / "transforms.json").write_text(json.dumps({"frames": 2 * [{"transform_matrix": matrix}]}))
     done = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras)], catch_exceptions=False)
     assert len({Path(line).parent.name for line in done.stdout.split()}) == 1 + 2, "the first has its own camera"
+    rooms.write_text("sofa.x\n0.9\n")
+    CliRunner().invoke(umbrella, place, catch_exceptions=False)
+    assert {file.name for file in out.iterdir()} == {"frame-0000"}
+    assert not (out / "frame-0000/truth.png").exists()
     refused = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras), "--camera", "0,1,0"])
     assert "--cameras and --camera exclude each other" in refused.stderr
 

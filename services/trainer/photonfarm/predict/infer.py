@@ -6,10 +6,11 @@ buffers` has written them to a file.
 
 from __future__ import annotations
 
+import re
 import statistics
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
@@ -47,6 +48,11 @@ NOT_JUDGED = "a training sample, so no error is given: the network may have lear
 FFMPEG = "imageio_ffmpeg"
 """The package with ffmpeg, of the extra `video`."""
 
+MADE = re.compile(
+    r"(prediction|truth|difference|target|frame-\d{4})\.png|frame\.(npz|exr|json)|path\.(gif|mp4)", re.ASCII
+)
+"""The names of all files that `infer` may make."""
+
 
 @dataclass(frozen=True, slots=True)
 class InferResult:
@@ -55,6 +61,20 @@ class InferResult:
     files: tuple[Path, ...]
     sentence: str
     doubts: tuple[str, ...] = ()
+
+
+def remove_others(out: Path, made: Collection[Path]) -> None:
+    """Remove from a folder what earlier calls have made there and this one has not, as it shows other things.
+
+    Raises StoreError if that is refused.
+    """
+    with store_errors("remove the pictures of an earlier call", out):
+        for file in {*out.glob("*"), *out.glob("frame-*/*")} - {*made}:
+            if MADE.fullmatch(file.name) and file.is_file():
+                file.unlink()
+        for folder in out.glob("frame-*/"):
+            if not any(folder.iterdir()):
+                folder.rmdir()
 
 
 # ----------------------------------------------------------------------------------------------- any configuration

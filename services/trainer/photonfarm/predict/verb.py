@@ -135,9 +135,13 @@ def infer(
         with tell_waiting(say, f"rendering {len(shots)} images of {trained.scene_id}"):
             opened = OpenRun(trained, store, device, fov)
             load_s = time.perf_counter() - began
+            made: list[Path] = []
             for number, shot in enumerate(shots):
                 folder = out / f"frame-{number:04}"
-                _tell(shows.show_frame(opened, Shot(), shot, folder, amount, load_s), f"{folder.name}: ")
+                shown = shows.show_frame(opened, Shot(), shot, folder, amount, load_s)
+                _tell(shown, f"{folder.name}: ")
+                made += shown.files
+        shows.remove_others(out, made)
         return
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
@@ -152,6 +156,7 @@ def infer(
             load_s = time.perf_counter() - began
             result = shows.show_frame(opened, asked, start, out, amount, load_s, store_it=store_it)
     _tell(result)
+    shows.remove_others(out, result.files)
 
 
 def _tell(result: InferResult, where: str = "") -> None:

@@ -152,7 +152,13 @@ def test_a_folder_that_is_gone(here: Path) -> None:
 
 @pytest.mark.parametrize("url", ["localhost", "redis://h:port/0", "http://localhost:80", "redis://127.0.0.1:1/0"])
 def test_a_wrong_redis(here: Path, url: str) -> None:
-    refused(f"submit room --redis {url}", 5, f"no Redis at {url}", "The plan is stored")
+    refused(
+        f"submit room --redis {url}",
+        5,
+        "256 samples planned, ",
+        f"no Redis at {url}",
+        "The plan is stored, and workers",
+    )
     assert json.loads(said("submit room --no-queue --json")[1])["planned_before"] == 256
 
 

@@ -57,14 +57,14 @@ def print_scene(spec: SceneSpec, as_json: bool) -> None:
             ("name", spec.name),
             ("scene id", spec.scene_id),
             ("source", source.file or f"built-in {source.builtin}"),
-            ("kind", f"dynamic, {len(spec.groups)} movable groups" if spec.groups else "static"),
+            ("kind", f"dynamic, {format_count(len(spec.groups), 'movable group')}" if spec.groups else "static"),
             ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.fov_deg:g}°"),
             ("light transport", f"depth {t.max_depth}, {_describe_strategy(t)}"),
             *([("on a card", _describe_strategy(t.on_card))] if t.card else []),
             ("half-estimates", f"2 × {t.half_spp} samples per pixel"),
             ("views from", _box(spec.view.origin.min, spec.view.origin.max)),
             ("looking at", _box(spec.view.look_at.min, spec.view.look_at.max)),
-            ("point cloud", f"{spec.points} points"),
+            ("point cloud", format_count(spec.points, "point")),
             ("photons", f"{spec.photons.paths} paths, {spec.photons.depth} hits each"),
             ("exposure", f"{spec.exposure:g}"),
             ("bytes per sample", f"≤ {bytes_per_sample(spec):,} with its own view and modification"),
@@ -143,23 +143,24 @@ def _print_cost(result: DryRun) -> None:
     if result.core_s is None or result.wall_s is None:
         click.echo(size)
         return
-    core_s = f"{result.core_s:,.0f}" if result.core_s >= 10 else f"{result.core_s:.1f}"
+    core_s = f"{result.core_s:,.0f}" if result.core_s >= 10 else f"{result.core_s:.2g}"
     cores = format_count(result.cores, "core")
     where = f"{cores}, a worker each" if result.workers else f"the {cores} here"
     click.echo(f"{size}; {core_s} core-seconds: {format_span(result.wall_s)} on {where}")
-    click.echo(_describe_suggestion(result))
+    if result.reduction is not None:
+        click.echo(_describe_suggestion(result))
+    elif result.planned_before:
+        click.echo("no suggestion: another half_spp would render again what is planned already")
 
 
 def _describe_suggestion(result: DryRun) -> str:
     better = result.suggestion
-    if result.reduction is None:
-        return f"no suggestion: another half_spp would render the {result.planned_before} planned samples again"
-    if better is None:
+    if better is None or result.reduction is None:
         return "what is asked for is within 5 % of the best at this cost"
-    request = f"{better.samples} views of one pass"
+    request = f"{format_count(better.samples, 'view')} of one pass"
     if better.views is not None:
         options = f"--modifications {better.modifications} --views {better.views}"
-        request = f"{options} ({better.samples} samples of one pass)"
+        request = f"{options} ({format_count(better.samples, 'sample')} of one pass)"
     return (
         f"suggested at this cost: half_spp = {better.half_spp} in [transport], {request}: "
         f"{100 * result.reduction:.0f} % less excess error predicted for light_transport; with guided networks, "

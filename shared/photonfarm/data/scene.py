@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from photonfarm.core.formatting import format_count
 from photonfarm.core.records import Geometry
 from photonfarm.plan.hold_out import HOLD_OUT, sides_of
 from photonfarm.scene.spec import SceneSpec
@@ -55,7 +56,8 @@ class Scene:
         return _reopen, (self._store, self._id, self._guides, self._rows.tolist() if self._frozen else None)
 
     def __repr__(self) -> str:
-        return f"<scene {self.name} ({self.id}), {len(self)} samples{', a snapshot' if self._frozen else ''}>"
+        samples = format_count(len(self), "sample")
+        return f"<scene {self.name} ({self.id}), {samples}{', a snapshot' if self._frozen else ''}>"
 
     # ---------------------------------------------------------------------------------------------------- what it is
 

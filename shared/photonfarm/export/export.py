@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from photonfarm.core.errors import IncompleteError, SpecError
+from photonfarm.core.formatting import format_count
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.export import card, folder
 from photonfarm.export.card import Exported
@@ -125,7 +126,7 @@ class _Export:
         splits = {split: [row for row in new if snapshot.split_of(row) == split] for split in ("train", "held-out")}
         planned = self._files.plan(splits, written)
         if there:
-            self._log(f"{self._out} holds {len(there)} samples already; {len(new)} are new")
+            self._log(f"{self._out} holds {format_count(len(there), 'sample')} already; new: {len(new)}")
         self._total = len(new)
         parts = () if self._contents.single else (*written, *planned)
         self._manifest = self._manifest.model_copy(update={"complete": False, "parts": parts})
@@ -136,7 +137,7 @@ class _Export:
             self._form.write(file, self._samples(snapshot, part), self._contents)
             written_bytes += file.stat().st_size
         rows = [*there, *new]
-        with tell_waiting(self._log, f"describing {len(rows)} samples"):
+        with tell_waiting(self._log, f"describing {format_count(len(rows), 'sample')}"):
             self._manifest = self._manifest.model_copy(update=self._description(snapshot, rows))
             exported = Exported(self._out, snapshot, self._contents, self._manifest)
             self._form.finish(exported)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from photonfarm.cli.options import json_option, store_option
-from photonfarm.core.formatting import format_bytes
+from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import format_span
 from photonfarm.plan.hold_out import HOLD_OUT
 
@@ -106,9 +106,9 @@ def export(scene: str, store: str | Path, out: Path, as_json: bool, **asked: Any
     if as_json:
         print_json(asdict(result))
         return
-    shared = f", {result.configurations} configurations" if result.configurations else ""
-    size = f" in {result.new_files} files of {format_bytes(result.new_bytes)}" if result.new else ""
-    click.echo(f"{result.folder}: {result.samples} samples{shared}; {result.new} of them new{size}")
+    shared = f", {format_count(result.configurations, 'configuration')}" if result.configurations else ""
+    size = f" in {format_count(result.new_files, 'file')} of {format_bytes(result.new_bytes)}" if result.new else ""
+    click.echo(f"{result.folder}: {format_count(result.samples, 'sample')}{shared}; {result.new} of them new{size}")
 
 
 LINE_S = 4.0

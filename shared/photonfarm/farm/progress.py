@@ -123,8 +123,8 @@ class FarmProgress:
             return "none is known here; workers without Redis are at work (`work --share`, `slurm`)"
         return (
             "no farm is known here; workers without Redis are seen by what they commit (`status --watch`). `photonfarm "
-            f"up` goes on with the {missing} samples that are missing, given their spec, and `photonfarm work --share "
-            "0/1 --until-complete` renders just these"
+            f"up` goes on with the missing {format_count(missing, 'sample')}, given the spec, and `photonfarm work "
+            "--share 0/1 --until-complete` renders just these"
         )
 
     def check_read(self) -> None:
@@ -145,7 +145,7 @@ def _find_waits(farm: FarmProgress) -> Iterator[Wait]:
     if status is not None:
         if missing and not status.workers and farm.running is None:
             how = "none is alive; `photonfarm work` starts one, which also queues them"
-            yield Wait("no_worker", missing, f"{missing} samples wait for a worker: {how}")
+            yield Wait("no_worker", missing, f"{format_count(missing, 'sample')} without a worker: {how}")
         for scene_id, reasons in status.skipped.items():
             if scene_id in names:
                 left = f"left by {len(reasons)} of {status.workers} workers: {next(iter(reasons.values()))}"

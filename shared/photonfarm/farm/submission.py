@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from photonfarm.core.errors import QueueError, SpecError, store_errors
+from photonfarm.core.formatting import format_count
 from photonfarm.core.models import differing
 from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import SHARD_ROWS, Request
@@ -18,7 +19,7 @@ from photonfarm.queue.reconciliation import reconcile
 from photonfarm.queue.workers import OtherStoreError
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
-from photonfarm.store import Store
+from photonfarm.store import PlanResult, Store
 from photonfarm.store.model.lease import announce_work
 from photonfarm.store.model.scene_store import stored_spec
 from photonfarm.store.read.find import describe_scenes, find_same_radiance, note_first_plan, scene_named
@@ -134,7 +135,7 @@ def submit(
         planned = opened.plan(named.spec, request, shard_rows=shard_rows, usual_rows=usual, halves_from=other)
     # a first plan's scene may have been here, with failed jobs of the same names, and forgotten
     retry_scene = planned.scene_id if planned.plan == 0 else False
-    queued = _queue(opened, redis_url, retry=retry or retry_scene)
+    queued = _queue(opened, redis_url, planned, retry=retry or retry_scene)
     return Submission(
         planned.scene_id,
         planned.plan,
@@ -171,7 +172,7 @@ def top_up(
         )
     with announce_work(opened.storage, scene_id, "top-up", log.warning):
         planned = opened.scene(scene_id).plan(wanted, dry_run=dry_run)
-    queued = None if dry_run else _queue(opened, redis_url, retry=retry)
+    queued = None if dry_run else _queue(opened, redis_url, planned, retry=retry)
     return TopUpSubmission(
         planned.scene_id,
         planned.plan,
@@ -190,12 +191,19 @@ def _describe_replaced(before: SceneSpec, now: SceneSpec) -> str | None:
     return ", ".join(f"{key} ({was} before, {is_} now)" for key, (was, is_) in differing(old, new).items()) or None
 
 
-def _queue(store: Store, redis_url: str | None, *, retry: bool | str) -> int | None:
-    """Queue every missing job; returns how many, None without Redis. The store notes a retry for workers without it."""
+def _queue(store: Store, redis_url: str | None, planned: PlanResult, *, retry: bool | str) -> int | None:
+    """Queue every missing job; returns how many, None without Redis. The store notes a retry for workers without it.
+
+    A QueueError says what is planned all the same.
+    """
     if retry is True:
         with store_errors("note a retry", store.storage.where):
             keep_retry(store)
-    return None if redis_url is None else queue_missing(store, redis_url, retry=retry)
+    try:
+        return None if redis_url is None else queue_missing(store, redis_url, retry=retry)
+    except QueueError as error:
+        done = f"{format_count(planned.new, 'sample')} planned, {planned.known} planned before, and not queued"
+        raise QueueError(f"{done}: {error}") from error
 
 
 def queue_missing(store: Store, redis_url: str, *, retry: bool | str = False) -> int:
@@ -209,5 +217,8 @@ def queue_missing(store: Store, redis_url: str, *, retry: bool | str = False) ->
     except OtherStoreError as error:
         raise QueueError(f"{error}. The plan is stored in {store.storage.where}") from error
     except QueueError as error:
-        how = "The plan is stored, and idle workers will find it; --no-queue submits without Redis"
+        how = (
+            "The plan is stored, and workers find it by themselves: as soon as there is a Redis, or without any by "
+            "`photonfarm work --share 0/1`; with --no-queue none is asked for"
+        )
         raise QueueError(f"{str(error).rstrip('.')}. {how}") from error

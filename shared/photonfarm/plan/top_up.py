@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from photonfarm.core.errors import SpecError
+from photonfarm.core.formatting import format_count
 from photonfarm.core.keys import KEY_BYTES, Key
 from photonfarm.core.models import Frozen, sentences
 from photonfarm.plan.hold_out import HOLD_OUT, rows_held_out
@@ -168,7 +169,9 @@ def _select(planned: PlannedViews, where: Sequence[str]) -> Mask:
             case "plan":
                 if value >= len(planned.known.plans):
                     number = len(planned.known.plans)
-                    raise SpecError(f"where plan={value}: the scene has {number} plans, numbered from 0")
+                    raise SpecError(
+                        f"where plan={value}: the scene has {format_count(number, 'plan')}, numbered from 0"
+                    )
                 first, rows = planned.known.plans[value]
                 own = rows.sample_view >= first  # samples of views that the plan itself added
                 selected &= np.isin(planned.view_row, rows.sample_view[own])

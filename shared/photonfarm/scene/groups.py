@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from photonfarm.core.formatting import format_count
 from photonfarm.core.models import Factor, Frozen, Name, Positive, Probability
 
 Vector = tuple[float, float, float]
@@ -148,7 +149,7 @@ class Light(Movable):
     def changes(self) -> str:
         """What changes of it beside its place, in words; empty where nothing does."""
         power = f"power × {self.power.min:g}…{self.power.max:g}" if self.power else ""
-        colours = f"{len(self.colour)} colours" if self.colour else ""
+        colours = format_count(len(self.colour), "colour") if self.colour else ""
         return ", ".join(filter(None, (super().changes, power, colours)))
 
     @property

@@ -206,6 +206,9 @@ def test_the_command_prints_what_when_and_what_would_be_better(
     assert second == "at most 0.1 MB before compression; 14 core-seconds: 3 s on the 4 cores here"
     assert third.startswith("suggested at this cost: half_spp = ")
     assert "% less excess error predicted for light_transport" in third
+    chosen = ["--store", str(tmp_path / "none"), "--dry-run", "--without", "object"]
+    said = CliRunner().invoke(submit, [str(spec_file(tmp_path)), *chosen]).stdout
+    assert len(said.splitlines()) == 2, "nothing is suggested for what a person chose"
     monkeypatch.setenv(DEVICE_VARIABLE, "cpu")  # which the command sets
     others = ["--workers", "6", "--device", "cuda"]
     assert "on 6 cores, a worker each" in (said := run(spec_file(tmp_path), tmp_path / "none", *others).stdout)

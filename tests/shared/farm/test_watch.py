@@ -151,7 +151,7 @@ def test_reasons_and_failures_are_told_in_words_and_equal_ones_once(
     scene: SceneStore, store: Store, common_redis: EmbeddedRedis, connection: redis.Redis
 ) -> None:
     said = status("--store", str(store.root), "--redis", common_redis.url).stdout
-    assert "8 samples wait for a worker" in said
+    assert "8 samples without a worker" in said
     reconcile(store, connection)
     name = queue_samples.failed(connection, "ValueError: 7 is odd")
     keep_failure(store, name, "ValueError: 7 is odd", worker="ada")

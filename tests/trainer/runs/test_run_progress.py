@@ -21,7 +21,7 @@ def test_phase_and_time_left_follow_the_session() -> None:
     now = [0.0]
     progress = RunProgress(100, batch=4, clock=lambda: now[0])
     now[0] = 5.0
-    assert progress.line() == "step 0/100: waits for samples for 5 s, 0 samples have arrived"
+    assert progress.line() == "step 0/100: waits for samples for 5 s, 0 samples arrived"
     progress.phase("train")
     progress.note_draws(80, 24)
     now[0] = 25.0

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.trainer import service
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, read_log, read_settings
@@ -88,6 +88,18 @@ def test_a_start_that_is_refused_leaves_no_folder(begin: Callable[..., Path], tm
     with pytest.raises(SpecError, match="width = 4 there, and 8"):
         service.run("cornell", tmp_path / "store", tmp_path / "run", "paper", changes, log=str)
     assert not (tmp_path / "run").exists()
+
+
+def test_inputs_that_the_weights_know_otherwise_are_said(begin: Callable[..., Path], tmp_path: Path) -> None:
+    changes = {**NETWORK, "start_from": str(begin("first", steps=1)), "max_seconds": 0.01}
+    for others, known in (({}, False), ({"points": 32, "least_specular": 0.04}, True)):
+        said: list[str] = []
+        with pytest.raises(IncompleteError):
+            service.run(
+                "cornell", tmp_path / "store", tmp_path / "run", "paper-dynamic", changes | others, log=said.append
+            )
+        told = any(line.endswith("points = 64, and not 32; least_specular = 0.0, and not 0.04") for line in said)
+        assert told == any("its weights know" in line for line in said) == known
 
 
 def test_a_filter_that_is_left_open_is_that_of_the_run_which_it_starts_from(begin: Callable[..., Path]) -> None:

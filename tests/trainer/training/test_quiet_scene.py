@@ -120,7 +120,7 @@ def test_training_waits_for_a_repair_and_for_what_it_set_aside_and_ends_in_the_s
     until(lambda: trainer.step > 1)
     assert f"waits for trainer of run {run}" in repair(committed, 0)
     assert trainer.said("store check --repair")
-    until(lambda: trainer.said("training waits: 4 samples were set aside; workers render them again"))
+    until(lambda: trainer.said("training waits: 4 samples set aside, for workers to render again"))
     stands = trainer.step
     time.sleep(0.5)
     assert trainer.step == stands < settings.max_steps
@@ -142,7 +142,7 @@ def test_a_run_that_is_stopped_while_it_waits_goes_on_to_the_same_weights(
         assert trainer.codes() == [0]
     repair(committed, 0)
     again = Trainer(committed, settings, run)
-    until(lambda: again.said("4 samples were set aside"))
+    until(lambda: again.said("4 samples set aside"))
     os.kill(again.processes[0].pid, signal.SIGTERM)
     assert again.codes() == [0]
     commit(committed, 0)

@@ -22,6 +22,7 @@ import torch
 from PIL import Image
 
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError, store_errors
+from photonfarm.core.formatting import format_count
 from photonfarm.core.pictures import display_values, enlarge, write_png
 from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
@@ -53,6 +54,9 @@ MADE = re.compile(
 )
 """The names of all files that `infer` may make."""
 
+FOLDERS = "frame-" + 4 * "[0-9]"
+"""The names of the folders that it makes, one for each of several configurations."""
+
 
 @dataclass(frozen=True, slots=True)
 class InferResult:
@@ -69,11 +73,11 @@ def remove_others(out: Path, made: Collection[Path]) -> None:
     Raises StoreError if that is refused.
     """
     with store_errors("remove the pictures of an earlier call", out):
-        for file in {*out.glob("*"), *out.glob("frame-*/*")} - {*made}:
+        for file in {*out.glob("*"), *out.glob(f"{FOLDERS}/*")} - {*made}:
             if MADE.fullmatch(file.name) and file.is_file():
                 file.unlink()
-        for folder in out.glob("frame-*/"):
-            if not any(folder.iterdir()):
+        for folder in out.glob(FOLDERS):
+            if folder.is_dir() and not any(folder.iterdir()):
                 folder.rmdir()
 
 
@@ -165,7 +169,9 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
 def _explain_missing(source: SceneReader, row: int) -> StoreError | IncompleteError:
     rows = max((plan["first_row"] + plan["samples"] for plan in source.plan_requests), default=0)
     if row >= rows:
-        return StoreError(f"there is no row {row}; scene {source.spec.scene_id} has {rows} rows, and the first is 0")
+        return StoreError(
+            f"there is no row {row}; scene {source.spec.scene_id} has {format_count(rows, 'row')}, and the first is 0"
+        )
     return IncompleteError(f"row {row} of scene {source.spec.scene_id} is not complete; wait for the workers")
 
 
@@ -259,7 +265,7 @@ def _show_images(images: Iterator[tuple[F32, float]], count: int, out: Path, fps
         if not np.isfinite(image).all():
             raise IncompleteError(f"{file.stem} came out non-finite; move the camera a little")
         write_png(enlarge(image), file)
-    sentence = f"{count} frames, {1e3 * statistics.median(seconds):.1f} ms each {what}"
+    sentence = f"{format_count(count, 'frame')}, {1e3 * statistics.median(seconds):.1f} ms each {what}"
     films = [out / "path.gif"]
     write_gif(files, films[0], fps)
     if find_spec(FFMPEG) is None:

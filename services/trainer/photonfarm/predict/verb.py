@@ -18,6 +18,7 @@ from photonfarm.cli.options import (
     start_options,
     store_option,
 )
+from photonfarm.core.formatting import format_count
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.trainer.cli.evaluation_verbs import device_option
 from photonfarm.trainer.cli.train_verb import run_option
@@ -122,8 +123,8 @@ def infer(
         from photonfarm.renderer.jobs.path_buffers import find_views
 
         changes = Arrangement.of(**asked.model_dump(include=set(Arrangement.model_fields)))
-        _, configuration, views = find_views(store, trained.scene_id, changes, along, row, like)
-        with tell_waiting(say, f"rendering {len(views)} frames of {trained.scene_id}"):
+        stored, configuration, views = find_views(store, trained.scene_id, changes, along, row, like)
+        with tell_waiting(say, f"rendering {format_count(len(views), 'frame')} of {stored.spec.name}"):
             opened = OpenRun(trained, store, device)
             result = shows.show_path(opened, configuration, views, out, fps=fps, amount=amount)
     elif files is not None:
@@ -132,7 +133,7 @@ def infer(
         begin, camera = find_start(store, trained.scene_id, row, like) or (None, None)
         changed, view = asked.apply(spec, begin), asked.view(spec, camera)
         shots = read_shots(spec, cameras, configurations, changed, otherwise=view)
-        with tell_waiting(say, f"rendering {len(shots)} images of {trained.scene_id}"):
+        with tell_waiting(say, f"rendering {format_count(len(shots), 'image')} of {spec.name}"):
             opened = OpenRun(trained, store, device, fov)
             load_s = time.perf_counter() - began
             made: list[Path] = []
@@ -150,8 +151,8 @@ def infer(
     else:
         require_renderer(trained)
         start = find_start(store, trained.scene_id, row, like)
-        asked.apply(trained.source(store).spec)  # a wrong name is refused before anything is loaded
-        with tell_waiting(say, f"rendering {trained.scene_id}"):
+        asked.apply(spec := trained.source(store).spec)  # a wrong name is refused before anything is loaded
+        with tell_waiting(say, f"rendering {spec.name}"):
             opened = OpenRun(trained, store, device, fov)
             load_s = time.perf_counter() - began
             result = shows.show_frame(opened, asked, start, out, amount, load_s, store_it=store_it)

@@ -95,7 +95,9 @@ def run(
         if user_code.is_own(name):
             user_code.load(key, name)  # so that a mistake is said before samples are waited for
     if settings.start_from is not None and not (folder / CHECKPOINT).exists():
-        check_same_network(Path(settings.start_from), settings)  # likewise
+        known_otherwise = check_same_network(Path(settings.start_from), settings)  # likewise
+        if known_otherwise:
+            log(known_otherwise)
     with join_ranks(settings.device, settings.batch) as ranks, stop_on_signals() as stop:
         device = ranks.device(settings.device)
         if ranks.rank:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.errors import SpecError, StoreError, store_errors
+from photonfarm.core.formatting import format_count
 from photonfarm.plan.request import UNUSED
 from photonfarm.store.format import markers
 from photonfarm.store.io.storage import put_json
@@ -85,7 +86,7 @@ def _left(stored_plans: list[StoredPlan], done: set[int]) -> str:
     """What is planned in other jobs than those that are done, in words."""
     jobs = {plan.number: set(range(plan.first_job, plan.end_job)) - done for plan in stored_plans}
     samples = {plan.number: sum(map(plan.samples_in, jobs[plan.number])) for plan in stored_plans}
-    left = ", ".join(f"{count} samples of plan {number}" for number, count in samples.items() if count)
+    left = ", ".join(f"{format_count(count, 'sample')} of plan {number}" for number, count in samples.items() if count)
     return f"not rendered yet: {left or 'none'}"
 
 

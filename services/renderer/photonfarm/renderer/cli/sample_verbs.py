@@ -19,6 +19,7 @@ from photonfarm.cli.options import (
     start_options,
     store_option,
 )
+from photonfarm.core.formatting import format_count
 from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import tell_waiting
 
@@ -89,7 +90,7 @@ def buffers(
         cloud = stored.base()[1] if stored.has_base() else None
         frames = frames_of(locate(stored.spec), configuration, views, cloud)
         frames.write(out)
-    click.echo(f"{out}: {len(frames)} frames")
+    click.echo(f"{out}: {format_count(len(frames), 'frame')}")
 
 
 @click.command("measure-frames")
@@ -161,12 +162,12 @@ def measure_frames(
     backend.load(threads=1)
     from photonfarm.renderer.tools.measure.frame_costs import write_frame_costs
 
-    with tell_waiting(partial(click.echo, err=True), f"timing {timed} frames"):
+    with tell_waiting(partial(click.echo, err=True), f"timing {format_count(timed, 'frame')}"):
         amounts = [*((k, 1) for k in kept), *((1, n) for n in halves)]
         costs = write_frame_costs(store, scene, rows, amounts, timed, points, out, seconds)
     parts = {**costs.parts(), **{f"render_s {n}/{k}": render for (k, n), render in costs.renders().items()}}
     click.echo(", ".join(f"{name} {seconds.median:.4f}" for name, seconds in parts.items()))
-    click.echo(f"{out}: {len(rows)} rows, {len(costs.edit_s)} timed frames")
+    click.echo(f"{out}: {format_count(len(rows), 'row')}, {format_count(len(costs.edit_s), 'timed frame')}")
 
 
 @click.command()

@@ -101,7 +101,9 @@ def render_job(
     scene_id = scene_named(opened, scene)
     planned = opened.scene(scene_id).jobs()
     if not 0 <= job < planned:
-        raise StoreError(f"{store}: scene {scene_id} has {planned} jobs, numbered from 0; there is no job {job}")
+        raise StoreError(
+            f"{store}: scene {scene_id} has {format_count(planned, 'job')}, numbered from 0; there is no job {job}"
+        )
     began = time.monotonic()
     rendered = jobs.ShardRenderer(opened, worker=_default_name(), load=load).render(scene_id, job)
     return rendered, time.monotonic() - began

@@ -39,7 +39,7 @@ def print_record(of: dict[str, Any]) -> None:
     if of["kind"] == "end" and of["advice"]:
         click.echo(of["advice"], err=True)
     if of["kind"] == "validation":
-        views = f"on {format_count(of['held_out'], 'view')}, {of['samples']} samples have arrived"
+        views = f"on {format_count(of['held_out'], 'view')}, {format_count(of['samples'], 'sample')} arrived"
         there = f"{views}; {_format_rounds(of)}{_format_poor(of['poor'])}"
         click.echo(
             f"step {of['step']}: held-out error {format_estimate(of['error'], of['standard_error'])} "
@@ -111,7 +111,7 @@ def show_progress() -> Iterator[OnProgress]:
             if bar is not None:
                 bars.update(bar, completed=done)
             if total and done == total and not console.is_terminal:
-                click.echo(f"{name}: {total} samples", err=True)
+                click.echo(f"{name}: {format_count(total, 'sample')}", err=True)
 
         def print_line() -> None:
             if not console.is_terminal:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from photonfarm.core.files import write_whole
+from photonfarm.core.formatting import format_count
 from photonfarm.core.processes import repeat
 from photonfarm.core.waiting import format_span
 from photonfarm.farm.training import PROGRESS, TRAINS, WAITS, count_steps
@@ -158,12 +159,12 @@ class RunProgress:
         left = "" if state["left_s"] is None else f", {format_span(state['left_s'])} left"
         since = f" for {state['phase_s']:.0f} s" if state["phase"] != TRAINS else ""
         step = count_steps(self._step, self._steps)
-        return f"step {step}: {state['phase']}{since}, {self._samples} samples have arrived{left}"
+        return f"step {step}: {state['phase']}{since}, {format_count(self._samples, 'sample')} arrived{left}"
 
     def last_line(self) -> str:
         """The state at the end of the session, in words; "" if nothing has arrived."""
         step = count_steps(self._step, self._steps)
-        return f"step {step}, {self._samples} samples have arrived" if self._samples else ""
+        return f"step {step}, {format_count(self._samples, 'sample')} arrived" if self._samples else ""
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import torch
 
 from photonfarm.core.errors import SpecError, store_errors
+from photonfarm.core.formatting import format_count
 from photonfarm.core.models import Changes
 from photonfarm.core.processes import Stop
 from photonfarm.core.statistics import group_means
@@ -262,7 +263,9 @@ class Session:
                 self._hooks.ranks.send("on")
         before, self._missing = self._missing, self._feed.missing
         if self._missing and not before:
-            self._hooks.on_wait(f"training waits: {self._missing} samples were set aside; workers render them again")
+            self._hooks.on_wait(
+                f"training waits: {format_count(self._missing, 'sample')} set aside, for workers to render again"
+            )
         return self._presence.is_there and not self._missing
 
     def _next_batch(self) -> TrainingBatch | None:

@@ -16,17 +16,35 @@ from photonfarm.trainer.training.learner import Learner
 SAME = ("architecture", "width", "descriptor", "octaves", "maxima", "emission", "demodulation")
 """The settings that say what a network's weights are, and what they are for."""
 
+OF_INPUTS = (
+    "points",
+    "occlusion",
+    "occlusion_tolerance",
+    "lit_points",
+    "filter",
+    "reflectance",
+    "least_specular",
+)
+"""The settings that say what a network's inputs are."""
+
 OF_POINTS = "descriptor"
 """The weights that belong to the points of one scene's cloud, and say nothing of those of another."""
 
 
-def check_same_network(run: Path, settings: TrainSettings) -> None:
+def check_same_network(run: Path, settings: TrainSettings) -> str:
     """Raise SpecError, with each setting that differs, if a run's weights are of another network than the settings say.
 
-    Raises StoreError if there is no such run.
+    Returns which inputs they know otherwise than they will be given them, in a sentence; "" if none. Raises StoreError
+    if there is no such run.
     """
     read_settings(run)  # which says what lacks
-    _name_differences(run, checkpoint.load(run / CHECKPOINT), settings, SAME)
+    state = checkpoint.load(run / CHECKPOINT)
+    _name_differences(run, state, settings, SAME)
+    changed = differing(state["settings"]["network"], settings.network.model_dump(mode="json"))
+    known = "; ".join(
+        f"{key} = {changed[key][0]!r}, and not {changed[key][1]!r}" for key in OF_INPUTS if key in changed
+    )
+    return known and f"start_from = {str(run)!r}: its weights know inputs with {known}"
 
 
 def _name_differences(run: Path, state: Mapping[str, Any], settings: TrainSettings, keys: Iterable[str]) -> None:

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.archives import PARTS, FrameCosts, Surface
 from photonfarm.core.errors import IncompleteError, StoreError
+from photonfarm.core.formatting import format_count
 from photonfarm.core.keys import Key, view_key
 from photonfarm.core.records import F32, BasePointCloud, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
@@ -153,7 +154,8 @@ def _check_complete(reader: SceneReader, rows: Sequence[int]) -> None:
     planned = max((plan["first_row"] + plan["samples"] for plan in reader.plan_requests), default=0)
     if max(rows) >= planned:
         raise StoreError(
-            f"there is no row {max(rows)}; scene {reader.spec.scene_id} has {planned} rows, and the first is 0"
+            f"there is no row {max(rows)}; scene {reader.spec.scene_id} has {format_count(planned, 'row')}, and the "
+            "first is 0"
         )
     if missing := sorted(set(rows) - set(reader.rows.tolist())):
         raise IncompleteError(

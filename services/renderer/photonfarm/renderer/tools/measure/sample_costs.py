@@ -15,6 +15,7 @@ import numpy as np
 
 from photonfarm.core.errors import IncompleteError, StoreError
 from photonfarm.core.files import write_whole
+from photonfarm.core.formatting import format_count
 from photonfarm.core.records import BasePointCloud
 from photonfarm.core.waiting import Log, Steps, WorkLog
 from photonfarm.plan.sample_costs import SampleCosts, relative_variance
@@ -96,7 +97,8 @@ def costs_within(scene: LoadedScene, frames: int, budget: Budget, work_log: Work
     views = Steps(WARM_UPS + frames, slow=WARM_UPS)
     within = f", in about {budget.seconds:.0f} s of processor time in all" if math.isfinite(budget.seconds) else ""
     work_log.begin(
-        f"measuring what samples of {name} cost here, in {frames} views after {WARM_UPS} that do not count{within}",
+        f"measuring what samples of {name} cost here, in {format_count(frames, 'view')} after {WARM_UPS} that do not "
+        f"count{within}",
         lambda: f"view {views.words()}",
     )
     cloud = scene.base()[1]

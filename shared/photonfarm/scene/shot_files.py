@@ -24,9 +24,6 @@ COLOURS = ("red", "green", "blue")
 DISTORTED = ("k1", "k2", "k3", "k4", "p1", "p2")
 """The coefficients of lenses, which must be 0."""
 
-FOUND = ("scene", "doubts", "seconds", "spp", "squared_error", "interval", "mean_square")
-"""What `infer` and `render` write of a configuration beside what it is."""
-
 
 def read_shots(
     spec: SceneSpec,
@@ -155,14 +152,14 @@ def read_configurations(
 
 
 def _read_list(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    """The tables of a JSON file, without what was found of them, each with where it stands."""
+    """The tables of a JSON file, each with where it stands; of what `infer` wrote, which names a scene, the shot."""
     document = _read_json(file)
     entries = document if isinstance(document, list) else [document]
     if not all(isinstance(entry, dict) for entry in entries):
         raise SpecError(f"{file}: a list of tables is required, each with place, move, without, camera or look_at")
     for number, entry in enumerate(entries, 1):
-        said = {key: value for key, value in entry.items() if key not in FOUND}
-        yield f"configuration {number} of {len(entries)}", said
+        read = {*Shot.model_fields, "fov"} if "scene" in entry else {*entry}
+        yield f"configuration {number} of {len(entries)}", {key: entry[key] for key in entry if key in read}
 
 
 def _read_json(file: Path) -> Any:

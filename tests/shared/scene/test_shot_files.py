@@ -1,6 +1,8 @@
 """Files of chosen samples: cameras of transforms.json, and configurations by the names of groups."""
 
 import json
+import re
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from click.testing import CliRunner
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.export.snapshot import camera_to_world
-from photonfarm.scene.arrangement import Arrangement
+from photonfarm.scene.arrangement import Arrangement, find_doubts
 from photonfarm.scene.camera_path import CameraPath, Cameras
 from photonfarm.scene.modification import rest
 from photonfarm.scene.shot_files import read_cameras, read_configurations, read_shots
@@ -135,6 +137,19 @@ def test_a_configuration_that_the_scene_cannot_have_is_refused(tmp_path: Path, t
     (file := tmp_path / "rooms.json").write_text(text)
     with pytest.raises(SpecError, match=says):
         read_configurations(file, SPEC)
+
+
+def test_the_table_of_the_page_is_of_the_room(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[3] / "docs/what-if.md").read_text()
+    (table,) = re.findall(r"(?:^    [-\w.]+(?:,[-\w.]*)+\n)+", page, re.MULTILINE)
+    (file := tmp_path / "rooms.csv").write_text(textwrap.dedent(table))
+    room = load_spec("room")
+    (first, none), (second, view) = read_configurations(file, room)
+    assert none is None
+    assert Arrangement.from_modification(room, first).describe() == "--place sofa=0.5,0,-1"
+    assert view is not None
+    assert Arrangement.from_modification(room, second).describe() == "--place sofa=1.2,0,0 --without lamp"
+    assert not find_doubts(room, second, view)
 
 
 @pytest.mark.parametrize(

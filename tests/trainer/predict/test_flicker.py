@@ -28,9 +28,11 @@ def test_a_still_wall_does_not_flicker_and_noise_does() -> None:
     for step in range(3):
         view, depth, still = look(spec, 0.07 * step)
         a, b = (still + rng.normal(0, noise, still.shape).astype(np.float32) for _ in "AB")
-        films.add(view, depth, {"still": [still], "noisy": [a], "halves": [a, b]})
+        lit = still + np.float32(noise * (step > 0))
+        films.add(view, depth, {"still": [still], "noisy": [a], "halves": [a, b], "lit": [lit]})
     told = films.result()
     assert told["still"] == pytest.approx(0, abs=1e-3)
+    assert told["lit"] == pytest.approx(noise / 2**0.5, rel=0.02), "from one of two frames to the next"
     assert noise < told["noisy"] < 2**0.5 * noise, "that of a pixel, and that of the mean of four before"
     assert told["halves"] < 0.2 * noise, "noise that is independent cancels"
 

@@ -17,10 +17,11 @@ from small_room import rendered, trained
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import IncompleteError, SpecError
-from photonfarm.core.pictures import display
+from photonfarm.core.pictures import display, display_values
 from photonfarm.core.statistics import block_z_test, clean_error
 from photonfarm.farm.devices import Card
 from photonfarm.predict import infer, open_run
+from photonfarm.predict.flicker import Flicker
 from photonfarm.renderer.jobs.truth import Amount
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
@@ -210,9 +211,19 @@ def test_a_film_flickers_and_a_frame_that_is_not_finite_is_refused_with_its_numb
         infer.show_path(opened, rest(opened.spec), [broken, view], tmp_path / "out")
     near = View(view.origin + np.float32(0.02), view.target)
     shown = infer.show_path(opened, rest(opened.spec), [view, near], tmp_path / "out", amount=Amount(spp=32))
-    told = dict(re.findall(r"(the network|the truth|OIDN of 16 samples) ([0-9.e-]+)", shown.sentence))
-    assert set(told) == {"the network", "the truth", "OIDN of 16 samples"}
-    assert all(0 <= float(value) < 0.5 for value in told.values())
+    found = re.findall(r"(the network|the truth|OIDN of 16 samples) ([0-9.e-]+)", shown.sentence)
+    told = {name: float(value) for name, value in found}
+    flicker = Flicker(opened.spec)
+    for seen in (view, near):
+        with torch.no_grad():
+            frame = opened.predict(rest(opened.spec), seen)
+        a, b = map(display_values, opened.truth(rest(opened.spec), seen, spp=32).halves)  # of exposure 1
+        films = {"the network": [display_values(frame.radiance.numpy())], "the truth": [a, b], "half": [a]}
+        flicker.add(seen, frame.inputs.depth[0].numpy(), films)
+    expected = flicker.result()
+    assert expected["the truth"] < 0.5 * expected["half"]
+    assert 0 < told.pop("OIDN of 16 samples") < 0.95 * expected.pop("half")
+    assert told == pytest.approx(expected, rel=0.01)
 
 
 def test_a_frame_is_asked_for_by_names_and_says_what_the_network_never_saw(store: Path, tmp_path: Path) -> None:

@@ -156,6 +156,22 @@ def test_embree_finds_the_same_surfaces_when_it_expects_changes(
         assert (first.normal != second.normal).any(axis=-1).mean() < 0.01
 
 
+def test_what_did_not_move_is_not_built_again_and_rays_meet_the_same(room: LoadedScene, somewhere: View) -> None:
+    """Bit by bit, with pieces and lights that move, are gone and come back."""
+    whole = LoadedScene.load(room.spec)
+    assert room._changing is not None
+    whole._changing = None  # Mitsuba gives Embree every shape anew
+    configurations = [sample_modification(room.spec, 6, i) for i in range(3)]
+    for i, modification in enumerate([configurations[0], rest(room.spec).without_groups(), *configurations[1:]]):
+        for loaded in (room, whole):
+            loaded.apply(modification)
+        same_image_and_buffers(room, whole, somewhere)
+        of_moved, of_all = room.photons(i), whole.photons(i)
+        assert of_moved is not None
+        assert of_all is not None
+        np.testing.assert_array_equal(of_moved.position, of_all.position)
+
+
 def test_embree_can_be_told_to_expect_changes_and_each_scene_is_told_by_itself() -> None:
     mi = backend.load(1)
     scenes = [mi.load_dict({"type": "scene", "s": {"type": "sphere", "radius": r}}, optimize=False) for r in (1.0, 2.0)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -22,6 +22,7 @@ from photonfarm.scene.spec import Film, GuideSpec, SceneSpec, Transport
 from photonfarm.scene.view import View, sample_view
 
 if TYPE_CHECKING:
+    from photonfarm.renderer.scene.native import ChangingScene
     from photonfarm.renderer.scene.surroundings import Surroundings
     from photonfarm.renderer.scene.view_rays import Take
 
@@ -74,7 +75,12 @@ class LoadedScene:
         self._group_of = {shape: i for i, group in enumerate(spec.groups) for shape in shape_ids(group)}
         shapes = scene.shapes()
         self._groups = [MovableGroup(scene, group, spec) for group in spec.groups]
-        self.boxes = boxes_of(shapes)
+        self._shapes_of: list[dict[int, Any]] = [{} for _ in spec.groups]
+        for number, shape in enumerate(shapes):
+            if shape.id() in self._group_of:
+                self._shapes_of[self._group_of[shape.id()]][number] = shape
+        self._boxes_now = self.boxes = boxes_of(shapes)
+        self._changing: ChangingScene | None = None
         self.still = np.array([shape.id() not in self._group_of for shape in shapes], np.bool_)
         # The corner that removed groups are parked in: see `editing`
         self._parking = self.boxes[self.still if self.still.any() else slice(None), 0].min(axis=0)
@@ -98,7 +104,7 @@ class LoadedScene:
 
         loaded = cls(spec, load_scene(spec, beside), **options)
         if spec.groups:
-            expect_changes(loaded.scene)
+            loaded._changing = expect_changes(loaded.scene)
         at_rest = rest(spec)
         loaded.apply(at_rest.without_groups())
         loaded.apply(at_rest)
@@ -112,23 +118,39 @@ class LoadedScene:
         before, turn, light = self._state, modification.turn, modification.light
         for group, factors in zip(self._groups, light, strict=True):
             group.check(factors)
+        moved: dict[int, Any] = {}
         for i, group in enumerate(self._groups):
             present, was_present = bool(modification.present[i]), bool(before.present[i])
             stays = np.array_equal(modification.translation[i], before.translation[i]) and turn[i] == before.turn[i]
             if present and not (was_present and stays):
                 group.move(modification.translation[i], turn[i])
+                moved |= self._shapes_of[i]
             if present and not (was_present and np.array_equal(light[i], before.light[i])):
                 group.shine(light[i])
             elif was_present and not present:
                 group.park(self._parking)
+                moved |= self._shapes_of[i]
         if not np.array_equal(modification.vector, self._state.vector):
             self.forget_path_guides()
         self._state = modification
-        if self._groups:
-            self.scene.parameters_changed([])  # Mitsuba rebuilds what depends on all shapes
-            # It gives environment lights the old bounding sphere of the scene, and directional ones none
-            for emitter in self._distant:
-                emitter.set_scene(self.scene)
+        if moved:
+            self._rebuild(moved)
+
+    def _rebuild(self, moved: Mapping[int, Any]) -> None:
+        """Have rays meet shapes, by their numbers, where they are now, and the scene know its bounding box."""
+        from photonfarm.renderer.scene.surroundings import boxes_of
+
+        boxes = self._boxes_now.copy()
+        boxes[list(moved)] = boxes_of(list(moved.values()))
+        has_same_box = np.array_equal(_around(boxes), _around(self._boxes_now))
+        self._boxes_now = boxes
+        if self._changing is not None and has_same_box:
+            self._changing.rebuild(moved)
+            return
+        self.scene.parameters_changed([])  # Mitsuba rebuilds what depends on all shapes
+        # It gives environment lights the old bounding sphere of the scene, and directional ones none
+        for emitter in self._distant:
+            emitter.set_scene(self.scene)
 
     def with_film(self, film: Film) -> Self:
         """The same scene in its present configuration, seen through another film; what edits this one edits both."""
@@ -281,6 +303,11 @@ class LoadedScene:
         cloud = cloud_of(self.scene, geometry, self.spec.points, self.spec.radiance_id)
         self.apply(before)
         return geometry, replace(cloud, pivots=self.spec.pivots)
+
+
+def _around(boxes: F32) -> F32:
+    """The box around boxes (S, 2, 3)."""
+    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
 
 def _samples_at_once(spec: SceneSpec, paths_at_once: int | None) -> int:

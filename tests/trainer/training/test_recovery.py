@@ -248,7 +248,13 @@ def test_a_loss_that_is_not_finite_costs_a_run_a_few_dozen_steps(make_source, ti
     said = "step 80: the loss is not finite; goes on from the weights of step 50, at 0.5 of the rate"
     assert said in capsys.readouterr().err.splitlines()
     (found,) = records(run, "recovered")
-    wanted = {"kind": "recovered", "cause": "loss", "errors": None, "losses": {"now": None, "usual": None}}
+    wanted = {
+        "kind": "recovered",
+        "cause": "loss",
+        "what": "loss",
+        "errors": None,
+        "losses": {"now": None, "usual": None},
+    }
     assert found == {**wanted, "recoveries": 1, "rate_factor": 0.5, "step": 80, "back_to": 50}
     rates = {record["step"]: record["rate"] for record in records(run, "train")}
     assert rates == {n: 5e-4 if n < 80 else 2.5e-4 for n in range(10, 121, 10) if n != 80}, "no loss to tell of that"

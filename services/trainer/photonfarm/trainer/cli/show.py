@@ -18,7 +18,7 @@ from photonfarm.core.processes import repeat
 from photonfarm.core.statistics import format_estimate
 from photonfarm.core.waiting import SILENCE_S, Steps
 from photonfarm.trainer.runs import progress
-from photonfarm.trainer.runs.advice import knows_noise
+from photonfarm.trainer.runs.advice import LEARNED_NOISE, knows_noise
 
 if TYPE_CHECKING:
     from photonfarm.trainer.dry_run import DryRun
@@ -76,13 +76,15 @@ def print_dry_run(estimate: DryRun, as_json: bool) -> None:
 def _format_recovery(log_record: dict[str, Any]) -> str:
     """Why a run went back, and to which step."""
     back_to = f"the weights of step {log_record['back_to']}"
-    values, what = log_record["errors"] or log_record["losses"], "held-out error" if log_record["errors"] else "loss"
+    values, what = log_record["errors"] or log_record["losses"], log_record["what"]
     now, before = (None if value is None else format_estimate(value, None) for value in values.values())
     if now is None:
         reason = f"the {what} is not finite"
     else:
         reason = f"{what} {now} ({'best so far' if log_record['errors'] else 'usually up to'} {before})"
-    if log_record["cause"] == "end":
+    if log_record["cause"] == LEARNED_NOISE:
+        reason = f"{reason}, as the network learns the noise of its samples by heart"
+    if log_record["cause"] in ("end", LEARNED_NOISE):
         return f"{reason}; ends with {back_to}"
     return f"{reason}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"
 

@@ -143,6 +143,20 @@ class BatchStream:
             self.last_step = last_step
             self._ranks.send("last", last_step)
 
+    def check_split(self) -> None:
+        """Raise SpecError, which names a share that would do, if all samples planned are on one side."""
+        if self.held_out and self.training_rows:
+            return
+        one = "configuration" if self._feed.spec.groups else "view"
+        fault = "all are held out, and none is left to train on"
+        if not self.held_out:
+            fault = "none is held out, and one is needed to validate on"
+        other = self._feed.other_hold_out()
+        remedy = f"plan more {one}s" if other is None else f"--hold-out {other:g} holds out one {one} of these"
+        raise SpecError(
+            f"hold_out = {self._settings.hold_out:g}: of the {len(self.arrived)} samples planned {fault}; {remedy}"
+        )
+
     def _count_left(self) -> int:
         """The training rows without those that are known to be skipped, as all are once each has been drawn."""
         return len(self.training_rows) - len(self._skipped)

@@ -18,6 +18,9 @@ Worth = Literal["fresh passes", "more steps", "more images", "a wider network"]
 LEAST_GAIN = 0.05
 """The share of the held-out error that twice the steps or images must take off, so that either is worth it."""
 
+LEARNED_NOISE = "learned noise"
+"""Why a run has ended that learned the noise of its samples by heart, and so got worse."""
+
 BY_HEART = -0.1
 """The share of the held-out error below which a training error says that noise was learned: above it may be chance."""
 
@@ -56,8 +59,14 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
         f"{max(gain, 0):.0%} off the held-out error"
         for name, (gain, cost) in gains.items()
     )
-    if knows_noise(training, held_out):
+    if stop := next((each for each in records if _tells_of_noise(each) and each["step"] == late[-1]["step"]), None):
         worth: Worth = "fresh passes"
+        said = (
+            "it learned the noise of its samples by heart, and ended with the weights of step "
+            f"{stop['back_to']}; with fresh passes of the same views, or more images, the same command goes on"
+        )
+    elif knows_noise(training, held_out):
+        worth = "fresh passes"
         said = "it learns the noise of its samples by heart, as its training loss is below what noise alone leaves"
     elif max(of_steps, of_images) < LEAST_GAIN:
         worth = "a wider network"
@@ -70,6 +79,10 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
 def knows_noise(training: float, held_out: float) -> bool:
     """Whether the error on training samples is so far below 0 that a network has learned their noise by heart."""
     return training < BY_HEART * abs(held_out)
+
+
+def _tells_of_noise(record: Mapping[str, Any]) -> bool:
+    return record["kind"] == "recovered" and record["cause"] == LEARNED_NOISE
 
 
 def _fit_slope(curve: Sequence[tuple[float, float]]) -> float:

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import torch
 
-from photonfarm.core.errors import SpecError, store_errors
+from photonfarm.core.errors import store_errors
 from photonfarm.core.formatting import format_count
 from photonfarm.core.models import Changes
 from photonfarm.core.processes import Stop
@@ -24,7 +24,7 @@ from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.predictors.evaluation import make_network_predictor, read_batches
 from photonfarm.trainer.predictors.half_filter import choose_filter, settle_filter
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.advice import advise
+from photonfarm.trainer.runs.advice import LEARNED_NOISE, advise
 from photonfarm.trainer.runs.devices import Ranks, usable_device
 from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used, share_waits
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, lock_run, read_log
@@ -34,7 +34,7 @@ from photonfarm.trainer.training.good_state import GoodState, Setback, settle_fi
 from photonfarm.trainer.training.learner import DivergedError, Learner, name_compile_errors
 from photonfarm.trainer.training.other_ranks import Presence
 from photonfarm.trainer.training.start_from import start_from
-from photonfarm.trainer.training.validation import Comparison, Show, Validation, compare, validate
+from photonfarm.trainer.training.validation import BestValidations, Comparison, Show, Standing, Validation, validate
 
 T = TypeVar("T")
 
@@ -47,7 +47,7 @@ class TrainingOutcome:
     """How a session of training ended."""
 
     step: int
-    reason: str  # "steps", "seconds", "rounds" or "stopped"
+    reason: str  # "steps", "seconds", "rounds", "stopped" or `LEARNED_NOISE`
     last_error: float | None  # held-out, noise removed; None if it ended before the first validation
 
 
@@ -71,7 +71,7 @@ def train(source: SceneReader, settings: TrainSettings, run: Path, hooks: Hooks 
     """Train on a source while it grows, or resume a run; everything is left in the directory `run`.
 
     Waits for the source to have a scene, and at any time for whoever takes the scene's lease. Ends at `max_steps`, at
-    `max_seconds`, or when `hooks.stop` is set; each leaves a checkpoint.
+    `max_seconds`, after its rounds, with noise learned by heart, or when `hooks.stop` is set; each leaves a checkpoint.
 
     Raises SpecError for a run of another network, scene or store, a device that is not there or a hold-out that leaves
     nothing; StoreError for a folder that cannot be written or that another trainer has; DivergedError if the losses or
@@ -112,27 +112,29 @@ class Session:
         frame = SceneFrame.of(feed.spec, *feed.base, settings.network)
         self._learner = Learner(frame, settings, hooks.ranks)
         self._good = GoodState(self._learner, settings)
-        self._best: dict[str, Any] | None = None  # the state of the run's best validation
+        self._best = BestValidations()
         self._stream = BatchStream(feed, settings, hooks.ranks)
         self._step = 0
         self._last_error: float | None = None
-        self._ended_before: str | None = None  # what ended the last session, if it had these settings
+        self._end_before: dict[str, Any] = {}  # the record of the last session's end, if it had these settings
         self._validated: int | None = None  # the step of the log's last validation
-        self._compared: Comparison | None = None  # of this session's last one, if it ended there
+        self._standing: Standing | None = None  # of this session's last one, unless the run has gone back since
         self._seconds_logged: dict[str, float] = {}  # at the last validation
 
     def run(self) -> TrainingOutcome:
-        """Train until something ends it; a run that has ended by its steps, or its rounds, stays as it is."""
+        """Train until something ends it; a run that has ended, and has nothing to go on with, stays as it is."""
         self._begin()
         self._watch.turn("other")
-        if (reason := self._ended()) in ("steps", "rounds") and reason == self._ended_before:
-            self._hooks.on_wait(f"run {self._run} has ended at step {self._step}; --steps N trains on")
+        if (reason := self._end_before.get("reason")) is not None and self._ends_again(reason):
+            goes_on = "further passes or images" if reason == LEARNED_NOISE else "--steps N"
+            self._hooks.on_wait(f"run {self._run} has ended at step {self._step} ({reason}); with {goes_on} it goes on")
             return TrainingOutcome(self._step, reason, self._last_error)
         while (reason := self._ended()) is None:
-            due = self._step % self._settings.validate_every == 0
-            if due and self._wait(self._can_validate) and self._step != self._validated:
+            due = self._step % self._settings.validate_every == 0 and self._step != self._validated
+            if due and self._wait(self._can_validate):
                 self._validate()
                 self._keep_or_go_back()
+                continue
             if (batch := self._wait(self._next_batch)) is not None:
                 self._train_step(batch)
             if self._step % self._settings.checkpoint_every == 0:
@@ -151,7 +153,7 @@ class Session:
         with store_errors("write the settings", self._run):
             (self._run / SETTINGS).write_text(self._settings.model_dump_json(indent=2) + "\n")
         kept = self._log.cut(self._step) if continues else []
-        self._ended_before = kept[-1].get("reason") if kept and not changed else None
+        self._end_before = kept[-1] if kept and kept[-1]["kind"] == "end" and not changed else {}
         self._validated = next((r["step"] for r in reversed(kept) if r["kind"] == "validation"), None)
         if changed:
             self._log.write("changes", step=self._step, changes=changed)
@@ -177,8 +179,8 @@ class Session:
         recovery = state["recovery"]
         settle_files(self._run, recovery["good"])
         self._good.restore(state, self._run)
-        if recovery["best"] and self._good.step is not None:  # without a state to go back to, a best is of no use
-            self._best = recovery["best"]
+        if self._good.step is not None:  # without a state to go back to, a best is of no use
+            self._best.restore(recovery)
         self._step, self._last_error = state["step"], state["last_error"]
         self._watch.add(state["seconds"])
         self._seconds_logged = dict(state["seconds"])
@@ -203,7 +205,7 @@ class Session:
 
     def _save(self) -> None:
         with self._watch.on("save"):
-            recovery = {**self._good.state(), "best": self._best}
+            recovery = {**self._good.state(), **self._best.state()}
             recent = self._good.recent(self._step)
             state = {**self._learner.state(), **self._state(), "recovery": recovery, "recent": recent}
             with self._good.save_with(self._run):
@@ -211,7 +213,7 @@ class Session:
 
     def _keep(self) -> None:
         """Keep this state as the good one; without one to go back to before it, it is a checkpoint of its own."""
-        recovery = {**self._good.state(), "good": None, "best": None}
+        recovery = {**self._good.state(), "good": None, "best": None, "least": None}
         self._good.keep(self._step, {**self._state(), "recovery": recovery})
 
     def _state(self) -> dict[str, Any]:
@@ -234,9 +236,17 @@ class Session:
             return "steps"
         if self._stream.last_step is not None and self._step >= self._stream.last_step:
             return "rounds"
+        if self._standing is not None and self._standing.has_learned_noise and self._stream.complete:
+            return LEARNED_NOISE
         if self._settings.max_seconds is not None and sum(self._watch.seconds.values()) >= self._settings.max_seconds:
             return "seconds"
         return None
+
+    def _ends_again(self, reason: str) -> bool:
+        """Whether what ended the last session ends this one too."""
+        if reason == LEARNED_NOISE:
+            return self._stream.complete and len(self._stream.arrived) == self._end_before["samples"]
+        return reason in ("steps", "rounds") and reason == self._ended()
 
     # -----------------------------------------------------------------------------------------------------------------
 
@@ -277,27 +287,12 @@ class Session:
     def _can_validate(self) -> bool:
         self._stream.look()
         if self._stream.complete:
-            self._check_split()
+            self._stream.check_split()
         return bool(self._stream.held_out) and (self._step > 0 or self._stream.may_draw())
-
-    def _check_split(self) -> None:
-        """Raise SpecError, which names a share that would do, if all samples planned are on one side."""
-        if self._stream.held_out and self._stream.training_rows:
-            return
-        one = "configuration" if self._feed.spec.groups else "view"
-        fault = "all are held out, and none is left to train on"
-        if not self._stream.held_out:
-            fault = "none is held out, and one is needed to validate on"
-        other = self._feed.other_hold_out()
-        remedy = f"plan more {one}s" if other is None else f"--hold-out {other:g} holds out one {one} of these"
-        raise SpecError(
-            f"hold_out = {self._settings.hold_out:g}: of the {len(self._stream.arrived)} samples planned {fault}; "
-            f"{remedy}"
-        )
 
     def _validate(self) -> None:
         """Log the held-out error of the predicting network, and compare it with the best before."""
-        self._compared = None
+        self._standing = None
         rows = self._feed.first_of_views(self._stream.held_out)[: self._settings.validation_samples]
         with self._watch.on("validate"):
             self._stream.drop()
@@ -311,8 +306,8 @@ class Session:
             self._stream.ask_again()
         self._validated = self._step
         if self._settings.recover:
-            self._compared = compare(now, self._best)
-            self._best = now.state() if self._compared.is_best else self._best
+            excess = self._learner.excess
+            self._standing = self._best.place(now, None if excess is None else float(excess))
         elif not now.is_finite:
             raise DivergedError(f"the held-out error of step {self._step} is {now.held_out.error.mean}")
         if now.is_finite:
@@ -338,14 +333,15 @@ class Session:
         self._seconds_logged = seconds
 
     def _keep_or_go_back(self) -> None:
-        """Keep the state after the last validation, or go back, in all processes."""
-        comparison = self._compared
-        if comparison is not None and comparison.is_clearly_worse:
-            reason = f"step {self._step}: {comparison.sentence}"
+        """Keep the state after the last validation, or go back, in all processes; neither if the run ends there."""
+        if self._standing is None or self._ended() == LEARNED_NOISE:
+            return
+        if (error := self._standing.error).is_clearly_worse:
+            reason = f"step {self._step}: {error.sentence}"
             self._hooks.ranks.send("back", reason)
             self._good.go_back(reason)
-            self._log_recovered("held-out error", comparison)
-        elif comparison is not None and not comparison.is_worse:
+            self._log_recovered("held-out error", error)
+        elif self._standing.is_good:
             self._hooks.ranks.send("keep", self._step)
             self._keep()
 
@@ -353,22 +349,24 @@ class Session:
         """Validate the last step, and end with the last good state if the last one is worse than allowed."""
         if self._step != self._validated:
             self._validate()
-        comparison = self._compared
-        if comparison is not None and not comparison.is_worse:
-            self._keep()
-        elif comparison is not None:
-            self._good.give(f"step {self._step}: {comparison.sentence}")
-            self._log_recovered("end", comparison)
+        if (standing := self._standing) is None:
+            return
+        if (rise := standing.rise) is not None:
+            self._good.give(f"step {self._step}: {rise.sentence}")
+            self._log_recovered(LEARNED_NOISE if standing.has_learned_noise else "end", rise)
             self._validate()
+        elif standing.is_good:
+            self._keep()
 
     def _log_recovered(self, cause: str, found: Comparison | Setback) -> None:
-        self._compared = None  # the learner has changed
+        self._standing = None  # the learner has changed
         self._log.write(
             "recovered",
             step=self._step,
             cause=cause,
             back_to=found.back_to if isinstance(found, Setback) else self._good.step,
             errors=_describe(now=found.error, best=found.best) if isinstance(found, Comparison) else None,
+            what=found.what if isinstance(found, Comparison) else "loss",
             losses=_describe(now=found.now, usual=found.usual) if isinstance(found, Setback) else None,
             recoveries=self._good.recoveries,
             rate_factor=self._learner.rate_factor,

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -15,6 +15,7 @@ from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors, Predictor, measure
+from photonfarm.trainer.runs.advice import knows_noise
 
 Show = Callable[[int, tuple[int, ...], F32, F32], None]
 """A callback with the step, rows of the store, and their targets and predictions."""
@@ -31,6 +32,7 @@ DEVIATIONS = 2.0
 Few configurations are held out while a store is young.
 """
 
+HELD_OUT, EXCESS = "held-out error", "held-out loss above that of clean images"
 ALL_LIGHT = "all light"
 UP_TO_WHITE = "means of blocks, up to white"
 
@@ -43,13 +45,20 @@ class Validation:
     rows: tuple[int, ...]  # (n,) the measured rows, in the order of `held_out.per_sample`
     held_out: HeldOutErrors
     judge: str = ALL_LIGHT  # which error is compared
-    excess: Estimate | None = None  # of the loss over that of the clean images, over batches
+    excesses: Mapping[int, float] = field(default_factory=dict)  # of each row's loss over that of its clean image; none
+    # where the loss has no known floor
 
     @property
     def errors(self) -> dict[int, float]:
         """The error of each row, by which validations are compared."""
         errors = self.held_out.shown if self.judge == UP_TO_WHITE else self.held_out.per_sample
         return dict(zip(self.rows, errors.tolist(), strict=True))
+
+    @property
+    def excess(self) -> Estimate | None:
+        """The mean of the excesses over configurations."""
+        excesses = np.array([*self.excesses.values()])
+        return Estimate.of(group_means(excesses, self.held_out.units)) if self.excesses else None
 
     @property
     def is_finite(self) -> bool:
@@ -64,6 +73,7 @@ class Validation:
             "judge": self.judge,
             "rows": torch.tensor(rows, dtype=torch.int64),
             "errors": torch.tensor(errors, dtype=torch.float64),
+            "excesses": torch.tensor([*self.excesses.values()], dtype=torch.float64),
         }
 
 
@@ -87,7 +97,7 @@ def validate(
     """
     rows: list[int] = []
     shown: list[tuple[tuple[int, ...], F32, F32]] = []
-    excesses: list[float] = []  # of each batch
+    excesses: list[float] = []
 
     def noted() -> Iterator[TrainingBatch]:
         for batch in samples:
@@ -97,7 +107,7 @@ def validate(
     def predict_and_keep(batch: TrainingBatch) -> F32:
         images = predict(batch)
         excess = measure_excess(torch.from_numpy(images).to(batch.target.device), batch)
-        excesses.extend([] if excess is None else [float(excess)])
+        excesses.extend([] if excess is None else excess.tolist())
         if show is not None and len(shown) * len(batch.rows) < SHOWN:
             shown.append((batch.rows, batch.target.mean(dim=1).cpu().numpy(), images.copy()))
         return images
@@ -108,7 +118,7 @@ def validate(
         targets, predictions = (np.concatenate(each) for each in list(zip(*shown, strict=True))[1:])
         show(step, tuple(row for each, *_ in shown for row in each), targets, predictions)
     judge = ALL_LIGHT if loss == "linear" else UP_TO_WHITE
-    return Validation(step, tuple(rows), held_out, judge, Estimate.of(np.array(excesses)) if excesses else None)
+    return Validation(step, tuple(rows), held_out, judge, dict(zip(rows, excesses, strict=True)) if excesses else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +129,7 @@ class Comparison:
     best: float  # of the best
     difference: Estimate  # this minus the best, over configurations
     is_best: bool  # this validation is the best from now on
+    what: str = HELD_OUT  # is compared
 
     @property
     def is_worse(self) -> bool:
@@ -126,33 +137,97 @@ class Comparison:
         return not self.error - self.best <= WORSE * abs(self.best)
 
     @property
-    def is_clearly_worse(self) -> bool:
-        """Whether it is worse by more than chance as well; for a single configuration, chance is not known."""
+    def is_beyond_chance(self) -> bool:
+        """Whether it is worse by more than chance, however little; for a single configuration, chance is not known."""
         deviation = self.difference.standard_error
-        by_chance = deviation is None or self.difference.mean <= DEVIATIONS * deviation
-        return not math.isfinite(self.error) or (self.is_worse and not by_chance)
+        return deviation is not None and self.difference.mean > DEVIATIONS * deviation
+
+    @property
+    def is_clearly_worse(self) -> bool:
+        """Whether it is worse by more than `WORSE` and by more than chance, or not finite."""
+        return not math.isfinite(self.error) or (self.is_worse and self.is_beyond_chance)
 
     @property
     def sentence(self) -> str:
         """Both errors in words."""
         before = f", and was {self.best:.5g} at best" if math.isfinite(self.best) else ""
-        return f"the held-out error is {self.error:.5g}{before}"
+        return f"the {self.what} is {self.error:.5g}{before}"
 
 
-def compare(now: Validation, best: Mapping[str, Any] | None) -> Comparison:
+def compare(
+    now: Validation, best: Mapping[str, Any] | None, of: Literal["errors", "excesses"] = "errors"
+) -> Comparison:
     """Compare a validation with the `state` of the best one; with itself if there is none of the same rows and error.
 
     The held-out set grows while the store does, and samples may be incomplete for a while: the mean over other rows
     would be another figure, whatever the network. Views of one configuration are averaged first, as in `measure`.
     """
-    mine = theirs = now.errors
+    mine = theirs = now.errors if of == "errors" else now.excesses
     if best is not None and best["judge"] == now.judge:
-        before_of = dict(zip(best["rows"].tolist(), best["errors"].tolist(), strict=True))
+        before_of = dict(zip(best["rows"].tolist(), best[of].tolist(), strict=True))
         theirs = mine if before_of.keys().isdisjoint(mine) else before_of
     units = [unit for row, unit in zip(now.rows, now.held_out.units, strict=True) if row in theirs]
     rows = [row for row in now.rows if row in theirs]
     ours, others = (group_means(np.array([errors[row] for row in rows]), units) for errors in (mine, theirs))
-    error, before = float(ours.mean()), float(others.mean())
+    error, before, what = float(ours.mean()), float(others.mean()), HELD_OUT if of == "errors" else EXCESS
     if not now.is_finite:
-        return Comparison(math.nan, before, Estimate(math.nan, None, len(ours)), is_best=False)
-    return Comparison(error, before, Estimate.of(ours - others), theirs is mine or error < before)
+        return Comparison(math.nan, before, Estimate(math.nan, None, len(ours)), is_best=False, what=what)
+    return Comparison(error, before, Estimate.of(ours - others), theirs is mine or error < before, what)
+
+
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """A validation beside the best ones of its run."""
+
+    error: Comparison  # by its judge, with the best
+    excess: Comparison | None  # with the least
+    is_good: bool  # its weights are worth keeping: not worse than the best, and of the least excess but for chance
+    has_learned_noise: bool  # more steps on the samples that there are make it worse
+
+    @property
+    def rise(self) -> Comparison | None:
+        """The comparison by which the run had better end with the weights that it has kept, if there is one."""
+        has_risen = self.excess is not None and self.excess.is_clearly_worse
+        return self.excess if has_risen else self.error if self.error.is_worse else None
+
+
+class BestValidations:
+    """The validations of a run that others are held against: the best one by its judge, and that of the least excess.
+
+    They may differ: the judge sees what a display shows, and the excess is in the units and weights of the loss.
+    """
+
+    def __init__(self) -> None:
+        """There is none yet."""
+        self._best: Mapping[str, Any] | None = None
+        self._least: Mapping[str, Any] | None = None
+
+    def place(self, now: Validation, training: float | None) -> Standing:
+        """Hold a validation against them, and let it be the best, or the least, from now on if it is.
+
+        With `training`, the excess on training samples, noise has been learned by heart if that is below 0 by more than
+        chance (`knows_noise`) while the held-out excess is clearly above its least. Once it is below 0, no weights are
+        good but those of the least.
+        """
+        error = compare(now, self._best)
+        self._best = now.state() if error.is_best else self._best
+        if now.excess is None or not now.is_finite:
+            return Standing(error, None, is_good=not error.is_worse, has_learned_noise=False)
+        excess = compare(now, self._least, "excesses")
+        self._least = now.state() if excess.is_best else self._least
+        knows = training is not None and knows_noise(training, now.excess.mean)
+        is_least = excess.is_best or not ((training or 0) < 0 or excess.is_beyond_chance)
+        return Standing(
+            error,
+            excess,
+            is_good=is_least and not error.is_worse,
+            has_learned_noise=knows and excess.is_clearly_worse,
+        )
+
+    def state(self) -> dict[str, Any]:
+        """Their part of a checkpoint."""
+        return {"best": self._best, "least": self._least}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        """Continue from a `state`; that of before there was a least one has none."""
+        self._best, self._least = state["best"], state.get("least")

@@ -1,7 +1,8 @@
 """The server of pages: GET and HEAD of what a table of routes has, POST of what a second one has, and nothing else.
 
 It serves one machine's user, so it listens on this machine alone unless told otherwise, and answers only to names of
-its own, so that no other site's page can ask it (by a name that leads here), and no other site's page can post to it.
+its own, so that no other site's page can ask it by a name that leads here. Another site may link to its first page;
+what else a browser says that another site's page asks for is refused, and so is what such a page posts.
 The farm's pages and the metrics have no second table.
 """
 
@@ -113,6 +114,10 @@ class NotThereError(LookupError):
     """There is no such sample or picture."""
 
 
+class WrongRequestError(ValueError):
+    """What a path asks for is impossible."""
+
+
 class _Handler(BaseHTTPRequestHandler):
     server: PageServer
     protocol_version = "HTTP/1.1"
@@ -147,6 +152,9 @@ class _Handler(BaseHTTPRequestHandler):
             path = urlsplit(self.path).path
         except ValueError:
             path = ""
+        if path != "/" and self.headers.get("Sec-Fetch-Site", "none") not in ("same-origin", "none"):
+            self._refuse(HTTPStatus.FORBIDDEN, "only a page of this server may ask for that")
+            return
         for pattern, stays, make in routes:
             if match := pattern.fullmatch(path):
                 self._answer(make, match.groups(), stays)
@@ -158,6 +166,8 @@ class _Handler(BaseHTTPRequestHandler):
             kind, content = make(*groups)
         except (NotThereError, IndexError) as error:
             self._refuse(HTTPStatus.NOT_FOUND, str(error))
+        except WrongRequestError as error:
+            self._refuse(HTTPStatus.BAD_REQUEST, str(error))
         except (PhotonfarmError, OSError) as error:
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
         except Exception:

@@ -52,19 +52,18 @@ def serving(shown: Live) -> Iterator[str]:
 
 
 def ask(
-    address: str, kind: str, state: dict[str, Any] | None = None, method: str = "GET", origin: str = ""
+    address: str, kind: str, state: dict[str, Any] | None = None, method: str = "GET", origin: str = "", site: str = ""
 ) -> dict[str, Any]:
-    """What the server tells of a state, also where it refuses."""
+    """What the server tells of a state; where it refuses, with the `status`."""
     path = "" if state is None else "/" + base64.urlsafe_b64encode(json.dumps(state).encode()).decode().rstrip("=")
-    asked = urllib.request.Request(
-        f"{address}{kind}{path}", method=method, headers={"Origin": (origin or address).rstrip("/")}
-    )
+    headers = {"Origin": (origin or address).rstrip("/")} | ({"Sec-Fetch-Site": site} if site else {})
+    asked = urllib.request.Request(f"{address}{kind}{path}", method=method, headers=headers)
     try:
         with urllib.request.urlopen(asked) as answer:
             return json.load(answer)
     except urllib.error.HTTPError as refused:
         with refused:
-            return json.load(refused)
+            return json.load(refused) | {"status": refused.code}
 
 
 def read_picture(told: dict[str, Any]) -> np.ndarray:
@@ -101,10 +100,22 @@ def test_pictures_follow_the_state_and_the_truth_goes_on_from_one_request_to_the
 
 
 def test_what_is_wrong_is_said_and_nothing_can_be_written(address: str) -> None:
-    assert "'sofaa'" in ask(address, "frame", {**AT_REST, "without": ["sofaa"]})["error"]
-    assert "no configuration" in ask(address, "frame/AAAA")["error"]
-    assert "view: unknown key" in ask(address, "frame", {**AT_REST, "view": 1})["error"]
+    wrong = ask(address, "frame", {**AT_REST, "without": ["sofaa"]})
+    assert "'sofaa'" in wrong["error"]
+    others = [("frame/AAAA", None), ("truth", {**AT_REST, "view": 1}), ("full", {**AT_REST, "turn": {"sofa": 30}})]
+    assert [each["status"] for each in (wrong, *(ask(address, *other) for other in others))] == [400] * 4
     assert "no way to write" in ask(address, "submit", AT_REST, method="POST")["error"]
+
+
+def test_what_another_site_s_page_asks_for_is_not_rendered(shown: Live, address: str) -> None:
+    state = {**AT_REST, "camera": [-1.2, 1.5, 0.2]}
+    for site in ("cross-site", "same-site"):  # the latter: another server of this machine
+        assert ask(address, "truth", state, site=site)["status"] == 403
+    assert state not in [json.loads(base64.urlsafe_b64decode(key + "==")) for key in shown._judged]
+    assert "picture" in ask(address, "truth", state, site="same-origin")
+    link = urllib.request.Request(address, headers={"Sec-Fetch-Site": "cross-site"})
+    with urllib.request.urlopen(link) as page:
+        assert page.status == 200
 
 
 def test_what_is_shown_is_planned_where_that_is_allowed_and_a_page_of_the_server_asks(shown: Live) -> None:

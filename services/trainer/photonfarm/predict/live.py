@@ -29,7 +29,7 @@ from photonfarm.scene.arrangement import Shot, describe_shot
 from photonfarm.scene.groups import Light, Movable
 from photonfarm.scene.spec import Film
 from photonfarm.web.images import encode
-from photonfarm.web.server import JSON, KINDS, PNG, Answer, NotThereError, Routes
+from photonfarm.web.server import JSON, KINDS, PNG, Answer, NotThereError, Routes, WrongRequestError
 from photonfarm.web.server import STATIC as FARM_PAGES
 
 PAGES = Path(__file__).parent / "static"
@@ -111,7 +111,10 @@ class Live:
 
     def _answer(self, make: Callable[..., dict[str, Any]]) -> Callable[..., Answer]:
         def answer(*asked: str) -> Answer:
-            told = self._thread.submit(make, *asked).result()
+            try:
+                told = self._thread.submit(make, *asked).result()
+            except SpecError as error:
+                raise WrongRequestError(str(error)) from error
             return JSON, json.dumps(told, allow_nan=False).encode()
 
         return answer
@@ -219,7 +222,7 @@ def _read(asked: str) -> dict[str, Any]:
     try:
         document = dict(json.loads(base64.urlsafe_b64decode(asked + "=" * (-len(asked) % 4))))
         return Shot.of(**document).model_dump()
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise SpecError(f"the path says no configuration and camera: {error}") from error
 
 

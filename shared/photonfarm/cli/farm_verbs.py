@@ -115,14 +115,15 @@ def submit(
     from photonfarm.farm import submission
     from photonfarm.farm.devices import AUTO, DEVICE_VARIABLE, is_card_wanted
     from photonfarm.farm.hold_out_checks import find_hold_out_warning
+    from photonfarm.farm.renderer_verbs import collect_doubts
     from photonfarm.plan.chosen import Chosen
-    from photonfarm.scene.arrangement import Shot, find_doubts
+    from photonfarm.scene.arrangement import Shot
     from photonfarm.scene.plausibility import warnings
     from photonfarm.scene.shot_files import read_shots
     from photonfarm.scene.spec_loading import NamedSpec
     from photonfarm.store.read.find import find_start
 
-    named = NamedSpec.load(spec)
+    named, log = NamedSpec.load(spec), partial(click.echo, err=True)
     wanted: Request | Chosen = request
     if (row, like, asked, cameras, configurations) == (None, None, Shot(), None, None):
         doubts = [*filter(None, [find_hold_out_warning(named.spec, store, request)])]
@@ -137,9 +138,7 @@ def submit(
         else:
             _refuse_given("is of random samples; one view of one configuration is asked for", *RANDOM)
             chosen = [(modification, asked.view(named.spec, start[1]))]
-        doubts = [*dict.fromkeys(doubt for each in chosen for doubt in find_doubts(named.spec, *each))]
-        if len(doubts) > MOST_DOUBTS:
-            doubts[MOST_DOUBTS:] = [f"and {len(doubts) - MOST_DOUBTS} more like these"]
+        doubts = collect_doubts(named, chosen, log)
         wanted = Chosen.of_all(named.spec, chosen, request.passes)
     for warning in (*warnings(named), *doubts):
         click.echo(f"warning: {warning}", err=True)
@@ -147,7 +146,6 @@ def submit(
     on_card = is_card_wanted(os.environ.get(DEVICE_VARIABLE) or AUTO)
     how: dict[str, Any] = {"shard_rows": shard_rows, "on_card": on_card}
     if dry_run:
-        log = partial(click.echo, err=True)
         result = dry.rehearse(named, store, wanted, measure=not no_measure, log=log, workers=workers, **how)
     else:
         url = None if no_queue else redis_url
@@ -162,10 +160,6 @@ def submit(
             **how,
         )
     show.print_submission(result, as_json)
-
-
-MOST_DOUBTS = 8
-"""The most doubts about chosen samples that are said."""
 
 
 RANDOM = ("modifications", "views", "seed")

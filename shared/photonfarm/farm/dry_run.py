@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from photonfarm.core.errors import BackendError, StoreError
-from photonfarm.core.processes import can_render, command, usable_cores
+from photonfarm.core.errors import BackendError
+from photonfarm.core.processes import usable_cores
+from photonfarm.farm.renderer_verbs import measure_costs
 from photonfarm.farm.submission import Submission, estimate_sample_seconds
 from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import SHARD_ROWS, Extent, Request
@@ -18,8 +18,6 @@ from photonfarm.store import Store
 from photonfarm.store.format.schema import bytes_of_rows
 from photonfarm.store.io.storage import is_vacant
 from photonfarm.store.model.plans import expand_request
-
-VERB = ("scene", "cost")  # of the renderer
 
 LEAST_S, MOST_S, SHARE_S = 20.0, 120.0, 0.1
 """The processor seconds that measuring may take: a tenth of one for each sample that would be planned, about a tenth of
@@ -92,7 +90,7 @@ def rehearse(
     if not (measure and new):
         return counted
     try:
-        costs = costs_by_renderer(named.name, min(max(SHARE_S * new, LEAST_S), MOST_S))
+        costs = measure_costs(named.name, min(max(SHARE_S * new, LEAST_S), MOST_S))
     except BackendError as error:
         log(f"cost and time are not known: {error}")
         return counted
@@ -110,22 +108,3 @@ def rehearse(
     modifications, views = (None, None) if static else (better.modifications, better.views)
     suggestion = Suggestion(better.spp // 2, modifications, views, better.samples)
     return replace(counted, reduction=reduction, suggestion=suggestion)
-
-
-def costs_by_renderer(spec: str, seconds: float) -> SampleCosts:
-    """The costs that the renderer measures for a spec in so much processor time, or has kept; it talks to stderr.
-
-    Raises BackendError with the reason for none.
-    """
-    name = " ".join(VERB)
-    if not can_render():
-        raise BackendError("the renderer, which measures them, is not installed here: pip install 'photonfarm[render]'")
-    done = subprocess.run(
-        command(*VERB, "--json", "--seconds", f"{seconds:g}", "--", spec), stdout=subprocess.PIPE, check=False
-    )
-    if done.returncode:
-        raise BackendError(f"`photonfarm {name}` ended with exit code {done.returncode} here")
-    try:
-        return SampleCosts.read(done.stdout)
-    except StoreError as error:
-        raise BackendError(f"`photonfarm {name}` said {error}") from error

@@ -10,6 +10,7 @@ import pytest
 from click.testing import CliRunner
 
 from photonfarm.cli.main import umbrella
+from photonfarm.farm import renderer_verbs
 from photonfarm.plan.request import PlannedContent, Request, expand
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.tools.check import samples
@@ -169,6 +170,30 @@ def test_a_spec_that_cannot_be_used_has_the_exit_code_of_a_wrong_spec(write: Wri
     told = CliRunner().invoke(umbrella, ["scene", "check", str(spec), "--out", str(spec.with_name("no.html"))])
     assert told.exception.exit_code == 3  # type: ignore[union-attr]
     assert not spec.with_name("no.html").exists()
+
+
+def test_what_files_say_is_looked_at_alone_and_submit_says_the_same_before_it_plans(
+    write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    spec, wall = str(write()), "block reaches beyond all that never moves"
+    (rooms := tmp_path / "rooms.csv").write_text("block.x,camera.x,camera.y,camera.z\n2,1.5,1.5,0\n,0,0.4,0\n")
+    from_file = ["--configurations", str(rooms)]
+    told = CliRunner().invoke(umbrella, ["scene", "check", spec, *from_file, "--json"])
+    expected = [
+        "block stands at 2,0,0, outside its box from -1.2,0,-1.2 to 1.2,0,1.2",
+        wall,
+        "the camera stands at 0,0.4,0, outside the spec's box from -1.8,1.2,-1.8 to 1.8,2,1.8",
+        "the camera is inside 'block'",
+    ]
+    assert json.loads(told.stdout) == expected
+    assert not list(tmp_path.glob("*.html"))
+    planned = CliRunner().invoke(umbrella, ["submit", spec, *from_file, "--store", str(tmp_path / "s"), "--no-queue"])
+    assert "2 samples planned" in planned.stdout
+    assert {f"warning: {doubt}" for doubt in expected} <= {*planned.stderr.splitlines()}
+    assert "looking at what stands where in small" in capfd.readouterr().err
+    monkeypatch.setattr(renderer_verbs, "can_render", lambda: False)
+    lacking = CliRunner().invoke(umbrella, ["submit", spec, *from_file, "--store", str(tmp_path / "t"), "--no-queue"])
+    assert "is not known: the renderer is not installed here" in lacking.stderr
 
 
 def shapes_of(name: str | Path) -> list[dict[str, Any]]:

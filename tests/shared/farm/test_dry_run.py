@@ -15,7 +15,7 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.farm_verbs import submit
 from photonfarm.cli.show import bytes_per_sample
-from photonfarm.farm import dry_run
+from photonfarm.farm import dry_run, renderer_verbs
 from photonfarm.farm.devices import DEVICE_VARIABLE
 from photonfarm.farm.dry_run import DryRun, rehearse
 from photonfarm.plan.request import Extent, Request
@@ -47,7 +47,7 @@ def verb(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Verb:
         script.write_text(f'#!/bin/sh\necho "$@" > "{asked}"\ncat "{tmp_path}/says"\nexit {code}\n')
         script.chmod(script.stat().st_mode | stat.S_IXUSR)
         monkeypatch.setattr(sys, "executable", str(script))
-        monkeypatch.setattr(dry_run, "can_render", lambda: True)
+        monkeypatch.setattr(renderer_verbs, "can_render", lambda: True)
         monkeypatch.setattr(dry_run, "usable_cores", lambda: 4)
         return asked
 
@@ -166,11 +166,11 @@ def test_of_a_static_scene_only_samples_per_pixel_are_suggested_and_its_configur
 
 
 def test_without_the_renderer_the_size_is_said_all_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(dry_run, "can_render", lambda: False)
+    monkeypatch.setattr(renderer_verbs, "can_render", lambda: False)
     result = run(spec_file(tmp_path), tmp_path / "none", "--modifications", "1", "--views", "12")
     assert result.exit_code == 0
     assert "12 samples would be planned, 0 are already\nat most 0.1 MB before compression\n" in result.stdout
-    reason = "the renderer, which measures them, is not installed here: pip install 'photonfarm[render]'"
+    reason = "the renderer is not installed here: pip install 'photonfarm[render]'"
     warning, told = result.stderr.splitlines()
     assert warning.startswith("warning: `photonfarm train` will refuse this: ")
     assert told == f"cost and time are not known: {reason}"

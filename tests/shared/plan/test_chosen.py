@@ -9,6 +9,7 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
+from photonfarm.farm import renderer_verbs
 from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import UNUSED, Request
 from photonfarm.scene.arrangement import Shot
@@ -18,6 +19,12 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import sample_view
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.model.plans import expand_request
+
+
+@pytest.fixture(autouse=True)
+def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing looks closer: the renderer's own tests do."""
+    monkeypatch.setattr(renderer_verbs, "can_render", lambda: False)
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,7 @@ from click.testing import CliRunner
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.export.snapshot import camera_to_world
+from photonfarm.farm import renderer_verbs
 from photonfarm.scene.arrangement import Arrangement, find_doubts
 from photonfarm.scene.camera_path import CameraPath, Cameras
 from photonfarm.scene.modification import rest
@@ -25,6 +26,12 @@ from photonfarm.store import Store
 
 SPEC = samples.small_spec()
 VIEW = View(np.float32([1, 1, 1]), np.float32([0, 0.5, 0]))
+
+
+@pytest.fixture(autouse=True)
+def without_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing looks closer: the renderer's own tests do."""
+    monkeypatch.setattr(renderer_verbs, "can_render", lambda: False)
 
 
 def views(count: int, spec: SceneSpec = SPEC) -> list[View]:

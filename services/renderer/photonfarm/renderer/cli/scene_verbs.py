@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from photonfarm.cli.options import device_option, json_option
+from photonfarm.cli.options import device_option, json_option, shot_file_options
 from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import WorkLog, tell_waiting
 
@@ -70,14 +70,18 @@ def scene_import(path: Path, out: Path | None, up: str | None, accept: tuple[str
 @click.option(
     "--out", type=click.Path(path_type=Path, dir_okay=False), default="check.html", show_default=True, help="The page."
 )
+@shot_file_options
 @device_option
 @json_option
 @end_on_ctrl_c()
-def scene_check(spec: str, out: Path, as_json: bool) -> None:
+def scene_check(spec: str, out: Path, cameras: Path | None, configurations: Path | None, as_json: bool) -> None:
     """Look at SPEC and its scene, and say what cannot be right: a page (HTML), and each finding with its line.
 
     The page shows plan and elevation, sixteen random configurations, every shape, and what cameras see. Nothing is
     written to a store. The exit code is 0 whatever is found, as long as the spec can be used.
+
+    With --cameras or --configurations only what these files say is looked at, and no page is made: what is outside its
+    box, in a wall, or otherwise as no random sample shows it.
     """
     if out.suffix not in (".html", ".htm"):
         raise click.BadParameter(f"{str(out)!r}: it is a page; name it like check.html", param_hint="--out")
@@ -85,11 +89,21 @@ def scene_check(spec: str, out: Path, as_json: bool) -> None:
     from photonfarm.renderer.scene import backend
     from photonfarm.scene.spec_loading import NamedSpec, SpecLines
 
-    named = NamedSpec.load(spec)
+    named, say = NamedSpec.load(spec), partial(click.echo, err=True)
+    if cameras or configurations:
+        from photonfarm.scene.shot_files import read_shots
+
+        shots = read_shots(named.spec, cameras, configurations)
+        backend.load(threads=1)
+        from photonfarm.renderer.tools.check.scene_check import doubt_shots
+
+        doubts = doubt_shots(named, shots, say)
+        click.echo(json.dumps(doubts, indent=1) if as_json else "\n".join(doubts or ["nothing is doubtful"]))
+        return
     backend.load()
     from photonfarm.renderer.tools.check.scene_check import check, write
 
-    made, lines = check(named, partial(click.echo, err=True)), SpecLines.of(named.file)
+    made, lines = check(named, say), SpecLines.of(named.file)
     write(made, lines, out)
     if as_json:
         show.print_json([finding.document(lines) for finding in made.findings])

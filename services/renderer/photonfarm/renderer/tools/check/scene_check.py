@@ -6,6 +6,7 @@ What was found is a page (HTML), one file that needs no other.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from photonfarm.core.pictures import Picture
 from photonfarm.core.records import F32, Geometry
 from photonfarm.core.waiting import Log, WorkLog
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.renderer.scene.surroundings import look_closer
 from photonfarm.renderer.tools.check import samples, shape_pictures
 from photonfarm.renderer.tools.check.findings import (
     CUT_AT_ALL,
@@ -30,8 +32,11 @@ from photonfarm.renderer.tools.check.shape_pictures import Projection, draw_scen
 from photonfarm.renderer.tools.check.shapes import ShapeFacts, facts_of, groups_by_shape, placements
 from photonfarm.renderer.tools.measure.exposure import TARGET
 from photonfarm.renderer.tools.plan_view import PlanView, Standing, hue
+from photonfarm.scene.arrangement import find_doubts
+from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec, SpecLines
+from photonfarm.scene.view import View
 
 TEMPLATE = Path(__file__).parents[1] / "check.html.j2"
 
@@ -79,6 +84,19 @@ def _check(named: NamedSpec, work: WorkLog) -> SceneCheck:
     measured = Measured(scene.boxes[:, 0].min(axis=0), scene.boxes[:, 1].max(axis=0), placed, rendered)
     findings = collect_findings(spec, named.lights, measured)
     return SceneCheck(spec, shapes, pictures, measured, drawn, findings, time.monotonic() - begun)
+
+
+def doubt_shots(named: NamedSpec, shots: Iterable[tuple[Modification, View]], log: Log) -> list[str]:
+    """What is doubtful of configurations and views, each as a sentence; the backend must have been loaded."""
+    found: dict[str, None] = {}
+    with WorkLog(log) as work:
+        work.begin(f"looking at what stands where in {named.spec.name}")
+        scene = LoadedScene.load(named.spec, named.file.parent)
+        for modification, view in shots:
+            scene.apply(modification)
+            doubts = [*find_doubts(named.spec, modification, view), *look_closer(scene, modification, view)]
+            found |= dict.fromkeys(doubts)
+    return [*found]
 
 
 def _draw_plan(

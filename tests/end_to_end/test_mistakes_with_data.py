@@ -141,6 +141,7 @@ DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
         (lambda f: flip(shard(f, "albedo")), "preview den.toml", 4, ["/albedo/c.", "store check --repair"]),
         (lambda f: cut(shard(f, "sample_key")), "status", 4, ["sample_key", "store check --repair"]),
         (NOTHING, "infer --row 0 --store other", 4, ["other: holds no scene", "it holds cornell"]),
+        (NOTHING, "infer --modification 0,1,0", 2, ["'--modification'; --place does"]),
         (NOTHING, "infer --without piano", 3, ["'piano' is no movable group of den; nearest: mirror"]),
         (NOTHING, "infer --orbit 3 --camera 0,1,0", 2, ["--orbit and --camera exclude each other"]),
         (NOTHING, "infer --row 999", 4, ["there is no row 999"]),

@@ -155,6 +155,9 @@ def _commands(group: click.Group, prefix: str) -> Iterator[tuple[str, click.Comm
                 yield from _commands(command, f"{prefix}{name}.")
 
 
+FORMERLY = {"--sample": "--row", "--modification": "--place", "--view": "--camera"}
+"""What options are called now."""
+
 STOPPED = 130
 """The exit code after Ctrl-C, as shells give it."""
 
@@ -207,6 +210,11 @@ def main(args: list[str] | None = None) -> None:
     try:
         sys.exit(umbrella.main(args, prog_name="photonfarm", standalone_mode=False) or 0)
     except click.ClickException as error:
+        if isinstance(error, click.NoSuchOption) and error.ctx is not None:
+            now = FORMERLY.get(error.option_name)
+            if now and any(now in each.opts for each in error.ctx.command.params):
+                said = f"No such option {error.option_name!r}; {now} does what it did."
+                error = click.NoSuchOption(error.option_name, said, ctx=error.ctx)
         error.show()
         sys.exit(error.exit_code)
     except click.Abort:

@@ -81,6 +81,8 @@ def test_pictures_follow_the_state_and_the_truth_goes_on_from_one_request_to_the
     assert pictures[0].shape == (16, 24, 3)
     assert not np.array_equal(pictures[0], pictures[1])
     assert np.array_equal(pictures[0], pictures[2])
+    beyond = {**AT_REST, "place": {"sofa": [0.9, 0, 3]}}
+    assert [len(ask(address, kind, beyond)["warnings"]) for kind in ("frame", "full")] == [1, 2], "at rest also by rays"
     first, second = ask(address, "truth", AT_REST), ask(address, "truth", moved)
     spp = first["spp"]
     for _ in range(20):

@@ -150,7 +150,7 @@ class Live:
     # -------------------------------------------------------------------------------------------------- the pictures
 
     def frame(self, asked: str, *, full: bool) -> dict[str, Any]:
-        """The network's picture: in motion as large as is fluent, else of the spec's size."""
+        """The network's picture: in motion as large as is fluent, else of the spec's size, and looked at closely."""
         began, film = time.perf_counter(), self.run.spec.film if full else self.speed.film()
         frame = self._predict(asked, film)
         radiance = frame.radiance.numpy(force=True)  # waits for a card
@@ -160,8 +160,7 @@ class Live:
         return {
             "picture": self._draw(radiance),
             "ms": 1e3 * seconds,
-            "full": film == self.run.spec.film,
-            "warnings": frame.doubts,
+            "warnings": [*frame.doubts, *(self.run.look_closer(frame.configuration, frame.view) if full else ())],
         }
 
     @torch.no_grad()

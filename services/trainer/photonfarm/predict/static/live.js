@@ -87,7 +87,7 @@ class Live {
     this.dirty = false;
     const began = performance.now(), asked = this.state();
     const told = await ask(`${isFull ? "full" : "frame"}/${this.address(asked)}`);
-    Object.assign(this, { isFull: isFull || told.full, isDone: false });
+    Object.assign(this, { isFull, isDone: false });
     const image = await paint($("network"), told.picture);
     this.seconds = [...this.seconds.slice(-9), performance.now() - began];
     const mean = this.seconds.reduce((sum, value) => sum + value) / this.seconds.length;

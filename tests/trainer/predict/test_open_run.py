@@ -224,6 +224,9 @@ def test_a_film_flickers_and_a_frame_that_is_not_finite_is_refused_with_its_numb
     assert expected["the truth"] < 0.5 * expected["half"]
     assert 0 < told.pop("OIDN of 16 samples") < 0.95 * expected.pop("half")
     assert told == pytest.approx(expected, rel=0.01)
+    away = View(view.origin, 2 * view.origin - view.target)
+    shown = infer.show_path(opened, rest(opened.spec), [view, away], tmp_path / "out")
+    assert shown.sentence.endswith("flicker: no surface stays in view")
 
 
 def test_a_frame_is_asked_for_by_names_and_says_what_the_network_never_saw(store: Path, tmp_path: Path) -> None:

@@ -220,12 +220,14 @@ def show_path(
         images = _follow(opened, modification, views, flicker, amount)
         shown = _show_images(images, len(views), out, fps, "for what the network reads and the network")
     changed = ", ".join(f"{name} {value:.3g}" for name, value in flicker.result().items())
-    stands = Arrangement.from_modification(opened.spec, modification).describe() or "at rest"
-    sentence = (
-        f"{stands}: {shown.sentence}\nflicker, the root mean square change of surfaces that stay in view: {changed}"
+    told = (
+        f"the root mean square change of surfaces that stay in view: {changed}"
+        if changed
+        else "no surface stays in view"
     )
+    stands = Arrangement.from_modification(opened.spec, modification).describe() or "at rest"
     doubts = never_seen(find_doubts(opened.spec, modification))
-    return InferResult(shown.files, sentence if changed else f"{stands}: {shown.sentence}", doubts)
+    return InferResult(shown.files, f"{stands}: {shown.sentence}\nflicker: {told}", doubts)
 
 
 def _follow(

@@ -10,10 +10,12 @@ from click.testing import CliRunner, Result
 
 from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError, StoreError
+from photonfarm.core.keys import make_key
 from photonfarm.core.statistics import block_z_test
 from photonfarm.plan.request import Request
+from photonfarm.renderer.jobs import truth
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.renderer.jobs.truth import Amount, render_asked
+from photonfarm.renderer.jobs.truth import Amount, render_asked, render_truth
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import look_closer
 from photonfarm.scene.arrangement import Shot
@@ -22,11 +24,34 @@ from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, Store
 
 
-def test_amounts_are_samples_or_seconds() -> None:
-    assert [Amount.parse(text) for text in ("256", "20s", ".5s")] == [Amount(256), Amount(None, 20), Amount(None, 0.5)]
-    for text in ("0", "-1", "s", "0s", "1e3", "20 s", "2m", "inf"):
+def test_amounts_are_samples_or_seconds_or_an_error() -> None:
+    amounts = [Amount(256), Amount(seconds=20), Amount(seconds=0.5), Amount(error=0.02)]
+    assert [Amount.parse(text) for text in ("256", "20s", ".5s", "2%")] == amounts
+    for text in ("0", "-1", "s", "0s", "0%", "1e3", "20 s", "2m", "inf"):
         with pytest.raises(SpecError, match="samples per pixel"):
             Amount.parse(text)
+    for wrong in ({}, {"spp": 2, "error": 0.1}, {"error": float("nan")}, {"error": -1}, {"spp": 0}):
+        with pytest.raises(SpecError, match="one of spp, seconds and error"):
+            Amount(**wrong)
+
+
+def test_a_truth_ends_where_its_own_error_is_small_enough_or_its_samples_are_many(
+    room: LoadedScene, somewhere: View, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    room.apply(Shot().apply(room.spec))
+    key = make_key("error", room.spec.name)
+    good = render_truth(room, key, somewhere, Amount(spp=768))
+    fewer = 0
+    for error in (0.1, 0.002):
+        found = render_truth(room, key + b"other", somewhere, Amount(error=error))
+        assert found.own_error() <= error * found.power()
+        assert fewer < found.spp < good.spp
+        fewer = found.spp
+        # what it says of itself is what it is off by
+        off = np.mean((found.radiance - good.radiance) ** 2) * room.spec.exposure**2 - good.own_error()
+        assert off == pytest.approx(found.own_error(), rel=0.5)
+    monkeypatch.setattr(truth, "MOST_SPP", 128)
+    assert render_truth(room, key, somewhere, Amount(error=1e-9)).spp == 128
 
 
 def test_what_stands_in_a_wall_or_beyond_and_a_camera_inside_of_something_are_said(

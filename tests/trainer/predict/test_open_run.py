@@ -248,7 +248,7 @@ def test_a_frame_is_asked_for_by_names_and_says_what_the_network_never_saw(store
     assert ["sofa stands at 0.9,0,3, outside its box" in doubt for doubt in other.doubts] == [True]
     (closer,) = opened.look_closer(**asked | {"place": {"sofa": (0.9, 0, 3)}})
     assert closer.startswith("sofa reaches beyond all that never moves")
-    with pytest.raises(SpecError, match="one of spp and seconds"):
+    with pytest.raises(SpecError, match="one of spp, seconds and error"):
         opened.truth(**asked)
 
 

@@ -11,7 +11,7 @@ import statistics
 import subprocess
 import time
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -118,14 +118,15 @@ def show_frame(
     said = [describe_shot(*shot)]
     truth = None
     if amount is not None:
-        truth = opened.truth(frame.configuration, frame.view, spp=amount.spp, seconds=amount.seconds)
+        truth = opened.truth(frame.configuration, frame.view, **asdict(amount))
         error, power, seconds["truth"] = truth.error(image), truth.power(), truth.seconds
         about |= {"spp": truth.spp, "squared_error": error.mean, "interval": error.interval, "mean_square": power}
+        about["truth_error"] = truth.own_error()
         low, high = error.interval or (error.mean, error.mean)
         share = f"{100 * error.mean / power:.2g} % of the image's mean square" if power > 0 else "of a black image"
         said.append(
             f"squared error {error.mean:.5f}, with probability 0.95 from {low:.5f} to {high:.5f}: {share}; truth of "
-            f"{truth.spp} samples per pixel"
+            f"{truth.spp} samples per pixel, with an error of {about['truth_error']:.2g} of its own"
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
     if store_it:
@@ -243,7 +244,7 @@ def _follow(
         yield image, time.perf_counter() - began
         films = {"the network": [image]}
         if amount is not None:
-            truth = opened.truth(modification, view, spp=amount.spp, seconds=amount.seconds)
+            truth = opened.truth(modification, view, **asdict(amount))
             halves = truth.halves * np.float32(exposure)
             films["the truth"] = [*halves]
             if denoise is not None:

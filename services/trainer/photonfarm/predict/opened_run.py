@@ -161,15 +161,18 @@ class OpenRun:
         *,
         spp: int | None = None,
         seconds: float | None = None,
+        error: float | None = None,
         **asked: Any,
     ) -> Truth:
-        """The image of the same by `bdpt`, with so many samples per pixel or for so many seconds; else as `predict`."""
+        """The image of the same by `bdpt`, with so many samples per pixel, for so many seconds, or so small an error.
+
+        That is the image's own mean squared error as a share of its mean square. Else as `predict`.
+        """
         from photonfarm.renderer.jobs.truth import Amount, render_truth
 
-        if (spp is None) == (seconds is None):
-            raise SpecError("truth: one of spp and seconds is required")
+        amount = Amount(spp, seconds, error)
         _, view = self.stage(configuration, view, **asked)
-        return render_truth(self._scene, view_key(self._key, view.vector), view, Amount(spp, seconds))
+        return render_truth(self._scene, view_key(self._key, view.vector), view, amount)
 
     def plan_sample(self, configuration: Modification, view: View) -> str:
         """Plan it in the store as a sample that was chosen by hand, which workers find; says whether that is new."""

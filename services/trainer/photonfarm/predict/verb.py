@@ -39,8 +39,9 @@ LIVE_PORT = 8430
 @fov_option
 @click.option(
     "--truth",
-    metavar="SPP|TIME",
-    help="Render it by bdpt beside the network's image, with so many samples per pixel (256) or for so long (20s).",
+    metavar="SPP|TIME|ERROR",
+    help="Render it by bdpt beside the network's image: with so many samples per pixel (256), for so long (20s), or "
+    "until its own squared error is so small a share of its mean square (0.1%).",
 )
 @click.option("--store-it", is_flag=True, help="Plan it as a sample, too; else the store stays as it is.")
 @shot_file_options

@@ -178,8 +178,9 @@ def measure_frames(
 @fov_option
 @click.option(
     "--spp",
-    metavar="SPP|TIME",
-    help="Samples per pixel (256), or for how long to render (20s).  [default: 64]",
+    metavar="SPP|TIME|ERROR",
+    help="Samples per pixel (256), for how long to render (20s), or until the image's own squared error is so small a "
+    "share of its mean square (0.1%).  [default: 64]",
 )
 @click.option(
     "--pass",

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import re
 import time
 from dataclasses import dataclass
@@ -45,25 +46,41 @@ LEAST_PASSES = 2
 SMALL_HALF = 4
 """The most samples per pixel of a half where time is what ends: so that a pass takes little of it."""
 
+MOST_SPP = 1 << 16
+"""The most samples per pixel where the image's own error is what ends."""
+
 SUFFIXES = (".npz", ".exr", ".png")
 """The kinds of files that an image in two halves is written as."""
 
 
 @dataclass(frozen=True, slots=True)
 class Amount:
-    """How much to render: so many samples per pixel, both halves together, or so many seconds."""
+    """How much to render: samples per pixel of both halves together, seconds, or until the image's own error is small.
+
+    Exactly one of them is given.
+    """
 
     spp: int | None = None
     seconds: float | None = None
+    error: float | None = None  # the image's mean squared error as a share of its mean square
+
+    def __post_init__(self) -> None:
+        """Raise SpecError unless one positive amount is given."""
+        given = [value for value in (self.spp, self.seconds, self.error) if value is not None]
+        if len(given) != 1 or not 0 < given[0] < math.inf:
+            raise SpecError("truth: one of spp, seconds and error is required, above 0")
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The amount in a text such as 256 or 20s; raises SpecError for another one."""
+        """The amount in a text such as 256, 20s or 0.1%; raises SpecError for another one."""
         if re.fullmatch(r"[1-9]\d{0,7}", text):
             return cls(spp=int(text))
-        if (found := re.fullmatch(r"(\d{1,6}|\d{0,6}\.\d{1,6})s", text)) and float(found[1]) > 0:
-            return cls(seconds=float(found[1]))
-        raise SpecError(f"{text!r}: samples per pixel are required, such as 256, or a time, such as 20s")
+        if (found := re.fullmatch(r"(\d{1,6}|\d{0,6}\.\d{1,6})(s|%)", text)) and float(found[1]) > 0:
+            return cls(seconds=float(found[1])) if found[2] == "s" else cls(error=float(found[1]) / 100)
+        raise SpecError(
+            f"{text!r}: samples per pixel are required, such as 256, a time, such as 20s, or the image's own error as "
+            "a share of its mean square, such as 0.1%"
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,6 +121,11 @@ class Truth:
             measure(total - own * part, count - own) for own, part in zip(self.passes.tolist(), parts, strict=True)
         ]
         return jackknife(measure(total, count), np.array(without), self.passes)
+
+    def own_error(self) -> float:
+        """The expected mean squared error of `radiance`, exposed: a quarter of the halves' squared difference."""
+        first, second = self.halves * np.float64(self.exposure)
+        return float(np.mean((first - second) ** 2)) / 4
 
     def power(self) -> float:
         """The mean square of the clean image, radiance × exposure: the error of a black image."""
@@ -154,17 +176,36 @@ def render_truth(scene: LoadedScene, key: Key, view: View, amount: Amount) -> Tr
     """The truth of the scene's present configuration from a view, by the view's content key.
 
     At least two passes are rendered, and a pass is whole. They are as large as those of samples, unless there would be
-    too few of them for each part. Raises IncompleteError if halves stay non-finite.
+    too few of them for each part. Where the image's own error is what ends, they are at most `MOST_SPP` samples per
+    pixel. Raises IncompleteError if halves stay non-finite.
     """
     most = SMALL_HALF if amount.spp is None else amount.spp // (2 * PARTS)
     began, refined = time.perf_counter(), RefinedTruth(scene.spec, max(1, min(scene.spec.transport.half_spp, most)))
     refined.add(scene, key, view, LEAST_PASSES)
-    while amount.spp is not None and refined.spp < amount.spp:
-        left = -(-(amount.spp - refined.spp) // refined.pass_spp)
-        refined.add(scene, key, view, min(left, scene.samples_at_once))
-    while amount.seconds is not None and time.perf_counter() - began < amount.seconds:
-        refined.add(scene, key, view)
+    while missing := _count_missing(refined, amount, time.perf_counter() - began):
+        for first in range(0, missing, scene.samples_at_once):
+            refined.add(scene, key, view, min(missing - first, scene.samples_at_once))
     return refined.result()
+
+
+def _count_missing(refined: RefinedTruth, amount: Amount, seconds: float) -> int:
+    """The passes to render next, after so many seconds; 0 if there are enough.
+
+    A mean over n passes has an error in proportion to 1/n. It is looked at after as many passes again, at the most.
+    """
+    done = refined.spp // refined.pass_spp
+    if amount.spp is not None:
+        return -(-amount.spp // refined.pass_spp) - done
+    if amount.seconds is not None:
+        return int(seconds < amount.seconds)
+    if done < PARTS:
+        return PARTS - done
+    truth = refined.result()
+    allowed, error = (amount.error or 0) * truth.power(), truth.own_error()
+    if error <= allowed:
+        return 0
+    needed = done * error / allowed if allowed > 0 else math.inf
+    return math.ceil(min(needed, 2 * done, MOST_SPP / refined.pass_spp)) - done
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -180,7 +221,8 @@ class RenderedImage:
 
     def document(self) -> dict[str, Any]:
         """What was rendered, for JSON; what stands where is said by names."""
-        effort = {"spp": self.truth.spp, "seconds": self.truth.seconds, "doubts": list(self.doubts)}
+        errors = {"squared_error": self.truth.own_error(), "mean_square": self.truth.power()}
+        effort = {"spp": self.truth.spp, **errors, "seconds": self.truth.seconds, "doubts": list(self.doubts)}
         shot = list_shot(self.spec, self.configuration, self.view)
         return {"scene": self.spec.name, **shot, **effort, "groups": names_of_ids(self.spec.groups)}
 

@@ -141,6 +141,25 @@ def test_the_fewest_samples_make_a_truth_too(shown: Live) -> None:
     assert "±" in told["error"]
 
 
+def test_viewers_take_turns_so_that_no_truth_holds_up_another_s_frames(shown: Live) -> None:
+    rests, moves = {**AT_REST, "without": ["vase"]}, {**AT_REST, "without": ["sofa"]}
+    with serving(replace(shown, open=lambda: shown.run, most_spp=10**6)) as address:
+        alone, slices, is_over = read_picture(ask(address, "full", moves)), [], threading.Event()
+
+        def refine() -> None:
+            while not is_over.is_set():
+                slices.append(ask(address, "truth", rests)["spp"])
+
+        viewer = threading.Thread(target=refine)
+        viewer.start()
+        pictures = [read_picture(ask(address, "full", moves)) for _ in range(8)]
+        is_over.set()
+        viewer.join()
+    assert 1 < len(slices) < 24, "they take turns"
+    assert slices == sorted(slices)
+    assert all(np.array_equal(picture, alone) for picture in pictures)
+
+
 def test_images_in_motion_become_smaller_until_they_are_fluent_and_grow_again() -> None:
     speed = Speed(Film(width=256, height=192))
     for seconds, film in ((0.9, (128, 96)), (0.3, (64, 48)), (0.16, (64, 48)), (0.05, (64, 48)), (0.02, (128, 96))):
@@ -166,6 +185,27 @@ def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks
             page.wait_for("!document.querySelector('#truth').classList.contains('old')", 60)
             assert page.value("document.documentElement.scrollWidth") <= width
         assert page.errors == []
+
+
+@needs_chromium
+def test_two_pages_see_each_their_own_configuration(address: str) -> None:
+    with chromium() as one, chromium() as other:
+        for page in (one, other):
+            page.open(address, 800, 1500)
+            page.wait_for("document.querySelector('#of-network').textContent !== ''", 60)
+            page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Random').click()")
+        for page in (one, other):
+            page.wait_for("document.querySelector('#of-truth').textContent.startsWith('truth · 24 samples')", 60)
+            page.wait_for("!document.querySelector('#truth').classList.contains('old')", 60)
+        states = [page.value("window.live.state()") for page in (one, other)]
+        assert states[0] != states[1]
+        for page, state in zip((one, other), states, strict=True):
+            for canvas, kind in (("network", "full"), ("truth", "truth")):
+                read = "(({ width, height }, at) => [...at.getImageData(0, 0, width, height).data])"
+                at = f"document.querySelector('#{canvas}')"
+                pixels = np.array(page.value(f"{read}({at}, {at}.getContext('2d'))"), np.uint8).reshape(16, 24, 4)
+                np.testing.assert_array_equal(pixels[..., :3], read_picture(ask(address, kind, state)))
+            assert page.errors == []
 
 
 def drag_sofa(page: Page) -> None:

@@ -230,7 +230,7 @@ def test_without_a_redis_who_named_none_hears_whether_workers_are_at_work(
     done = status()
     assert done.exit_code == 0
     assert "no Redis" not in done.output
-    assert "`photonfarm up` goes on with the 8 samples" in done.output
+    assert "`photonfarm up` goes on with the missing 8 samples" in done.output
     now = [0.0]
     watch = FarmWatch(store, f"unix://{tmp_path}/none", named_redis=False, clock=lambda: now[0])
     watch.look()

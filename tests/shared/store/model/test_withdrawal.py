@@ -125,7 +125,7 @@ def test_without_a_number_it_is_the_last_plan_that_has_something_to_withdraw(sce
     for job in set(scene.missing_jobs()) & set(range(scene.plans()[3].first_job, scene.jobs())):
         assert samples.commit(scene, job, samples.outputs(scene, job))
     nothing = withdraw(scene, 3)
-    assert (nothing.jobs, nothing.left) == (0, "not rendered yet: 1 samples of plan 2")
+    assert (nothing.jobs, nothing.left) == (0, "not rendered yet: 1 sample of plan 2")
     done = withdraw(scene)
     assert (done.plan, done.samples, withdraw(scene).left) == (2, 1, "not rendered yet: none")
 

@@ -124,7 +124,7 @@ class Stages:
     def _is_trained(self, run: Run) -> bool:
         """Whether a run has come to its end. Raises StageError where it is not of what is asked for."""
         from photonfarm.trainer.runs import checkpoint  # here, as it brings torch
-        from photonfarm.trainer.runs.advice import LEARNED_NOISE
+        from photonfarm.trainer.runs.advice import LEARNED_BY_HEART
         from photonfarm.trainer.runs.run_folder import METRICS, read_log
 
         if not self._checkpoint(run).is_file():
@@ -145,7 +145,8 @@ class Stages:
         seconds, log = sum(state["seconds"].values()), self._folder(run) / METRICS
         if state["step"] >= settings["max_steps"] or seconds >= (settings["max_seconds"] or math.inf):
             return True
-        return log.is_file() and any(record.get("reason") in ("rounds", LEARNED_NOISE) for record in read_log(log)[-1:])
+        last = read_log(log)[-1:] if log.is_file() else []
+        return any(record.get("reason") in ("rounds", LEARNED_BY_HEART) for record in last)
 
     def _asked(self, run: Run) -> dict[str, Any]:
         """The settings that its preset and the experiment's files name; all others are the trainer's defaults."""

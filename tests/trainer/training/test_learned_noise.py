@@ -14,7 +14,7 @@ from analytic_room_samples import AnalyticSource
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.cli import show
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors
-from photonfarm.trainer.runs.advice import LEARNED_NOISE, advise
+from photonfarm.trainer.runs.advice import LEARNED_BY_HEART, advise
 from photonfarm.trainer.runs.checkpoint import load
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, GOOD, METRICS, read_log
 from photonfarm.trainer.runs.settings import NetworkSettings, TrainSettings
@@ -61,7 +61,7 @@ def test_a_run_that_learns_noise_by_heart_ends_with_its_best_weights_and_goes_on
     log = read_log(run / METRICS)
     *validations, last = (record for record in log if record["kind"] == "validation")
     (found,) = (record for record in log if record["kind"] == "recovered")
-    assert outcome.reason == LEARNED_NOISE == log[-1]["reason"] == found["cause"]
+    assert outcome.reason == LEARNED_BY_HEART == log[-1]["reason"] == found["cause"]
     assert outcome.step == last["step"] == validations[-1]["step"] < 400
     assert validations[-1]["excess"] < 0
     least = min(validations, key=lambda each: each["excess_held_out"][0])
@@ -69,7 +69,7 @@ def test_a_run_that_learns_noise_by_heart_ends_with_its_best_weights_and_goes_on
     assert last["error"] == pytest.approx(least["error"])
     assert last["error"] < validations[-1]["error"] / 1.1
     said = capsys.readouterr().err
-    assert f"learns the noise of its samples by heart; ends with the weights of step {least['step']}" in said
+    assert f"learns its samples by heart; ends with the weights of step {least['step']}" in said
     found_worth = advise(log)
     assert found_worth is not None
     assert found_worth.worth == "fresh passes"
@@ -80,7 +80,7 @@ def test_a_run_that_learns_noise_by_heart_ends_with_its_best_weights_and_goes_on
     assert all(torch.equal(kept[name], weight) for name, weight in ended.items())
 
     again = train(source_of(16), by_heart(), run)
-    assert (again.reason, again.step) == (LEARNED_NOISE, outcome.step), "nothing has come that it could go on with"
+    assert (again.reason, again.step) == (LEARNED_BY_HEART, outcome.step), "nothing has come that it could go on with"
     further = train(source_of(64), by_heart(max_steps=outcome.step + 20), run)
     assert (further.reason, further.step) == ("steps", outcome.step + 20)
 
@@ -99,10 +99,12 @@ def of_excesses(step: int, *excesses: float) -> Validation:
 
 
 @pytest.mark.parametrize(
-    ("now", "training", "is_good", "has_risen", "has_learned_noise"),
+    ("now", "training", "is_good", "has_risen", "learns_by_heart"),
     [
         ((1.2, 1.3, 1.2), -0.2, False, True, True),
-        ((1.2, 1.3, 1.2), 0.5, False, True, False),  # too few images, but not by heart
+        ((1.2, 1.3, 1.2), 0.04, False, True, True),  # above 0: too few images rather than noise
+        ((1.2, 1.3, 1.2), 0.06, False, True, False),
+        ((1.2, 1.3, 1.2), 0.5, False, True, False),  # worse on both, as where a run diverges
         ((1.2, 1.3, 1.2), None, False, True, False),
         ((1.05, 1.06, 1.05), -0.2, False, False, False),  # by less than a tenth
         ((2.0, 0.9, 1.0), 0.1, True, False, False),  # one view, which may be chance
@@ -110,8 +112,8 @@ def of_excesses(step: int, *excesses: float) -> Validation:
         ((0.9, 0.8, 0.9), -0.2, True, False, False),  # still better on held-out views
     ],
 )
-def test_noise_is_learned_where_the_training_loss_is_below_its_floor_and_the_held_out_one_clearly_above_its_least(
-    now: tuple[float, ...], training: float | None, is_good: bool, has_risen: bool, has_learned_noise: bool
+def test_samples_are_learned_by_heart_where_their_excess_halves_while_the_held_out_one_rises_clearly_above_its_least(
+    now: tuple[float, ...], training: float | None, is_good: bool, has_risen: bool, learns_by_heart: bool
 ) -> None:
     best = BestValidations()
     best.place(of_excesses(0, 3.0, 3.0, 3.0), None)
@@ -120,5 +122,5 @@ def test_noise_is_learned_where_the_training_loss_is_below_its_floor_and_the_hel
     resumed.restore(best.state())
     for each in (best, resumed):
         found = each.place(of_excesses(2, *now), training)
-        told = found.is_good, found.rise is not None, found.has_learned_noise
-        assert told == (is_good, has_risen, has_learned_noise)
+        told = found.is_good, found.rise is not None, found.learns_by_heart
+        assert told == (is_good, has_risen, learns_by_heart)

@@ -18,7 +18,7 @@ from photonfarm.core.processes import repeat
 from photonfarm.core.statistics import format_estimate
 from photonfarm.core.waiting import SILENCE_S, Steps
 from photonfarm.trainer.runs import progress
-from photonfarm.trainer.runs.advice import LEARNED_NOISE, knows_noise
+from photonfarm.trainer.runs.advice import LEARNED_BY_HEART, knows_noise
 
 if TYPE_CHECKING:
     from photonfarm.trainer.dry_run import DryRun
@@ -82,9 +82,9 @@ def _format_recovery(log_record: dict[str, Any]) -> str:
         reason = f"the {what} is not finite"
     else:
         reason = f"{what} {now} ({'best so far' if log_record['errors'] else 'usually up to'} {before})"
-    if log_record["cause"] == LEARNED_NOISE:
-        reason = f"{reason}, as the network learns the noise of its samples by heart"
-    if log_record["cause"] in ("end", LEARNED_NOISE):
+    if log_record["cause"] == LEARNED_BY_HEART:
+        reason = f"{reason}, as the network learns its samples by heart"
+    if log_record["cause"] in ("end", LEARNED_BY_HEART):
         return f"{reason}; ends with {back_to}"
     return f"{reason}; goes on from {back_to}, at {log_record['rate_factor']:g} of the rate"
 

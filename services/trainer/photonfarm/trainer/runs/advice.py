@@ -18,8 +18,8 @@ Worth = Literal["fresh passes", "more steps", "more images", "a wider network"]
 LEAST_GAIN = 0.05
 """The share of the held-out error that twice the steps or images must take off, so that either is worth it."""
 
-LEARNED_NOISE = "learned noise"
-"""Why a run has ended that learned the noise of its samples by heart, and so got worse."""
+LEARNED_BY_HEART = "learned by heart"
+"""Why a run has ended that learned its samples by heart, and so got worse on others."""
 
 BY_HEART = -0.1
 """The share of the held-out error below which a training error says that noise was learned: above it may be chance."""
@@ -59,10 +59,10 @@ def advise(records: Sequence[Mapping[str, Any]], images_s: float | None = None) 
         f"{max(gain, 0):.0%} off the held-out error"
         for name, (gain, cost) in gains.items()
     )
-    if stop := next((each for each in records if _tells_of_noise(each) and each["step"] == late[-1]["step"]), None):
+    if stop := next((each for each in records if _ended_by_heart(each) and each["step"] == late[-1]["step"]), None):
         worth: Worth = "fresh passes"
         said = (
-            "it learned the noise of its samples by heart, and ended with the weights of step "
+            "it learned its samples by heart, and ended with the weights of step "
             f"{stop['back_to']}; with fresh passes of the same views, or more images, the same command goes on"
         )
     elif knows_noise(training, held_out):
@@ -81,8 +81,8 @@ def knows_noise(training: float, held_out: float) -> bool:
     return training < BY_HEART * abs(held_out)
 
 
-def _tells_of_noise(record: Mapping[str, Any]) -> bool:
-    return record["kind"] == "recovered" and record["cause"] == LEARNED_NOISE
+def _ended_by_heart(record: Mapping[str, Any]) -> bool:
+    return record["kind"] == "recovered" and record["cause"] == LEARNED_BY_HEART
 
 
 def _fit_slope(curve: Sequence[tuple[float, float]]) -> float:

@@ -24,7 +24,7 @@ from photonfarm.trainer.networks.inputs import SceneFrame
 from photonfarm.trainer.predictors.evaluation import make_network_predictor, read_batches
 from photonfarm.trainer.predictors.half_filter import choose_filter, settle_filter
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.advice import LEARNED_NOISE, advise
+from photonfarm.trainer.runs.advice import LEARNED_BY_HEART, advise
 from photonfarm.trainer.runs.devices import Ranks, usable_device
 from photonfarm.trainer.runs.progress import Stopwatch, TimeKind, divide_by_used, share_waits
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, SETTINGS, MetricsLog, lock_run, read_log
@@ -47,7 +47,7 @@ class TrainingOutcome:
     """How a session of training ended."""
 
     step: int
-    reason: str  # "steps", "seconds", "rounds", "stopped" or `LEARNED_NOISE`
+    reason: str  # "steps", "seconds", "rounds", "stopped" or `LEARNED_BY_HEART`
     last_error: float | None  # held-out, noise removed; None if it ended before the first validation
 
 
@@ -126,7 +126,7 @@ class Session:
         self._begin()
         self._watch.turn("other")
         if (reason := self._end_before.get("reason")) is not None and self._ends_again(reason):
-            goes_on = "further passes or images" if reason == LEARNED_NOISE else "--steps N"
+            goes_on = "further passes or images" if reason == LEARNED_BY_HEART else "--steps N"
             self._hooks.on_wait(f"run {self._run} has ended at step {self._step} ({reason}); with {goes_on} it goes on")
             return TrainingOutcome(self._step, reason, self._last_error)
         while (reason := self._ended()) is None:
@@ -236,15 +236,15 @@ class Session:
             return "steps"
         if self._stream.last_step is not None and self._step >= self._stream.last_step:
             return "rounds"
-        if self._standing is not None and self._standing.has_learned_noise and self._stream.complete:
-            return LEARNED_NOISE
+        if self._standing is not None and self._standing.learns_by_heart and self._stream.complete:
+            return LEARNED_BY_HEART
         if self._settings.max_seconds is not None and sum(self._watch.seconds.values()) >= self._settings.max_seconds:
             return "seconds"
         return None
 
     def _ends_again(self, reason: str) -> bool:
         """Whether what ended the last session ends this one too."""
-        if reason == LEARNED_NOISE:
+        if reason == LEARNED_BY_HEART:
             return self._stream.complete and len(self._stream.arrived) == self._end_before["samples"]
         return reason in ("steps", "rounds") and reason == self._ended()
 
@@ -334,7 +334,7 @@ class Session:
 
     def _keep_or_go_back(self) -> None:
         """Keep the state after the last validation, or go back, in all processes; neither if the run ends there."""
-        if self._standing is None or self._ended() == LEARNED_NOISE:
+        if self._standing is None or self._ended() == LEARNED_BY_HEART:
             return
         if (error := self._standing.error).is_clearly_worse:
             reason = f"step {self._step}: {error.sentence}"
@@ -353,7 +353,7 @@ class Session:
             return
         if (rise := standing.rise) is not None:
             self._good.give(f"step {self._step}: {rise.sentence}")
-            self._log_recovered(LEARNED_NOISE if standing.has_learned_noise else "end", rise)
+            self._log_recovered(LEARNED_BY_HEART if standing.learns_by_heart else "end", rise)
             self._validate()
         elif standing.is_good:
             self._keep()

@@ -15,7 +15,6 @@ from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
 from photonfarm.trainer.data.batch import TrainingBatch
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors, Predictor, measure
-from photonfarm.trainer.runs.advice import knows_noise
 
 Show = Callable[[int, tuple[int, ...], F32, F32], None]
 """A callback with the step, rows of the store, and their targets and predictions."""
@@ -182,7 +181,7 @@ class Standing:
     error: Comparison  # by its judge, with the best
     excess: Comparison | None  # with the least
     is_good: bool  # its weights are worth keeping: not worse than the best, and of the least excess but for chance
-    has_learned_noise: bool  # more steps on the samples that there are make it worse
+    learns_by_heart: bool  # more steps on the samples that there are make it worse on others
 
     @property
     def rise(self) -> Comparison | None:
@@ -205,23 +204,24 @@ class BestValidations:
     def place(self, now: Validation, training: float | None) -> Standing:
         """Hold a validation against them, and let it be the best, or the least, from now on if it is.
 
-        With `training`, the excess on training samples, noise has been learned by heart if that is below 0 by more than
-        chance (`knows_noise`) while the held-out excess is clearly above its least. Once it is below 0, no weights are
-        good but those of the least.
+        With `training`, the excess on training samples, these are learned by heart if it has halved since the held-out
+        excess was least, and that is clearly higher now; where a run diverges, both rise. Once `training` is below 0,
+        no weights are good but those of the least.
         """
         error = compare(now, self._best)
         self._best = now.state() if error.is_best else self._best
         if now.excess is None or not now.is_finite:
-            return Standing(error, None, is_good=not error.is_worse, has_learned_noise=False)
+            return Standing(error, None, is_good=not error.is_worse, learns_by_heart=False)
+        before = None if self._least is None else self._least["training"]
         excess = compare(now, self._least, "excesses")
-        self._least = now.state() if excess.is_best else self._least
-        knows = training is not None and knows_noise(training, now.excess.mean)
+        self._least = {**now.state(), "training": training} if excess.is_best else self._least
+        has_halved = training is not None and before is not None and training < before / 2
         is_least = excess.is_best or not ((training or 0) < 0 or excess.is_beyond_chance)
         return Standing(
             error,
             excess,
             is_good=is_least and not error.is_worse,
-            has_learned_noise=knows and excess.is_clearly_worse,
+            learns_by_heart=has_halved and excess.is_clearly_worse,
         )
 
     def state(self) -> dict[str, Any]:

@@ -4,6 +4,7 @@ import http.client
 import io
 import json
 import re
+import shlex
 import socket
 import threading
 import time
@@ -330,6 +331,12 @@ def test_a_browser_shows_the_farm_and_a_sample_without_errors_at_a_desks_and_a_p
             told = "[...document.querySelectorAll('circle.hollow')].map((point) => point.textContent)"
             assert page.value(told) == 2 * ["step 0: 1.00000 on 1 held-out view"], "by steps and by seconds"
             assert page.value("document.documentElement.scrollWidth") <= width
+            page.call("Emulation.setFocusEmulationEnabled", enabled=True)
+            page.call("Browser.grantPermissions", permissions=["clipboardReadWrite", "clipboardSanitizedWrite"])
+            page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Copy').click()")
+            page.wait_for("[...document.querySelectorAll('button')].some((b) => b.textContent === 'Copied')")
+            copied = page.value("navigator.clipboard.readText()")
+            assert shlex.split(copied)[2:] == ["--store", str(scene.folder.parent.parent), "--run", str(run)]
             page.open(f"{address}#/sample/{scene.scene_id}/3", width)
             page.wait_for("document.querySelectorAll('.pictures img').length >= 7")
             page.wait_for(pictures_there)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shlex
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -281,9 +282,10 @@ class FarmPages:
     # ------------------------------------------------------------------------------------------------------------ runs
 
     def curves(self) -> list[dict[str, Any]]:
-        """The curves of all runs: held-out error and loss by step and by seconds."""
+        """The curves of all runs, held-out error and loss by step and by seconds, and the command of its page live."""
         self._view.get()
-        return [_read_curves(run) for run in self._watch.runs]
+        runs, command = self._watch.runs, f"photonfarm live --store {shlex.quote(str(self._place))} --run"
+        return [_read_curves(run) | {"live": f"{command} {shlex.quote(str(run.folder))}"} for run in runs]
 
     def prediction(self, run: int, step: int) -> bytes:
         """The picture of a run's predictions at a validation; raises NotThereError."""

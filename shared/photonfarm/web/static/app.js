@@ -41,6 +41,14 @@ function fill(where, ...nodes) {
   if (nodes.length !== where.children.length || nodes.some((node, i) => node !== where.children[i])) where.replaceChildren(...nodes);
 }
 
+// A command with a button that copies it; where the browser allows no page to do that, the button selects it.
+function copyable(command) {
+  const shown = h("code", {}, command);
+  return [shown, " ", h("button", { onclick: async ({ target }) => {
+    try { await navigator.clipboard.writeText(command); target.textContent = "Copied"; } catch { getSelection().selectAllChildren(shown); }
+  } }, "Copy")];
+}
+
 function track(done, total, hand = 0) {
   const [bar, rest] = [h("i"), h("i", { class: "hand" })];
   bar.style.width = `${(100 * done) / (total || 1)}%`;
@@ -164,7 +172,7 @@ function predictions(runs) {
     references.style.setProperty("--columns", run.rows.length);
     return card("half", `Predictions of ${run.run}`, "of views that training never sees",
       references, h("p", { class: "note" }, "Above: the mean of all passes of these views. Below: what the network makes of them. ",
-        h("code", {}, `photonfarm live --run ${run.run}`), " shows any other configuration beside its truth."), picture,
+        ...copyable(run.live), " shows any other configuration beside its truth."), picture,
       h("div", { class: "controls" }, h("input", { type: "range", min: 0, max: last, value: at, "aria-label": "step", oninput: (event) => {
         chosen[place] = +event.target.value === last ? undefined : +event.target.value;
         show(+event.target.value);

@@ -195,8 +195,8 @@ def test_two_pages_see_each_their_own_configuration(address: str) -> None:
             page.wait_for("document.querySelector('#of-network').textContent !== ''", 60)
             page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Random').click()")
         for page in (one, other):
-            page.wait_for("document.querySelector('#of-truth').textContent.startsWith('truth · 24 samples')", 60)
-            page.wait_for("!document.querySelector('#truth').classList.contains('old')", 60)
+            whole = "document.querySelector('#of-truth').textContent.startsWith('truth · 24 samples')"
+            page.wait_for(f"{whole} && !document.querySelector('#truth').classList.contains('old')", 60)
         states = [page.value("window.live.state()") for page in (one, other)]
         assert states[0] != states[1]
         for page, state in zip((one, other), states, strict=True):
@@ -204,7 +204,9 @@ def test_two_pages_see_each_their_own_configuration(address: str) -> None:
                 read = "(({ width, height }, at) => [...at.getImageData(0, 0, width, height).data])"
                 at = f"document.querySelector('#{canvas}')"
                 pixels = np.array(page.value(f"{read}({at}, {at}.getContext('2d'))"), np.uint8).reshape(16, 24, 4)
-                np.testing.assert_array_equal(pixels[..., :3], read_picture(ask(address, kind, state)))
+                while not (told := ask(address, kind, state)).get("done", True):
+                    pass
+                np.testing.assert_array_equal(pixels[..., :3], read_picture(told))
             assert page.errors == []
 
 

@@ -16,7 +16,7 @@ from photonfarm.trainer.runs import checkpoint
 
 ROOT = Path(__file__).parents[2]
 UP = ("up", "small.toml", "--modifications", "16", "--views", "2", "--shard-rows", "4", "--train-steps", "40")
-UP = (*UP, "--preset", "small", "--architecture", "guided_transport", "--set", "batch=3")
+UP = (*UP, "--preset", "small", "--architecture", "guided_transport", "--set", "batch=3", "--also", "guided", "20")
 
 Command = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -41,8 +41,9 @@ def test_the_farm_renders_trains_and_reports(folder: Path) -> None:
     report = json.loads((folder / "out/report.json").read_text())
     assert report["dataset"]["samples_complete"] == 32
     assert report["dataset"]["core_seconds_per_sample"] > 0
-    (run,) = report["runs"]
-    assert run["steps"] == 40
+    run, also = report["runs"]
+    assert (run["steps"], also["steps"], also["architecture"]) == (40, 20, "guided")
+    assert (folder / "run-guided/checkpoint.safetensors").exists()
     assert json.loads((folder / "run/settings.json").read_text())["batch"] == 3
     assert [run["curve"][end]["step"] for end in (0, -1)] == [0, 40]  # the first is of the few samples there were then
     assert run["curve"][-1]["error"] < 0.1 * report["mean_colour"]

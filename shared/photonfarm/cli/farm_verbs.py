@@ -316,6 +316,13 @@ def redis_server(port: int) -> None:
     help="Any setting of the training, as `train` has it; may be repeated.",
 )
 @click.option(
+    "--also",
+    type=(str, click.IntRange(1)),
+    multiple=True,
+    metavar="NAME STEPS",
+    help="A further network to train meanwhile, in RUN-NAME, and to compare in the report; may be repeated.",
+)
+@click.option(
     "--hold-out",
     type=click.FloatRange(0, 1, min_open=True, max_open=True),
     default=None,
@@ -360,10 +367,13 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
         named = {f"--{name}": options.pop(name) for name in ("preset", "architecture")}
         given = [word for name, value in named.items() if value is not None for word in (name, value)]
         options["train_options"] = [*given, *(word for pair in options.pop("pairs") for word in ("--set", pair))]
-        if options["train_steps"]:
-            trainer = {name: options[name] for name in ("run", "train_steps", "train_options")}
-            arguments = trainer_arguments(spec, hold_out=options["hold_out"] or HOLD_OUT, **trainer)
-            _check_arguments(arguments, "torch", "train", "--train-steps 0 renders only")
+        options["also"] = dict(options["also"])
+        if options["also"] and not options["train_steps"]:
+            raise click.UsageError("--also trains beside a network, and --train-steps 0 trains none")
+        for own in ([], *(["--architecture", name] for name in options["also"])) if options["train_steps"] else ():
+            trainer = {name: options[name] for name in ("run", "train_steps")}
+            trainer |= {"hold_out": options["hold_out"] or HOLD_OUT, "train_options": [*options["train_options"], *own]}
+            _check_arguments(trainer_arguments(spec, **trainer), "torch", "train", "--train-steps 0 renders only")
         devices = worker_devices(os.environ.get(DEVICE_VARIABLE) or AUTO, cards_here())
         options["workers"] = options["workers"] or (WORKERS if devices == (CPU,) else len(devices))
         say = partial(click.echo, err=True)

@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from itertools import cycle
 from pathlib import Path
+from types import MappingProxyType
 
 from photonfarm.core.errors import IncompleteError, SpecError, store_errors
 from photonfarm.core.formatting import format_count
@@ -68,6 +69,7 @@ def run_farm(
     hold_out: float | None,
     out: Path,
     train_options: Sequence[str] = (),
+    also: Mapping[str, int] = MappingProxyType({}),
     reference_views: int = 0,
     reference_spp: int = 256,
     shard_rows: int | None = None,
@@ -77,8 +79,9 @@ def run_farm(
 ) -> None:
     """Submit, render, train, and write the report and the preview; raises IncompleteError if a part fails.
 
-    The first `reference_views` held-out views get `reference_spp` samples per pixel, which are merged in `out`, and the
-    report compares networks with them. `reserve` is that of the workers. Without a `hold_out` it is the run's, or
+    Networks of `also` are trained meanwhile, each for its steps and with the same options, in RUN-NAME. The first
+    `reference_views` held-out views get `reference_spp` samples per pixel, which are merged in `out`, and the report
+    compares networks with them. `reserve` is that of the workers. Without a `hold_out` it is the run's, or
     of a new run the default or just enough for one configuration. With `web`, pages that show all of it are served on
     this machine until the end. Workers render on the `devices` in turn.
 
@@ -90,8 +93,13 @@ def run_farm(
     for warning in warnings(named):
         say(f"warning: {warning}")
     references = reference_views > 0
-    if train_steps:
-        check_run(run, named.spec, store)
+    trained = {"trainer": (run, train_steps, [*train_options])} if train_steps else {}
+    for name, steps in also.items():
+        beside_run = run.with_name(f"{run.name}-{name}")
+        trained[f"trainer-{name}"] = (beside_run, steps, [*train_options, "--architecture", name])
+    runs = [each for each, *_ in trained.values()]
+    for each in runs:
+        check_run(each, named.spec, store)
     asked = hold_out or hold_out_of(run)
     splits = train_steps or references
     share = _checked_hold_out(named.spec, store, asked, request, say) if splits else asked or HOLD_OUT
@@ -128,21 +136,19 @@ def run_farm(
         for name, device in zip((f"worker-{i + 1}" for i in range(workers)), cycle(devices), strict=False):
             scene = ["--scene", planned.scene_id, "--name", name, "--device", device]
             verbs[name] = ["work", "--until-complete", *scene, *([] if reserve is None else ["--reserve", reserve])]
-        if train_steps:
-            verbs["trainer"] = trainer_arguments(
-                spec, run=run, train_steps=train_steps, hold_out=share, train_options=train_options
-            )
-        address, trained = None, run if train_steps else None
+        for name, (each, steps, own) in trained.items():
+            verbs[name] = trainer_arguments(spec, run=each, train_steps=steps, hold_out=share, train_options=own)
+        address, shown = None, [word for each in runs for word in ("--run", str(each))]
         if web:
             port = free_port(WEB_PORT)
             address = f"http://localhost:{port}/"
-            verbs[PAGES] = ["web", "--run", str(run), "--port", str(port)]
+            verbs[PAGES] = ["web", *(shown or ["--run", str(run)]), "--port", str(port)]
             say(f"watch it at {address}")
-        stack.enter_context(announce(opened, redis_url=redis.url, run=trained, web=address))
+        stack.enter_context(announce(opened, redis_url=redis.url, run=run if train_steps else None, web=address))
         running = stack.enter_context(_processes(verbs, environment, run, say))
         preview = ["preview", planned.scene_id, "--out", str(out / "preview.html")]
         try:
-            watch = FarmWatch(opened, redis.url, [run] if trained else [], scene_id=planned.scene_id)
+            watch = FarmWatch(opened, redis.url, runs, scene_id=planned.scene_id)
             with display as show:
                 _watch(running, watch, redis, show, run)
             beside: list[str] = []
@@ -154,7 +160,7 @@ def run_farm(
                 beside = ["--references", folder]
             if train_steps:
                 _tell_of_late_samples(run, scene_status(opened.scene(planned.scene_id)).samples_complete, say)
-                _call(["report", "--run", str(run), "--out", str(out), *beside], environment)
+                _call(["report", *shown, "--out", str(out), *beside], environment)
         except IncompleteError as error:
             try:
                 _call(preview, environment)  # the samples rendered so far can still be looked at

@@ -23,9 +23,10 @@ from photonfarm.core.archives import Seconds
 from photonfarm.core.files import write_whole
 from photonfarm.core.keys import seed_of
 from photonfarm.core.statistics import Estimate
-from photonfarm.renderer.jobs.render import load_scene, locate
+from photonfarm.renderer.jobs.render import load_scene
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
+from photonfarm.scene.spec_loading import locate
 from photonfarm.store import SceneReader
 from photonfarm.trainer.compare.evaluation_samples import HeldOutSamples, Reference, read_references
 from photonfarm.trainer.metrics.image_metrics import metric_space, mse

@@ -14,7 +14,7 @@ from typing import Any, Self
 
 from pydantic import BaseModel, ValidationError
 
-from photonfarm.core.errors import SpecError
+from photonfarm.core.errors import SceneNotHereError, SpecError
 from photonfarm.core.models import nearest, sentences
 from photonfarm.scene.files import BUILTIN, SceneFile, check_textures
 from photonfarm.scene.groups import Light
@@ -62,6 +62,23 @@ def _read(file: Path, *, measured_again: bool = False) -> tuple[SceneSpec, froze
 def parse_spec(described: dict[str, Any], *, where: str, beside: Path | None = None) -> SceneSpec:
     """The checked spec in a parsed TOML or JSON document, its scene file found and digested."""
     return parse_with_lights(described, where=where, beside=beside)[0]
+
+
+def locate(spec: SceneSpec) -> SceneSpec:
+    """The spec, once its scene file has been found on this machine and is the planned one.
+
+    Raises SceneNotHereError otherwise: other machines may still render the job.
+    """
+    try:
+        here = parse_spec(spec.model_dump(mode="json"), where=f"scene {spec.scene_id} ({spec.name})")
+    except SpecError as error:
+        raise SceneNotHereError(f"this machine cannot render {error}") from error
+    if here.scene_id != spec.scene_id:
+        raise SceneNotHereError(
+            f"scene {spec.scene_id} ({spec.name}): the scene file here is another one than was planned (its files' "
+            f"digest is {here.content[:12]}…, planned was {spec.content[:12]}…); give every worker the same files"
+        )
+    return here
 
 
 def parse_with_lights(

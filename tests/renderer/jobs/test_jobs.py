@@ -17,7 +17,7 @@ from photonfarm.renderer.jobs import render as jobs
 from photonfarm.renderer.jobs.render import ShardRenderer
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
-from photonfarm.scene.spec_loading import load_spec
+from photonfarm.scene.spec_loading import load_spec, locate
 from photonfarm.scene.view import sample_view
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers
@@ -315,7 +315,7 @@ def test_a_scene_file_that_is_not_the_planned_one_is_refused(
     with pytest.raises(SceneNotHereError):
         renderer.render(result.scene_id, 0)
     monkeypatch.setenv("PHOTONFARM_SCENES", str(folders[0]))
-    assert jobs.locate(spec) == spec
+    assert locate(spec) == spec
 
 
 def test_a_job_that_is_not_planned_is_refused_and_one_of_a_forgotten_scene_is_dropped(

@@ -79,8 +79,8 @@ def buffers(
     Nothing is written to the store. Views between those of the file lie on a Catmull–Rom spline through them.
     """
     from photonfarm.renderer.jobs.path_buffers import find_views, frames_of
-    from photonfarm.renderer.jobs.render import locate
     from photonfarm.scene.camera_path import CameraPath
+    from photonfarm.scene.spec_loading import locate
 
     if (path is None) == (orbit is None):
         raise click.UsageError("one of --camera-path and --orbit is required")

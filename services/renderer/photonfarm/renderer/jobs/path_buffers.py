@@ -45,14 +45,19 @@ def find_views(
     opened = Store(store)
     stored = opened.scene(scene_named(opened, scene))
     start = find_start(store, stored.scene_id, row, like)
-    configuration = start[0] if start else None
-    if not isinstance(path, int):
-        configuration = path.apply(stored.spec, configuration)
-    configuration = asked.apply(stored.spec, configuration)
+    return stored, *list_views(stored.spec, asked, path, start[0] if start else None)
+
+
+def list_views(
+    spec: SceneSpec, asked: Arrangement, path: CameraPath | Cameras | int, begin: Modification | None = None
+) -> tuple[Modification, list[View]]:
+    """The configuration and the views of `find_views`, from the one to `begin` with, or the scene at rest."""
+    configuration = begin if isinstance(path, int) else path.apply(spec, begin)
+    configuration = asked.apply(spec, configuration)
     if isinstance(path, int):
-        return stored, configuration, orbit(stored.spec, path, configuration)
-    views = path.sample() if isinstance(path, CameraPath) else path.sample(stored.spec)
-    return stored, configuration, check_clear(stored.spec, views, configuration)
+        return configuration, orbit(spec, path, configuration)
+    views = path.sample() if isinstance(path, CameraPath) else path.sample(spec)
+    return configuration, check_clear(spec, views, configuration)
 
 
 def frames_of(

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.core.errors import CorruptError, IncompleteError, QueueError, SceneNotHereError, SpecError
+from photonfarm.core.errors import CorruptError, IncompleteError, QueueError
 from photonfarm.core.keys import Key, view_key
 from photonfarm.core.records import (
     F32,
@@ -33,7 +33,7 @@ from photonfarm.renderer.jobs.estimates import halves_of, photons_of
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces
 from photonfarm.scene.spec import SceneSpec, Transport
-from photonfarm.scene.spec_loading import parse_spec
+from photonfarm.scene.spec_loading import locate
 from photonfarm.scene.view import View
 from photonfarm.store import Figures, JobRows, JobWriter, SampleRow, SceneReader, SceneStore, Store
 from photonfarm.store.model.lease import announce_work
@@ -168,23 +168,6 @@ class ShardRenderer:
             gc.collect()  # while an older scene is still partly alive, Dr.Jit finds no kernel in its cache
             self._scenes[scene_id] = _Loaded(stored, self._load(spec), spec.transport)
         return self._scenes[scene_id]
-
-
-def locate(spec: SceneSpec) -> SceneSpec:
-    """The spec, once its scene file has been found on this machine and is the planned one.
-
-    Raises SceneNotHereError otherwise: other machines may still render the job.
-    """
-    try:
-        here = parse_spec(spec.model_dump(mode="json"), where=f"scene {spec.scene_id} ({spec.name})")
-    except SpecError as error:
-        raise SceneNotHereError(f"this machine cannot render {error}") from error
-    if here.scene_id != spec.scene_id:
-        raise SceneNotHereError(
-            f"scene {spec.scene_id} ({spec.name}): the scene file here is another one than was planned (its files' "
-            f"digest is {here.content[:12]}…, planned was {spec.content[:12]}…); give every worker the same files"
-        )
-    return here
 
 
 @cache

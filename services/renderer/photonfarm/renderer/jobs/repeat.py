@@ -18,12 +18,12 @@ from photonfarm.core.statistics import block_z_test
 from photonfarm.core.waiting import Log, tell_waiting
 from photonfarm.plan.request import sample_key
 from photonfarm.renderer.jobs.estimates import halves_of
-from photonfarm.renderer.jobs.render import SceneLoader, load_scene, locate, versions
+from photonfarm.renderer.jobs.render import SceneLoader, load_scene, versions
 from photonfarm.renderer.jobs.truth import write_halves
 from photonfarm.renderer.scene import backend
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.spec_loading import scene_folder
+from photonfarm.scene.spec_loading import locate, scene_folder
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, SceneStore, Store
 from photonfarm.store.format import markers

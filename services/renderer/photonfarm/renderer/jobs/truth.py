@@ -245,8 +245,9 @@ def render_asked(
     The configuration begins with that of `find_start`. Raises SpecError for what is impossible, StoreError for a start
     that the store does not hold, BackendError if the scene's files are not on this machine.
     """
-    from photonfarm.renderer.jobs.render import load_scene, locate
+    from photonfarm.renderer.jobs.render import load_scene
     from photonfarm.renderer.scene.surroundings import look_closer
+    from photonfarm.scene.spec_loading import locate
 
     start, stored = None, None
     if row is not None or like is not None:
@@ -265,7 +266,7 @@ def render_asked(
 
 def load_named(store: str | Path, named: str) -> SceneSpec:
     """The spec of a scene of the store, if it has one of this name, or else the spec of this name or file."""
-    from photonfarm.renderer.jobs.render import locate
+    from photonfarm.scene.spec_loading import locate
 
     if not is_spec_file(named):
         try:

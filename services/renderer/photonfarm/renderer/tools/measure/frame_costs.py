@@ -38,13 +38,14 @@ from photonfarm.core.formatting import format_count
 from photonfarm.core.keys import Key, view_key
 from photonfarm.core.records import F32, BasePointCloud, arrays_of
 from photonfarm.renderer.jobs.estimates import photons_of
-from photonfarm.renderer.jobs.render import lit_points, locate
+from photonfarm.renderer.jobs.render import lit_points
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
 from photonfarm.renderer.scene.view_rays import ViewCameras
 from photonfarm.scene.modification import Modification, rebuild, rest
 from photonfarm.scene.spec import WITHOUT_SHADOWS, GuideSpec, SceneSpec
+from photonfarm.scene.spec_loading import locate
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.read.find import scene_named

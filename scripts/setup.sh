@@ -41,7 +41,7 @@ say "installing packages into $venv: minutes, and with their dependencies gigaby
 if [ "${2:-}" = dev ]; then
   [ "$(id -u)" != 0 ] || need chromium has_browser # tests open the pages in it, and are skipped without it
   install 'pip>=25.1' # the first that knows dependency groups
-  install -e '.[render,train,redis,export,oidn,tensorboard,video]' --group test --group check
+  install -e '.[render,train,redis,export,oidn,tensorboard,video,onnx]' --group test --group check
 else
   install -e '.[render,train,redis]'
 fi

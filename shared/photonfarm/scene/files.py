@@ -6,9 +6,10 @@ Elements of its XML know their lines, so that a message can name them.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Set
+import re
+from collections.abc import Iterator, Mapping, Set
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from xml.etree.ElementTree import Element, ParseError, TreeBuilder
 from xml.parsers import expat
 
@@ -113,6 +114,9 @@ class SceneFile:
 TEXTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tga", ".ppm")
 """The names' ends of images that can be read here; Mitsuba alone reads EXR, HDR and PFM."""
 
+OWN_FILES = (*TEXTURES, ".exr", ".hdr", ".rgbe", ".pfm", ".obj", ".ply", ".serialized", ".bsdf", ".spd")
+"""The names' ends of files that a scene which stands alone may have beside its own."""
+
 
 def check_textures(path: Path) -> None:
     """Read the images that a readable scene names, as far as they end in `TEXTURES`; SpecError for one that is damaged.
@@ -185,10 +189,39 @@ def _refuse_unsupported(root: Element, path: Path) -> None:
 
 def _named_files(root: Element, path: Path) -> list[Path]:
     files = []
-    for node in root.iter("string"):
-        if node.get("name") == "filename":
-            file = path.parent / node.get("value", "")
-            if not file.is_file():
-                raise SpecError(f"{path}: filename = {node.get('value')!r} is not there")
-            files.append(file)
+    for name in _list_names(root):
+        file = path.parent / name
+        if not file.is_file():
+            raise SpecError(f"{path}: filename = {name!r} is not there")
+        files.append(file)
     return sorted(set(files))
+
+
+def _list_names(root: Element) -> list[str]:
+    return [node.get("value", "") for node in root.iter("string") if node.get("name") == "filename"]
+
+
+_TYPE = re.compile(r"\w+")
+
+
+def list_own_files(path: Path, parameters: Mapping[str, str]) -> list[str]:
+    """The files that a readable scene names, relative to its own, for a copy that stands alone.
+
+    `parameters` are values for its <default> names.
+
+    Raises SpecError for a file outside of the scene's folder, and for what may be code: a file that is neither mesh nor
+    image nor table of numbers, and a type that is no plugin's name, as Mitsuba would look for a library there.
+    """
+    root = parse(path)
+    names = sorted({str(PurePosixPath(name)) for name in _list_names(root)})
+    for name in names:
+        if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or {*name} & {*"\\$"}:
+            raise SpecError(f"{path}: filename = {name!r} is no file below the scene's folder; copy it there")
+        if PurePosixPath(name).suffix.lower() not in OWN_FILES:
+            raise SpecError(f"{path}: filename = {name!r} is none of {', '.join(OWN_FILES)}")
+    values = {f"${node.get('name')}": node.get("value", "") for node in root.iter("default")}
+    values |= {f"${name}": value for name, value in parameters.items()}
+    for node in root.iter():
+        if (kind := node.get("type")) is not None and not _TYPE.fullmatch(values.get(kind, kind)):
+            raise SpecError(f"{path}: line {line_of(node)}: type = {kind!r} is no plugin's name")
+    return names

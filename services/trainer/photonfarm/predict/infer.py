@@ -43,6 +43,7 @@ from photonfarm.trainer.networks.inputs import require
 from photonfarm.trainer.predictors.denoisers import PACKAGE as OIDN_PACKAGE
 from photonfarm.trainer.predictors.denoisers import Oidn
 from photonfarm.trainer.predictors.evaluation import choose_error
+from photonfarm.trainer.predictors.network_file import PackedScene
 from photonfarm.trainer.predictors.trained import TrainedRun
 
 NOT_JUDGED = "a training sample, so no error is given: the network may have learned its noise"
@@ -145,7 +146,8 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     Raises StoreError for a row that is not planned, IncompleteError for one that is not complete.
     """
     torch.set_num_threads(run.settings.threads)
-    source = _open_source(store, run)
+    source = run.source(Store(store).root)
+    _ = source.spec  # which says what is there instead
     with Feed(source, run.settings.model_copy(update={"device": "cpu"})) as feed:
         if row not in dict(feed.arrivals()[0]):
             raise _explain_missing(source, row)
@@ -187,7 +189,7 @@ def show_frames(
     Raises SpecError for frames of another scene or film, and for a network that needs a rendered image.
     """
     torch.set_num_threads(run.settings.threads)
-    source = _open_source(store, run)
+    source = run.scene(store)
     _check_frames(run, frames, source.spec)
     predict = run.predictor(source.spec, source.base(), device)
     images = (predict(batch)[0] for batch in _read_frames(run, frames, source))
@@ -295,7 +297,7 @@ def _check_frames(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
         raise SpecError(f"{run.folder}: {run.settings.network.architecture} needs photons, and the buffers have none")
 
 
-def _read_frames(run: TrainedRun, frames: Frames, source: SceneReader) -> Iterator[TrainingBatch]:
+def _read_frames(run: TrainedRun, frames: Frames, source: SceneReader | PackedScene) -> Iterator[TrainingBatch]:
     """The frames one by one, in memory that is reused."""
     spec = source.spec
     tensors = SampleTensors(spec, run.needs.fields, exposure=spec.exposure, points=run.settings.network.points)
@@ -315,13 +317,6 @@ def _read_frames(run: TrainedRun, frames: Frames, source: SceneReader) -> Iterat
         )
         tensors.fill(memory, 0, sample)
         yield TrainingBatch.of((i,), (b"",), memory)
-
-
-def _open_source(store: str | Path, run: TrainedRun) -> SceneReader:
-    """The samples of the run's scene; StoreError if there is no store, or it lacks the scene."""
-    source = run.source(Store(store).root)
-    _ = source.spec  # which says what is there instead
-    return source
 
 
 def write_gif(pictures: Sequence[Path], file: Path, fps: float) -> None:

@@ -32,6 +32,7 @@ from photonfarm.plan.chosen import Chosen
 from photonfarm.scene.arrangement import Shot, find_doubts, with_fov
 from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces, rest
 from photonfarm.scene.spec import WITHOUT_SHADOWS
+from photonfarm.scene.spec_loading import locate
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import Store
 from photonfarm.store.model.lease import announce_work
@@ -92,11 +93,11 @@ class OpenRun:
     def __init__(self, run: TrainedRun, store: str | Path, device: str = "auto", fov: float | None = None) -> None:
         """Load both, as `open_run` does; the network's device is by default the one that renders."""
         require_renderer(run)
-        from photonfarm.renderer.jobs.render import load_scene, locate
+        from photonfarm.renderer.jobs.render import load_scene
         from photonfarm.renderer.scene import backend
 
-        self.store = Store(store)
-        source = run.source(self.store.root)
+        source = run.scene(store)
+        self.store = None if run.packed else Store(store)
         self.spec, self.scene_id = with_fov(locate(source.spec), fov), run.scene_id
         geometry, self.cloud = source.base()
         self._scene: LoadedScene = load_scene(self.spec)
@@ -176,6 +177,8 @@ class OpenRun:
 
     def plan_sample(self, configuration: Modification, view: View) -> str:
         """Plan it in the store as a sample that was chosen by hand, which workers find; says whether that is new."""
+        if self.store is None:
+            raise SpecError(f"{self._run.folder}: a network on its own has no store to plan a sample in")
         stored = self.store.scene(self.scene_id)
         with announce_work(stored.storage, self.scene_id, "predict", log.warning):
             planned = stored.plan(Chosen.of(self.spec, configuration, view))

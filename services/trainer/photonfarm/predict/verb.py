@@ -1,7 +1,8 @@
-"""The verbs infer and live."""
+"""The verbs infer, live and pack."""
 
 from __future__ import annotations
 
+import os
 import shlex
 import time
 from functools import partial
@@ -18,17 +19,33 @@ from photonfarm.cli.options import (
     start_options,
     store_option,
 )
-from photonfarm.core.formatting import format_count
+from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.trainer.cli.evaluation_verbs import device_option
-from photonfarm.trainer.cli.train_verb import run_option
 
 if TYPE_CHECKING:
     from photonfarm.predict.infer import InferResult
     from photonfarm.scene.arrangement import Shot
+    from photonfarm.trainer.predictors.trained import TrainedRun
 
 
 LIVE_PORT = 8430
+
+run_option = click.option(
+    "--run",
+    type=click.Path(path_type=Path),
+    envvar="PHOTONFARM_RUN",
+    default="run",
+    show_default=True,
+    help="Folder of the training run, or a network on its own, as `photonfarm pack` wrote it.",
+)
+
+
+def _refuse_store(run: TrainedRun, **asked: object) -> None:
+    """Refuse options that need a store, for a network on its own."""
+    if run.packed is not None and (given := [name for name, value in asked.items() if value not in (None, False)]):
+        options = " and ".join(f"--{name.replace('_', '-')}" for name in given)
+        raise click.UsageError(f"{options}: {run.folder} is a network on its own, and there is no store to look in")
 
 
 @click.command()
@@ -118,19 +135,22 @@ def infer(
     if isinstance(along, CameraPath):
         along.sample()  # a faulty one is refused before anything is loaded
     trained = TrainedRun.load(run)
+    _refuse_store(trained, row=row, like=like, store_it=store_it)
     say = partial(click.echo, err=True)
     if along is not None:
         require_renderer(trained)
-        from photonfarm.renderer.jobs.path_buffers import find_views
+        from photonfarm.renderer.jobs.path_buffers import list_views
 
         changes = Arrangement.of(**asked.model_dump(include=set(Arrangement.model_fields)))
-        stored, configuration, views = find_views(store, trained.scene_id, changes, along, row, like)
-        with tell_waiting(say, f"rendering {format_count(len(views), 'frame')} of {stored.spec.name}"):
+        spec = trained.scene(store).spec
+        begin, _ = find_start(store, trained.scene_id, row, like) or (None, None)
+        configuration, views = list_views(spec, changes, along, begin)
+        with tell_waiting(say, f"rendering {format_count(len(views), 'frame')} of {spec.name}"):
             opened = OpenRun(trained, store, device)
             result = shows.show_path(opened, configuration, views, out, fps=fps, amount=amount)
     elif files is not None:
         require_renderer(trained)
-        spec = with_fov(trained.source(store).spec, fov)
+        spec = with_fov(trained.scene(store).spec, fov)
         begin, camera = find_start(store, trained.scene_id, row, like) or (None, None)
         changed, view = asked.apply(spec, begin), asked.view(spec, camera)
         shots = read_shots(spec, cameras, configurations, changed, otherwise=view)
@@ -152,7 +172,7 @@ def infer(
     else:
         require_renderer(trained)
         start = find_start(store, trained.scene_id, row, like)
-        asked.apply(spec := trained.source(store).spec)  # a wrong name is refused before anything is loaded
+        asked.apply(spec := trained.scene(store).spec)  # a wrong name is refused before anything is loaded
         with tell_waiting(say, f"rendering {spec.name}"):
             opened = OpenRun(trained, store, device, fov)
             load_s = time.perf_counter() - began
@@ -208,6 +228,37 @@ def live(
     from photonfarm.web.server import serve
 
     trained = TrainedRun.load(run)
-    begins = f"photonfarm infer --store {shlex.quote(str(store))} --run {shlex.quote(str(run))} --truth 256"
+    _refuse_store(trained, may_submit=may_submit)
+    stored = "" if trained.packed else f"--store {shlex.quote(str(store))} "
+    begins = f"photonfarm infer {stored}--run {shlex.quote(str(run))} --truth 256"
     shown = Live(lambda: OpenRun(trained, store, device), most_spp, begins, may_submit)
     serve(shown.routes(), host=host, port=free_port(port), names=names, say=click.echo, writes=shown.writes())
+
+
+@click.command()
+@store_option
+@run_option
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default="network.photonfarm",
+    show_default=True,
+    help="A file; one that ends in .onnx is the network alone, as ONNX.",
+)
+def pack(store: str | Path, run: Path, out: Path) -> None:
+    """Write a trained network as one file, from which `infer`, `live` and `open_run` predict on any machine.
+
+    It has weights, settings, the scene with its files, and the point cloud; neither samples nor the state of training.
+    With --out NAME.onnx it is the network alone, whose inputs are named as in `photonfarm.data`.
+    """
+    from photonfarm.trainer.predictors.network_file import write_network
+    from photonfarm.trainer.predictors.onnx_file import write_onnx
+    from photonfarm.trainer.predictors.trained import TrainedRun
+    from photonfarm.trainer.runs.run_folder import make_environment
+
+    trained = TrainedRun.load(run)
+    os.environ.update(make_environment(run))
+    write = write_onnx if out.suffix == ".onnx" else write_network
+    with tell_waiting(partial(click.echo, err=True), f"writing {out.name}"):
+        write(trained, store, out)
+    click.echo(f"{out}: {trained.name}, {format_bytes(out.stat().st_size)}")

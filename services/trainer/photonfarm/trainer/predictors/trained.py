@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,13 +13,14 @@ from torch import Tensor
 from photonfarm.core.errors import SpecError
 from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.store import SceneReader
+from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.networks import build, find_needs
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
 from photonfarm.trainer.predictors.evaluation import DevicePredictor, make_network_predictor
 from photonfarm.trainer.predictors.half_filter import HalfFilter, uses_denoiser
+from photonfarm.trainer.predictors.network_file import PackedScene, note_training, read_network
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import usable_device
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings
@@ -29,31 +30,51 @@ from photonfarm.trainer.runs.user_code import is_own, name_in_errors
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TrainedRun:
-    """A run folder with a checkpoint."""
+    """A run folder with a checkpoint, or a network on its own."""
 
-    folder: Path
+    folder: Path  # or the file
     settings: TrainSettings
     scene_id: str
     exposure: float  # of the scene when the run began
     weights: dict[str, Any]  # that predict: averaged over its steps, if the run averages
     halves: int = 1  # of a network of halves: it is given the mean of so many
+    packed: PackedScene | None = None  # of a network on its own
+    trained: Mapping[str, Any] = field(default_factory=dict)  # how far and on what, as a checkpoint says
 
     @classmethod
     def load(cls, folder: Path, name: str = CHECKPOINT) -> Self:
-        """The run with the weights of the checkpoint of this name, by default the last one.
+        """The run with the weights of the checkpoint of this name, by default the last one; or a network on its own.
 
         Raises StoreError if the folder is not a run with a readable checkpoint, SpecError if its settings are not those
-        of the checkpoint.
+        of the checkpoint; and what `read_network` does.
         """
+        if folder.is_file():
+            settings, state, packed = read_network(folder)
+            spec = packed.spec
+            return cls(
+                folder, settings, spec.scene_id, spec.exposure, state["network"], 1, packed, note_training(state)
+            )
         settings, state = read_settings(folder), checkpoint.load(folder / name)
         identity = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
         checkpoint.check_continues(folder / name, state, identity)
         weights = average["weights"] if (average := state.get("average")) else state["network"]
-        return cls(folder, settings, str(state["scene_id"]), float(state["exposure"]), weights)
+        of_scene = str(state["scene_id"]), float(state["exposure"])
+        return cls(folder, settings, *of_scene, weights, trained=note_training(state))
 
     def source(self, store: str | Path) -> SceneReader:
         """The samples of its scene in a store, exposed as they were when the run began."""
         return SceneReader(store, self.scene_id, exposure=self.exposure)
+
+    def scene(self, store: str | Path) -> SceneReader | PackedScene:
+        """What has the scene's `spec` and `base()`: a store, or the network's own file.
+
+        Raises StoreError if there is no store, or it lacks the scene.
+        """
+        if self.packed is not None:
+            return self.packed
+        source = self.source(Store(store).root)
+        _ = source.spec  # which says what is there instead
+        return source
 
     def network(self, spec: SceneSpec, base: tuple[Geometry, BasePointCloud]) -> Network:
         """The trained network, on the CPU, for the scene that it was trained on."""

@@ -128,7 +128,7 @@ def _translations() -> dict[Any, Any]:
         first, second = op.Constant(value_ints=[0]), op.Constant(value_ints=[1])
         places = op.Range(zero, op.ReduceSum(repeats, keepdims=0), one)
         past = op.GreaterOrEqual(op.Unsqueeze(places, second), op.Unsqueeze(op.CumSum(repeats, zero), first))
-        return op.ReduceSum(op.Cast(past, to=INT64.dtype), second, keepdims=0)
+        return op.ReduceSum(op.Cast(past, to=int(INT64.dtype)), second, keepdims=0)
 
     aten = torch.ops.aten
     return {aten.nonzero_static.default: find_nonzero, aten.repeat_interleave.Tensor: repeat_places}

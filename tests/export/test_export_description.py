@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import store_samples as samples
 import yaml
-from exports import exported, planned, several
+from exports import commit, exported, planned, read, several
 
 from photonfarm.data import open_scene
+from photonfarm.scene.shot_files import read_cameras
 from photonfarm.scene.view import Camera
 from photonfarm.store import SceneStore
 
@@ -31,6 +32,22 @@ def test_the_cameras_of_transforms_show_what_the_samples_show(scene: SceneStore,
         u, v, w = intrinsics @ (x, -y, -z)
         np.testing.assert_allclose((u / w, v / w), pixel, atol=1e-4)
     assert document["camera_angle_x"] == pytest.approx(2 * np.arctan(document["cx"] / document["fl_x"]))
+
+
+@pytest.mark.parametrize("to", ["exr", "npz", "parquet"])
+def test_a_field_of_view_of_each_view_is_exported(tmp_path: Path, to: str) -> None:
+    """It comes back as the same cameras."""
+    view = samples.small_spec().view.model_dump() | {"fov": {"min": 40, "max": 80}}
+    scene = planned(tmp_path / "store", modifications=2, view=view, **samples.ALWAYS)
+    commit(scene, 0)
+    exported(scene, tmp_path / "out", to, buffers="none", **several(to))
+    wanted = scene.plans()[0].rows.view[:2]
+    for row, found in read(tmp_path / "out", to).items():
+        assert float(found["fov"]) == wanted[row, 6]
+    assert "40° to 80°" in (tmp_path / "out/README.md").read_text()
+    if to == "exr":
+        cameras = read_cameras(tmp_path / "out/transforms.json", scene.spec)
+        np.testing.assert_array_equal([camera.vector for camera in cameras], wanted)
 
 
 def test_the_manifest_says_where_the_samples_came_from(scene: SceneStore, tmp_path: Path) -> None:

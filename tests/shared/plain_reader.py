@@ -243,12 +243,13 @@ def rays(view, spec):
     """The unit directions through the centres of the pixels, (H, W, 3)."""
     width, height = spec["film"]["width"], spec["film"]["height"]
     up = np.array(spec["view"]["up"])
-    forward = normalised(view[3:] - view[:3])
+    forward = normalised(view[3:6] - view[:3])
     if np.linalg.norm(np.cross(forward, up)) <= 1e-6:
         up = up[[2, 0, 1]]
     right = normalised(np.cross(forward, up))
     down = np.cross(forward, right)
-    focal = width / 2 / np.tan(np.radians(spec["view"]["fov_deg"]) / 2)
+    fov_deg = view[6] if len(view) > 6 and view[6] else spec["view"]["fov_deg"]
+    focal = width / 2 / np.tan(np.radians(fov_deg) / 2)
     y, x = np.mgrid[:height, :width][..., None] + 0.5
     return normalised((x - width / 2) / focal * right + (y - height / 2) / focal * down + forward)
 

@@ -131,7 +131,7 @@ def submit(
         start = find_start(store, named.spec.scene_id, row, like) or (None, None)
         modification = asked.apply(named.spec, start[0])
         if cameras or configurations:
-            _refuse_given("files say what is planned", "modifications", "camera", "look_at")
+            _refuse_given("files say what is planned", "modifications", "camera", "look_at", "fov")
             _refuse_given("is of random views; --cameras has them all", *(("views", "seed") if cameras else ()))
             views, seed = request.views_per_modification, request.seed
             chosen = read_shots(named.spec, cameras, configurations, modification, views=views, seed=seed)

@@ -279,6 +279,12 @@ def arrangement_options(*, camera: bool = True) -> Callable[[Callable[..., Any]]
         of_camera = (
             click.option("--camera", help="Where the camera stands.", **point),
             click.option("--look-at", help="The point that it looks at.", **point),
+            click.option(
+                "--fov",
+                type=click.FloatRange(1, 170),
+                metavar="DEGREES",
+                help="Its field of view along the width.  [default: spec's]",
+            ),
         )
         return combine_options(
             *(
@@ -315,7 +321,3 @@ shot_file_options = combine_options(
     ),
 )
 """Files of what stands where and of what looks at it, as `read_shots` takes them."""
-
-fov_option = click.option(
-    "--fov", type=click.FloatRange(1, 170), metavar="DEGREES", help="Field of view along the width.  [default: spec's]"
-)

@@ -58,7 +58,7 @@ def print_scene(spec: SceneSpec, as_json: bool) -> None:
             ("scene id", spec.scene_id),
             ("source", source.file or f"built-in {source.builtin}"),
             ("kind", f"dynamic, {format_count(len(spec.groups), 'movable group')}" if spec.groups else "static"),
-            ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.fov_deg:g}°"),
+            ("film", f"{spec.film.width} × {spec.film.height}, field of view {spec.view.describe_fov()}"),
             ("light transport", f"depth {t.max_depth}, {_describe_strategy(t)}"),
             *([("on a card", _describe_strategy(t.on_card))] if t.card else []),
             ("half-estimates", f"2 × {t.half_spp} samples per pixel"),

@@ -29,7 +29,7 @@ def make_key(*parts: Part) -> Key:
 
 
 def view_key(modification_key: Key, view: NDArray[np.float32]) -> Key:
-    """The content key of a view of a configuration; `view` is the view's vector (6,)."""
+    """The content key of a view of a configuration; `view` is the view's vector (D,)."""
     return make_key("view", modification_key, view)
 
 

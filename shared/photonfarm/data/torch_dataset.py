@@ -19,7 +19,7 @@ from photonfarm.core.errors import SpecError
 from photonfarm.core.records import Guides, Photons
 from photonfarm.scene.modification import columns
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.view import Camera
+from photonfarm.scene.view import Camera, view_columns
 from photonfarm.store.format.schema import output_arrays
 from photonfarm.store.read.batch import Batch, Sample
 
@@ -65,7 +65,8 @@ class SampleTensors:
 
     By name, as `Sample` has them: `radiance` (2, H, W, 3), `albedo` (H, W, 3), `normal` (H, W, 3), `depth` (H, W), and
     the guides; `modification` (G, C), the translation of each group, 1 if it is present, and `modification.FURTHER`;
-    `view` (6,), the camera's origin and target; `world_to_camera` (3, 4); the points of the configuration,
+    `view` (6,), the camera's origin and target, and (7,) with a field of view where each has its own; `world_to_camera`
+    (3, 4), and there `focal_px` (), the focal length in pixels; the points of the configuration,
     `point_position`, `point_normal`, `point_emission` (P, 3), `point_present` and `point_seen` (P,); and its photons,
     `photon_position` (K, 3) and so on to `photon_seen` (K,).
     """
@@ -75,10 +76,12 @@ class SampleTensors:
     ) -> None:
         """Take the names; light is multiplied by `exposure`, and of the scene's points there are the first `points`.
 
-        All of `POINTS` come with `POINT_SURFACES` in a scene whose configurations change these.
+        All of `POINTS` come with `POINT_SURFACES` in a scene whose configurations change these, and `world_to_camera`
+        with `focal_px` where each view has its own field of view.
         """
         surfaces = POINT_SURFACES if spec.further_changes and {*POINTS} <= {*fields} else ()
-        self._spec, self.fields, self._exposure = spec, tuple(dict.fromkeys([*fields, *surfaces])), exposure
+        lens = ("focal_px",) if spec.view.fov is not None and "world_to_camera" in fields else ()
+        self._spec, self.fields, self._exposure = spec, tuple(dict.fromkeys([*fields, *surfaces, *lens])), exposure
         self._points = spec.points if points is None else min(points, spec.points)
 
     def empty(self, size: int, *, pinned: bool = False) -> dict[str, Tensor]:
@@ -106,6 +109,8 @@ class SampleTensors:
             return np.ascontiguousarray(getattr(sample, name).vector, np.float32)
         if name == "world_to_camera":
             return Camera.of(sample.view, self._spec).world_to_camera
+        if name == "focal_px":
+            return np.array(Camera.of(sample.view, self._spec).focal_px)
         if name in (*POINTS, *POINT_SURFACES):
             points: NDArray[Any] = getattr(sample.point_cloud, name.removeprefix("point_"))
             return points[: self._points]
@@ -117,7 +122,7 @@ class SampleTensors:
 
     def _shape(self, name: str) -> tuple[int, ...]:
         points, photons = (self._points,), (self._spec.photons.slots,)
-        shapes: dict[str, tuple[int, ...]] = {"view": (6,)}
+        shapes: dict[str, tuple[int, ...]] = {"view": (view_columns(self._spec),), "focal_px": ()}
         shapes["modification"] = len(self._spec.groups), columns(self._spec)
         shapes |= {"world_to_camera": (3, 4)} | dict.fromkeys(("point_position", *POINT_SURFACES), (*points, 3))
         shapes |= {"point_present": points, "point_seen": points, "photon_seen": photons, "photon_bounce": photons}
@@ -141,7 +146,7 @@ class SceneDataset(Dataset[dict[str, Any]]):
         without = () if getattr(samples, "has_guides", True) else GUIDES
         exist = [
             name
-            for name in (*DEFAULT, "world_to_camera", *POINTS, *POINT_SURFACES, *PHOTONS, "photon_seen")
+            for name in (*DEFAULT, "world_to_camera", "focal_px", *POINTS, *POINT_SURFACES, *PHOTONS, "photon_seen")
             if name not in without
         ]
         chosen = tuple([name for name in DEFAULT if name in exist] if fields is None else fields)

@@ -153,12 +153,16 @@ def _format_origin(manifest: Manifest) -> str:
         f"- scene id {manifest.scene.id}, store {manifest.store}",
         f"- committed jobs {manifest.jobs} of {len(manifest.plans)} plans, rows {manifest.rows} of the store",
         f"- half-estimates of {about['half_spp']} samples per pixel each; exposure {about['exposure']:g} for display",
-        f"- {camera['width']} × {camera['height']} pixels, field of view {camera['fov_deg']:g}° along the width",
+        f"- {camera['width']} × {camera['height']} pixels, field of view {_describe_fov(camera)} along the width",
         f"- movable groups, in the order of `modification`: {groups}",
         f"- held out: a share {manifest.settings.hold_out:g} of the configurations, chosen by a hash of their content",
         "- versions and plans: export.json",
     ]
     return "\n".join(parts)
+
+
+def _describe_fov(camera: dict[str, Any]) -> str:
+    return "{min:g}° to {max:g}°".format_map(camera["fov"]) if "fov" in camera else f"{camera['fov_deg']:g}°"
 
 
 CROISSANT = "croissant.json"

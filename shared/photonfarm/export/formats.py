@@ -34,6 +34,7 @@ from photonfarm.export.snapshot import (
     parse_rows,
     select_facts,
 )
+from photonfarm.scene.view import Camera
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -122,13 +123,16 @@ class Exr(Format):
         snapshot, frames = exported.snapshot, []
         for row in parse_rows(exported.manifest.rows):
             modification, view = snapshot.inputs(row)
-            frame = {
+            frame: dict[str, Any] = {
                 "file_path": f"{SAMPLES}/{row:08d}{Exr.SUFFIX}",
                 "transform_matrix": camera_to_world(view, snapshot.spec).tolist(),
                 "look_at": view.target.tolist(),
                 "configuration_key": modification.key(snapshot.spec.radiance_id).hex(),
                 "split": snapshot.split_of(row),
             }
+            if view.fov is not None:
+                focal_px = Camera.of(view, snapshot.spec).focal_px
+                frame |= {"fl_x": focal_px, "fl_y": focal_px, "camera_angle_x": float(np.radians(view.fov))}
             frames.append(frame)
         document = {**head, **focal, "w": width, "h": height, "up": camera["up"], "frames": frames}
         with store_errors("write the cameras", exported.folder):

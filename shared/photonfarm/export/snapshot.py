@@ -136,6 +136,7 @@ def _list_facts(spec: SceneSpec) -> list[Column]:
         ("origin", "float32", (3,), "scene units", "where the camera stands, world coordinates"),
         ("target", "float32", (3,), "scene units", "the point that it looks at, world coordinates"),
         ("camera_to_world", "float64", (4, 4), "scene units", camera),
+        *([("fov", "float32", (), "degrees", "the camera's field of view, along the width")] if spec.view.fov else []),
         ("seed_A", "int64", (), "1", "seed of A; a render that was not finite was drawn again with another"),
         ("seed_B", "int64", (), "1", "seed of B, likewise"),
         ("job", "int64", (), "1", "the render job that it came from"),
@@ -253,6 +254,7 @@ class Snapshot:
             "origin": sample.view.origin,
             "target": sample.view.target,
             "camera_to_world": camera_to_world(sample.view, self.spec),
+            "fov": None if sample.view.fov is None else float(sample.view.fov),
             "seed_A": seed_a,
             "seed_B": seed_b,
             "job": job,
@@ -290,6 +292,7 @@ def describe_constants(spec: SceneSpec) -> dict[str, Any]:
             "width": width,
             "height": spec.film.height,
             "up": list(spec.view.up),
+            **({"fov": spec.view.fov.model_dump()} if spec.view.fov else {}),  # from which each view has its own
         },
         "half_spp": spec.transport.half_spp,
         "exposure": spec.exposure,

@@ -36,7 +36,9 @@ class Chosen(Frozen):
     def of_all(cls, spec: SceneSpec, views: Iterable[tuple[Modification, View]], passes: int = 1) -> Self:
         """The request for passes of several views, each with its configuration; SpecError for too many."""
         said = [list_shot(spec, configuration, view) for configuration, view in views]
-        shots = tuple(Shot.of(**{key: value for key, value in each.items() if key != "fov"}) for each in said)
+        if spec.view.fov is None:
+            _check_fov(spec, [each.pop("fov") for each in said])
+        shots = tuple(Shot.of(**each) for each in said)
         if len(shots) * passes > MAX_SAMPLES:
             raise SpecError(f"names {len(shots) * passes} samples; at most {MAX_SAMPLES} fit one request")
         return cls(shots=shots, passes=passes)
@@ -50,6 +52,15 @@ class Chosen(Frozen):
     def views_per_modification(self) -> int:
         """The views that each configuration has at least."""
         return 1
+
+
+def _check_fov(spec: SceneSpec, asked: Iterable[float]) -> None:
+    """Raise SpecError for a field of view that views of a spec cannot have."""
+    for fov_deg in asked:
+        if fov_deg != spec.view.fov_deg:
+            raise SpecError(
+                f"fov = {fov_deg:g}: samples of this spec have {spec.view.fov_deg:g}; a range, view.fov, allows more"
+            )
 
 
 def expand_chosen(

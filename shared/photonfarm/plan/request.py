@@ -1,7 +1,7 @@
 """A request for samples, expanded into rows and jobs, without what is planned already; and samples of another store.
 
-Shape letters: R rows of a plan, G movable groups, C columns of the scene's modification vectors. J is `shard_rows`, the
-samples of one job.
+Shape letters: R rows of a plan, G movable groups, C columns of the scene's modification vectors, D of its view
+vectors. J is `shard_rows`, the samples of one job.
 
 A request names every combination of its modifications, of `views_per_modification` views of each, and of `passes` noisy
 passes of each view. Configurations that come out equal (both objects removed, say) are one modification, which gets the
@@ -32,7 +32,7 @@ from photonfarm.core.models import Frozen, sentences
 from photonfarm.core.records import F32
 from photonfarm.scene.modification import FIELDS, Modification, modification_keys, rest, sample_modifications
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.view import sample_views
+from photonfarm.scene.view import AXES, sample_views
 
 SHARD_ROWS = 32
 """The default number of samples per job, if neither the caller nor an older plan of the scene sets it."""
@@ -95,7 +95,7 @@ class PlannedRows:
     """The inputs of a plan, R rows each; row numbers run through all plans of a scene."""
 
     modification: F32  # (R, G, C) modification vectors; NaN where no modification has its row
-    view: F32  # (R, 6) origin and look-at point; NaN where no view has its row
+    view: F32  # (R, D) view vectors; NaN where no view has its row
     sample_modification: NDArray[np.int64]  # (R,) row of the sample's modification, or UNUSED
     sample_view: NDArray[np.int64]  # (R,) row of the sample's view, or UNUSED
     sample_pass: NDArray[np.int32]  # (R,) pass number, or UNUSED
@@ -104,11 +104,11 @@ class PlannedRows:
     view_density: F32  # (R,) likewise of the view, given the configuration
 
     @classmethod
-    def empty(cls, rows: int, groups: int, columns: int = len(FIELDS)) -> PlannedRows:
+    def empty(cls, rows: int, groups: int, columns: int = len(FIELDS), view_columns: int = len(AXES)) -> PlannedRows:
         """Rows that hold nothing yet."""
         return cls(
             np.full((rows, groups, columns), np.nan, np.float32),
-            np.full((rows, 6), np.nan, np.float32),
+            np.full((rows, view_columns), np.nan, np.float32),
             np.full(rows, UNUSED, np.int64),
             np.full(rows, UNUSED, np.int64),
             np.full(rows, UNUSED, np.int32),
@@ -120,8 +120,9 @@ class PlannedRows:
     def without(self, spans: Iterable[range]) -> PlannedRows:
         """The same rows, but for some spans, which hold nothing."""
         left = PlannedRows(*(getattr(self, each.name).copy() for each in fields(self)))
+        columns = *self.modification.shape[1:], self.view.shape[1]
         for span in spans:
-            nothing = PlannedRows.empty(len(span), *self.modification.shape[1:])
+            nothing = PlannedRows.empty(len(span), *columns)
             for each in fields(self):
                 getattr(left, each.name)[span.start : span.stop] = getattr(nothing, each.name)
         return left
@@ -175,7 +176,7 @@ class PlannedContent:
         return uniform
 
     def vectors(self, kind: Literal["modification", "view"], rows: NDArray[np.int64]) -> F32:
-        """The vectors in some rows of modifications, (N, G, C), or of views, (N, 6)."""
+        """The vectors in some rows of modifications, (N, G, C), or of views, (N, D)."""
         first_rows = np.array([first_row for first_row, _ in self.plans])
         of_row = np.searchsorted(first_rows, rows, side="right") - 1
         vectors = np.empty((len(rows), *getattr(self.plans[0][1], kind).shape[1:]), np.float32)
@@ -205,7 +206,7 @@ def _own(references: NDArray[np.int64], first_row: int) -> tuple[NDArray[np.int6
 
 
 def view_contents(modification_rows: NDArray[np.int64], views: F32) -> list[bytes]:
-    """The lookup keys of views (N, 6), given the rows (N,) of their modifications."""
+    """The lookup keys of views (N, D), given the rows (N,) of their modifications."""
     rows = modification_rows.astype("<i8").tobytes()
     return [rows[8 * i : 8 * i + 8] + view for i, view in enumerate(contents(views))]
 
@@ -216,7 +217,7 @@ class SamplesToPlan:
 
     modification: F32  # (M, G, C)
     modification_row: NDArray[np.int64]  # (M,) the row of one that is planned already, or UNUSED
-    view: F32  # (V, 6)
+    view: F32  # (V, D)
     view_row: NDArray[np.int64]  # (V,) the row of one that is planned already, or UNUSED
     sample_modification: NDArray[np.int64]  # (S,) which of the modifications
     sample_view: NDArray[np.int64]  # (S,) which of the views
@@ -264,7 +265,7 @@ def expand_views(
     first_job: int,
     shard_rows: int,
 ) -> Expansion:
-    """The rows of what is new of so many passes of views (V, 6), in the order of their modifications (V,) of (M, G, C).
+    """The rows of what is new of so many passes of views (V, D), in the order of their modifications (V,) of (M, G, C).
 
     `density` is that of all of them, as `PlannedRows` has it; a static scene's only configuration has 1.
     """
@@ -293,13 +294,13 @@ def expand_views(
 
 
 def sample_keys(radiance_id: str, modifications: F32, views: F32, passes: Iterable[int]) -> list[Key]:
-    """The content keys of samples of configurations (N, G, C) and views (N, 6), by the numbers of their passes (N,)."""
+    """The content keys of samples of configurations (N, G, C) and views (N, D), by the numbers of their passes (N,)."""
     samples = zip(modifications, views, passes, strict=True)
     return [make_key("sample", radiance_id, modification, view, int(pass_)) for modification, view, pass_ in samples]
 
 
 def sample_key(radiance_id: str, modification: Modification, view: F32, pass_: int) -> Key:
-    """The content key of one sample; `view` is the view's vector (6,)."""
+    """The content key of one sample; `view` is the view's vector (D,)."""
     return sample_keys(radiance_id, modification.vector[None], view[None], [pass_])[0]
 
 
@@ -331,7 +332,8 @@ def expand_samples(samples: SamplesToPlan, *, first_job: int, shard_rows: int, k
     count, first_row = len(samples.sample_pass), first_job * shard_rows
     if not count:
         return Expansion(None, 0, known, Extent())
-    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, *samples.modification.shape[1:])
+    columns = *samples.modification.shape[1:], samples.view.shape[1]
+    rows = PlannedRows.empty(-(-count // shard_rows) * shard_rows, *columns)
     modification_row, modified = _place(samples.sample_modification, samples.modification_row, first_row, shard_rows)
     rows.modification[modification_row[modified] - first_row] = samples.modification[modified]
     density = samples.modification_density

@@ -15,10 +15,10 @@ from pydantic import BeforeValidator, Field, ValidationError
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import Factor, Frozen, nearest, sentences
-from photonfarm.scene.groups import Box, Light, Movable
+from photonfarm.scene.groups import Box, Degrees, Light, Movable
 from photonfarm.scene.modification import Modification, rest
-from photonfarm.scene.spec import SceneSpec, ViewSpec
-from photonfarm.scene.view import View, are_in_free_space, are_in_group, sample_view
+from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import View, are_in_free_space, are_in_group, field_of_view, sample_view
 
 SLACK = 1e-4
 """How far beyond a box nothing is said, in scene units: float32 has no more digits."""
@@ -155,12 +155,13 @@ class Shot(Arrangement):
 
     camera: Point | None = None  # where it stands, scene units
     look_at: Point | None = None  # the point that it looks at
+    fov: Degrees | None = Field(default=None, exclude_if=lambda said: said is None)  # along the image's width
 
     def view(self, spec: SceneSpec, start: View | None = None) -> View:
         """The view that this makes of another one, by default of the scene's first one at rest.
 
-        A camera without a point to look at looks at the middle of the spec's box, unless there is a start. Raises
-        SpecError for a camera that would look at itself.
+        A camera without a point to look at looks at the middle of the spec's box, and one without a field of view has
+        the spec's `fov_deg`, unless there is a start. Raises SpecError for a camera that would look at itself.
         """
         view = start or sample_view(spec, rest(spec).key(spec.radiance_id), 0, 0)
         target = view.target
@@ -168,7 +169,11 @@ class Shot(Arrangement):
             target = np.array(self.look_at, np.float32)
         elif start is None and self.camera is not None:
             target = (0.5 * (spec.view.look_at.low + spec.view.look_at.high)).astype(np.float32)
-        made = View(view.origin if self.camera is None else np.array(self.camera, np.float32), target)
+        fov = self.fov
+        if fov is None and view.fov is not None and (start is not None or self.camera is None):
+            fov = float(view.fov)
+        origin = view.origin if self.camera is None else np.array(self.camera, np.float32)
+        made = View(origin, target, field_of_view(spec, fov))
         if np.array_equal(made.origin, made.target):
             raise SpecError(f"camera = {_text(_shorten(made.origin))}: is where it looks at; give another look_at")
         return made
@@ -189,13 +194,15 @@ def describe_shot(spec: SceneSpec, modification: Modification, view: View) -> st
     """A configuration and a view as options of the command line."""
     stands = Arrangement.from_modification(spec, modification).describe()
     camera = f"--camera {_text(_shorten(view.origin))} --look-at {_text(_shorten(view.target))}"
-    return f"{stands} {camera}".lstrip()
+    fov = "" if view.fov is None else f" --fov {float(str(view.fov)):.9g}"
+    return f"{stands} {camera}{fov}".lstrip()
 
 
 def list_shot(spec: SceneSpec, modification: Modification, view: View) -> dict[str, Any]:
     """A configuration and a view by names, for JSON."""
     stands = Arrangement.from_modification(spec, modification).model_dump(mode="json", exclude={"move"})
-    return {**stands, "camera": _shorten(view.origin), "look_at": _shorten(view.target), "fov": spec.view.fov_deg}
+    fov = spec.view.fov_deg if view.fov is None else float(str(view.fov))
+    return {**stands, "camera": _shorten(view.origin), "look_at": _shorten(view.target), "fov": fov}
 
 
 def _shorten(point: NDArray[np.float32]) -> list[float]:
@@ -214,20 +221,7 @@ def _text(point: Any) -> str:
     return ",".join(f"{value:.9g}" for value in point)
 
 
-def with_fov(spec: SceneSpec, fov_deg: float | None) -> SceneSpec:
-    """The spec with another field of view; as it is for None. Raises SpecError for one that no camera has."""
-    if fov_deg is None:
-        return spec
-    view = spec.view.model_dump() | {"fov_deg": fov_deg}
-    try:
-        return spec.model_copy(update={"view": ViewSpec.model_validate(view)})
-    except ValidationError as error:
-        raise SpecError("; ".join(sentences(error))) from error
-
-
-def find_doubts(
-    spec: SceneSpec, modification: Modification, view: View | None = None, trained_fov_deg: float | None = None
-) -> list[str]:
+def find_doubts(spec: SceneSpec, modification: Modification, view: View | None = None) -> list[str]:
     """What no sample of a spec shows: groups beyond their boxes, groups that are never removed, cameras elsewhere.
 
     Each is a sentence. The renderer's `look_closer` finds what needs the scene's surfaces.
@@ -240,10 +234,13 @@ def find_doubts(
             doubts.append(f"{group.name} is there, and in the spec it never is")
         elif now[3] and not np.array_equal(now, before):
             doubts += _find_beyond(group, now)
-    if trained_fov_deg not in (None, spec.view.fov_deg):
-        doubts.append(f"the field of view is {spec.view.fov_deg:g}°, not {trained_fov_deg:g}°")
     if view is None:
         return doubts
+    if view.fov is not None:
+        low, high = (spec.view.fov.min, spec.view.fov.max) if spec.view.fov else (spec.view.fov_deg, spec.view.fov_deg)
+        if not low - SLACK <= view.fov <= high + SLACK:
+            usual = f"not {low:g}°" if low == high else f"outside {low:g}° to {high:g}°"
+            doubts.append(f"the field of view is {view.fov:g}°, {usual}")
     for what, point, box in (
         ("the camera stands", view.origin, spec.view.origin),
         ("the camera looks", view.target, spec.view.look_at),

@@ -191,10 +191,11 @@ class Frames:
 
     def write(self, file: Path) -> None:
         """Store them as a NumPy archive, whole or not at all; raises StoreError if the disk refuses."""
+        longest = max(len(view.vector) for view in self.views)  # a field of view of 0 is the spec's
         arrays: dict[str, NDArray[Any]] = {
             "scene_id": np.array(self.scene_id),
             "modification": self.modification.vector,
-            "view": np.stack([view.vector for view in self.views]),
+            "view": np.stack([np.pad(view.vector, (0, longest - len(view.vector))) for view in self.views]),
             **{name: getattr(self, name) for name in _OF_VIEWS},
             **{f"guide_{name}": array for name, array in arrays_of(self.guides).items()},
         }

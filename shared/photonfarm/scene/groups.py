@@ -55,6 +55,17 @@ class Range(Frozen):
         return self
 
 
+Degrees = Annotated[float, Field(ge=1, le=170)]
+"""A camera's field of view along the image's width."""
+
+
+class Fov(Range):
+    """Fields of view in degrees, along the image's width."""
+
+    min: Degrees
+    max: Degrees
+
+
 class Turn(Range):
     """Angles in degrees, about the up axis: counter-clockwise as seen from above."""
 

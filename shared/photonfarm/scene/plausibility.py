@@ -53,10 +53,11 @@ def group_key(spec: SceneSpec, index: int) -> str:
 def _check_view(spec: SceneSpec) -> Iterator[Doubt]:
     view, (narrow, wide) = spec.view, USUAL_FOV
     usual = "40 to 90 degrees are usual in rooms"
-    if view.fov_deg < narrow:
-        yield "view.fov_deg", f"fov_deg = {view.fov_deg:g} shows as little as a telescope does; {usual}"
-    if view.fov_deg > wide:
-        yield "view.fov_deg", f"fov_deg = {view.fov_deg:g} stretches what is near the image's edges; {usual}"
+    key, least, most = ("fov", view.fov.min, view.fov.max) if view.fov else ("fov_deg", view.fov_deg, view.fov_deg)
+    if least < narrow:
+        yield f"view.{key}", f"{key} = {least:g} shows as little as a telescope does; {usual}"
+    if most > wide:
+        yield f"view.{key}", f"{key} = {most:g} stretches what is near the image's edges; {usual}"
     gap = _gap(view.origin, view.look_at)
     places = [group.at for group in spec.groups if not group.stays]
     spread = float(np.linalg.norm(np.ptp(places, axis=0))) if places else 0.0

@@ -34,16 +34,18 @@ def read_shots(
     views: int = 1,
     seed: int = 0,
     otherwise: View | None = None,
+    fov: float | None = None,
 ) -> list[tuple[Modification, View]]:
     """The views of a spec that two files say, each with its configuration.
 
     Configurations change `start`, by default the scene at rest, which is the only one without their file. Each is seen
     by its own camera if it has one, else by all `cameras`; without that file from one view `otherwise`, or else by so
-    many random `views`, of a master seed. Raises SpecError for what is no such file, and for what the spec cannot have.
+    many random `views`, of a master seed. `fov`, in degrees, is that of cameras of which no file says it, by default
+    the spec's. Raises SpecError for what is no such file, and for what the spec cannot have.
     """
-    seen_by = read_cameras(cameras, spec) if cameras else [otherwise] if otherwise else []
+    seen_by = read_cameras(cameras, spec, fov) if cameras else [otherwise] if otherwise else []
     start = rest(spec) if start is None else start
-    arranged = [(start, None)] if configurations is None else read_configurations(configurations, spec, start)
+    arranged = [(start, None)] if configurations is None else read_configurations(configurations, spec, start, fov)
     shots: list[tuple[Modification, View]] = []
     for modification, own in arranged:
         key = modification.key(spec.radiance_id)
@@ -55,21 +57,23 @@ def read_shots(
 # -------------------------------------------------------------------------------------------------------------- cameras
 
 
-def read_cameras(file: Path, spec: SceneSpec) -> list[View]:
+def read_cameras(file: Path, spec: SceneSpec, fov: float | None = None) -> list[View]:
     """The views in a `transforms.json`, as nerfstudio and `photonfarm export --to exr` write it.
 
-    Its world is the scene's. Raises SpecError for a camera that is not upright, or has another field of view, another
-    aspect, or a lens that distorts.
+    Its world is the scene's, and each has its field of view, `fov` where it is not said. Raises SpecError for a camera
+    that is not upright, or has another aspect, or a lens that distorts.
     """
     document = _read_json(file)
     frames = document.get("frames") if isinstance(document, Mapping) else None
     if not isinstance(frames, list) or not frames:
         raise SpecError(f"{file}: has no frames; a transforms.json has a list of them, each with a transform_matrix")
     count = len(frames)
-    return [_read_camera(document, frame, spec, f"{file}: frame {n} of {count}") for n, frame in enumerate(frames, 1)]
+    return [
+        _read_camera(document, frame, spec, fov, f"{file}: frame {n} of {count}") for n, frame in enumerate(frames, 1)
+    ]
 
 
-def _read_camera(document: Mapping[str, Any], frame: Any, spec: SceneSpec, where: str) -> View:
+def _read_camera(document: Mapping[str, Any], frame: Any, spec: SceneSpec, fov: float | None, where: str) -> View:
     """The view of a frame, with what is said of all frames; its own `look_at` if it has one."""
     try:
         camera = {**document, **frame}
@@ -82,8 +86,8 @@ def _read_camera(document: Mapping[str, Any], frame: Any, spec: SceneSpec, where
         raise SpecError(f"{where}: is no camera: {error!r}; a transform_matrix of 4 × 4 numbers is required") from error
     if to_world.shape != (3, 4) or not (np.isfinite(to_world).all() and to_world[:, :3].any(axis=0).all()):
         raise SpecError(f"{where}: transform_matrix: 4 × 4 finite numbers are required, of a rotation and a place")
-    if fov_deg is not None and abs(fov_deg - spec.view.fov_deg) > FOV_SLACK_DEG:
-        raise SpecError(f"{where}: has a field of view of {fov_deg:.2f}°, and the spec of {spec.view.fov_deg:g}°")
+    if fov_deg is not None and spec.view.fov is None and abs(fov_deg - spec.view.fov_deg) <= FOV_SLACK_DEG:
+        fov_deg = spec.view.fov_deg
     if abs(aspect - spec.film.width / spec.film.height) > 1e-3 * aspect:
         raise SpecError(f"{where}: its image is {aspect:.3f} times as wide as high, and the spec's film is not")
     if any(lens):
@@ -95,7 +99,7 @@ def _read_camera(document: Mapping[str, Any], frame: Any, spec: SceneSpec, where
         distance = float((middle - origin) @ ahead)
         look_at = origin + ahead * (distance if distance > spec.view.near else 1.0)
     try:
-        view = Shot.of(camera=origin, look_at=look_at).view(spec)
+        view = Shot.of(camera=origin, look_at=look_at, fov=fov if fov_deg is None else fov_deg).view(spec)
     except SpecError as error:
         raise SpecError(f"{where}: {error}") from error
     made = Camera.of(view, spec)
@@ -124,14 +128,14 @@ def _angle_between(one: Any, other: Any) -> float:
 
 
 def read_configurations(
-    file: Path, spec: SceneSpec, start: Modification | None = None
+    file: Path, spec: SceneSpec, start: Modification | None = None, fov: float | None = None
 ) -> list[tuple[Modification, View | None]]:
-    """The configurations in a file, by names, as changes of `start`, each with its camera if it has one.
+    """The configurations in a file, by names, as changes of `start`, each with its camera if it has one of its own.
 
     JSON is a table with the fields of a `Shot`, as `photonfarm infer` writes it, or a list. CSV has a column for each
     number: `sofa.x`, `sofa.y` and `sofa.z` are where that stands, `sofa.present` is 0 where it is not there,
     `sofa.turn`, `lamp.power`, `lamp.red`, `lamp.green`, `lamp.blue` are as the modification vector has them, `camera.x`
-    … `look_at.z` the camera's; an empty cell changes nothing.
+    … `look_at.z` and `fov` the camera's; an empty cell changes nothing.
     """
     is_table = file.suffix.lower() == ".csv"
     entries = dict(_read_table(file) if is_table else _read_list(file))
@@ -140,11 +144,9 @@ def read_configurations(
     found: list[tuple[Modification, View | None]] = []
     for where, entry in entries.items():
         try:
-            fov_deg = entry.pop("fov", spec.view.fov_deg)
-            if fov_deg != spec.view.fov_deg:
-                raise SpecError(f"fov = {fov_deg}: samples of this spec have {spec.view.fov_deg:g}")
-            shot = Shot.of(**_fill_places(entry, spec, start) if is_table else entry)
-            own = shot.view(spec) if shot.camera or shot.look_at else None
+            shot = Shot.of(**{"fov": fov} | (_fill_places(entry, spec, start) if is_table else entry))
+            is_own = shot.camera or shot.look_at or (shot.fov or spec.view.fov_deg) != (fov or spec.view.fov_deg)
+            own = shot.view(spec) if is_own else None
             found.append((shot.apply(spec, start), own))
         except SpecError as error:
             raise SpecError(f"{file}: {where}: {error}") from error
@@ -158,7 +160,7 @@ def _read_list(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     if not all(isinstance(entry, dict) for entry in entries):
         raise SpecError(f"{file}: a list of tables is required, each with place, move, without, camera or look_at")
     for number, entry in enumerate(entries, 1):
-        read = {*Shot.model_fields, "fov"} if "scene" in entry else {*entry}
+        read = {*Shot.model_fields} if "scene" in entry else {*entry}
         yield f"configuration {number} of {len(entries)}", {key: entry[key] for key in entry if key in read}
 
 
@@ -207,9 +209,11 @@ def _fill_places(cells: Mapping[str, str], spec: SceneSpec, start: Modification 
             entry["colour"].setdefault(name, [*before.colour.get(name, (1.0, 1.0, 1.0))])[COLOURS.index(what)] = number
         elif name and what in ("turn", "power"):
             entry[what][name] = number
+        elif key == "fov":
+            entry[key] = number
         else:
             known = ", ".join(f"NAME.{what}" for what in ("x", "y", "z", "present", "turn", "power", *COLOURS))
-            raise SpecError(f"column {key!r}: is none of {known}, camera.x … look_at.z")
+            raise SpecError(f"column {key!r}: is none of {known}, camera.x … look_at.z, fov")
     for changes in ("place", "colour", "turn", "power"):
         entry[changes] = {name: value for name, value in entry[changes].items() if name not in entry["without"]}
     return entry

@@ -17,7 +17,7 @@ from photonfarm.core.keys import make_key
 from photonfarm.core.models import Factor, Frozen, Name, Positive
 from photonfarm.core.records import Pivots
 from photonfarm.scene.free_space import FreeSpace
-from photonfarm.scene.groups import Box, Light, Movable, Vector, shape_ids
+from photonfarm.scene.groups import Box, Degrees, Fov, Light, Movable, Vector, shape_ids
 
 BUILTIN_ROOMS = ("cornell", "room")
 
@@ -41,7 +41,8 @@ class ViewSpec(Frozen):
 
     origin: Box
     look_at: Box
-    fov_deg: Annotated[float, Field(ge=1, le=170)] = 60.0  # along the image's width
+    fov_deg: Degrees = 60.0  # along the image's width
+    fov: Fov | None = Field(default=None, exclude_if=lambda said: said is None)  # of each view; then left out of ids
     up: Vector = (0.0, 1.0, 0.0)
     near: Positive = 0.01  # also the near plane of window depth
     far: Positive = 1000.0
@@ -51,11 +52,20 @@ class ViewSpec(Frozen):
     def _is_a_camera(self) -> Self:
         if self.near >= self.far:
             raise ValueError(f"has near {self.near} ≥ far {self.far}; near < far is required")
+        if self.fov and not self.fov.min <= self.fov_deg <= self.fov.max:
+            limits = f"{self.fov.min:g} to {self.fov.max:g}"
+            raise ValueError(
+                f"has fov_deg = {self.fov_deg:g}, of views that say none; within fov, {limits}, is required"
+            )
         if sorted(map(abs, self.up)) != [0, 0, 1]:
             raise ValueError(f"has up {self.up}; a unit vector along one axis is required")
         if self.origin == self.look_at and self.origin.min == self.origin.max:
             raise ValueError("has origin and look_at in one and the same point; no direction can be drawn")
         return self
+
+    def describe_fov(self) -> str:
+        """The field of view of cameras in words."""
+        return f"{self.fov.min:g}° to {self.fov.max:g}°" if self.fov else f"{self.fov_deg:g}°"
 
 
 class Film(Frozen):

@@ -21,20 +21,39 @@ from photonfarm.scene.spec import SceneSpec, ViewSpec
 
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
-    """A camera position and the point it looks at; all that is stored of a view."""
+    """A camera position and the point it looks at, and perhaps a field of view; all that is stored of a view."""
 
     origin: NDArray[np.float32]  # (3,) scene units
     target: NDArray[np.float32]  # (3,) scene units
+    fov: np.float32 | None = None  # degrees along the image's width; None: that of the spec
 
     @property
     def vector(self) -> NDArray[np.float32]:
-        """Origin, then target; (6,)."""
-        return np.concatenate([self.origin, self.target])
+        """Origin, target and, of a view with its own, the field of view; (6,) or (7,)."""
+        own = [] if self.fov is None else [np.array([self.fov], np.float32)]
+        return np.concatenate([self.origin, self.target, *own])
 
     @classmethod
     def from_vector(cls, vector: NDArray[np.float32]) -> View:
-        """The inverse of `vector`; (6,)."""
-        return cls(np.asarray(vector[:3], np.float32), np.asarray(vector[3:], np.float32))
+        """The inverse of `vector`; (6,) or (7,)."""
+        fov = np.float32(vector[6]) if len(vector) > len(AXES) else None
+        return cls(np.asarray(vector[:3], np.float32), np.asarray(vector[3:6], np.float32), fov)
+
+
+AXES = ("origin_x", "origin_y", "origin_z", "look_at_x", "look_at_y", "look_at_z")
+"""The columns of every view's vector."""
+
+
+def view_columns(spec: SceneSpec) -> int:
+    """The number of columns of a scene's view vectors, D: one more where each view has its own field of view."""
+    return len(AXES) + (spec.view.fov is not None)
+
+
+def field_of_view(spec: SceneSpec, fov_deg: float | None) -> np.float32 | None:
+    """What a view of a spec has as `fov`, given one in degrees or None; where all share the spec's, that is None."""
+    if spec.view.fov is None:
+        return None if fov_deg in (None, spec.view.fov_deg) else np.float32(fov_deg)
+    return np.float32(spec.view.fov_deg if fov_deg is None else fov_deg)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,7 +75,8 @@ class Camera:
         forward = _unit(view.target.astype(np.float64) - origin)
         right = np.cross(forward, upright(view, spec.view))
         right = _unit(right)
-        focal_px = 0.5 * spec.film.width / np.tan(0.5 * np.radians(spec.view.fov_deg))
+        fov_deg = float(view.fov or spec.view.fov_deg)
+        focal_px = 0.5 * spec.film.width / np.tan(0.5 * np.radians(fov_deg))
         return cls(origin, right, np.cross(forward, right), forward, float(focal_px), spec.film.width, spec.film.height)
 
     @property
@@ -96,24 +116,28 @@ MOST_DRAWS = 1000
 def sample_views(
     spec: SceneSpec, modification_keys: Sequence[Key], seed: int, indices: Sequence[int], modifications: F32
 ) -> F32:
-    """Random views of configurations (N, G, C) with these keys, under a master seed, as vectors (N, 6).
+    """Random views of configurations (N, G, C) with these keys, under a master seed, as vectors (N, D).
 
     `indices` (N,) are their numbers within each configuration. Origin and look-at point are uniform in their boxes and
     independent [supplement 2.2]. Both are drawn again where they are nearer to each other than 1e-4 of the boxes' joint
     diagonal and, in a spec with free space, where the origin is not in it. Then origins are uniform in what is free in
-    the configuration. Raises SpecError where almost nothing is free.
+    the configuration. Fields of view are uniform in the spec's range, if it has one. Raises SpecError where almost
+    nothing is free.
     """
     keys = [make_key("view", key, seed, index) for key, index in zip(modification_keys, indices, strict=True)]
     low = np.concatenate([spec.view.origin.low, spec.view.look_at.low])
     high = np.concatenate([spec.view.origin.high, spec.view.look_at.high])
     corners = np.concatenate([low, high]).reshape(-1, 3)
     least = 1e-4 * np.linalg.norm(np.ptp(corners, axis=0))
-    vectors, left = np.empty((len(keys), 6), np.float32), np.arange(len(keys))
+    vectors, left = np.empty((len(keys), view_columns(spec)), np.float32), np.arange(len(keys))
+    if spec.view.fov is not None:
+        share = uniform_of(keys, "field of view", 1)[:, 0]
+        vectors[:, 6] = spec.view.fov.min + share * (spec.view.fov.max - spec.view.fov.min)
     for draw in range(MOST_DRAWS):
         if not len(left):
             return vectors
-        vectors[left] = low + uniform_of([keys[i] for i in left.tolist()], "placement", 6, 6 * draw) * (high - low)
-        origin, target = vectors[left, :3], vectors[left, 3:].astype(np.float64)
+        vectors[left, :6] = low + uniform_of([keys[i] for i in left.tolist()], "placement", 6, 6 * draw) * (high - low)
+        origin, target = vectors[left, :3], vectors[left, 3:6].astype(np.float64)
         is_kept = np.linalg.norm(target - origin, axis=1) >= least
         left = left[~(is_kept & are_in_free_space(spec, origin, modifications[left]))]
     raise SpecError(
@@ -131,7 +155,7 @@ def sample_view(
 
 
 def view_keys(modification_keys: Iterable[Key], vectors: F32) -> list[Key]:
-    """The content keys of views (N, 6) of configurations with these keys."""
+    """The content keys of views (N, D) of configurations with these keys."""
     return [view_key(key, vector) for key, vector in zip(modification_keys, vectors, strict=True)]
 
 

@@ -144,7 +144,7 @@ class SceneSamples:
             "origin": sample.view.origin.tolist(),
             "target": sample.view.target.tolist(),
             "up": list(spec.view.up),
-            "fov_deg": spec.view.fov_deg,
+            "fov_deg": float(sample.view.fov or spec.view.fov_deg),
             "exposure": spec.exposure,
             "spp": 2 * spec.transport.half_spp,
             "size": [spec.film.width, spec.film.height],

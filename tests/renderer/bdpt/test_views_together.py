@@ -57,6 +57,34 @@ def test_views_rendered_together_are_those_rendered_alone_to_the_bit(
     np.testing.assert_array_equal(together, one_by_one)
 
 
+def wider(place: np.ndarray, fov: float) -> np.ndarray:
+    """The place of a camera with another field of view than the sensor's 60°."""
+    width = np.tan(np.radians(fov / 2)) / np.tan(np.radians(30))
+    return place * np.array([width, width, 1, 1])
+
+
+@pytest.mark.parametrize("settings", SETTINGS)
+@pytest.mark.parametrize("record", [False, True])
+def test_views_of_several_fields_of_view_are_those_rendered_alone(settings: dict[str, Any], record: bool) -> None:
+    """By a sensor of that field of view; light paths' splats and weights among them."""
+    scene, fovs, seeds = box(), [25.0, 60.0, 100.0], [1, 2, 3]
+    places = placed([0.0, 7.0, -11.0])
+    bdpt = mi.load_dict({"type": "bdpt", "max_depth": 5, "record": record, **settings})
+    wide = np.stack([wider(place, fov) for place, fov in zip(places, fovs, strict=True)])
+    one_by_one = []
+    for place, fov, seed in zip(places, fovs, seeds, strict=True):
+        film = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
+        to_world = mi.ScalarTransform4f(place)
+        sensor = mi.load_dict({"type": "perspective", "fov": fov, "near_clip": 0.1, "film": film, "to_world": to_world})
+        one_by_one.append(np.array(bdpt.render_seeds(scene, sensor, [seed], SPP))[0])
+    together = np.array(bdpt.render_seeds(scene, sensor_of("perspective", SIZE), seeds, SPP, places=wide))
+    near = np.isclose(together, np.stack(one_by_one), rtol=1e-3, atol=1e-4 * np.mean(one_by_one))
+    assert near.mean() > 0.99  # a path near an edge may fall to its other side
+    for image, alone_image in zip(together, one_by_one, strict=True):
+        assert image.mean() == pytest.approx(alone_image.mean(), rel=2e-3)
+    assert abs(together[0].mean() / together[2].mean() - 1) > 0.1
+
+
 def test_views_through_a_lens_of_another_size_differ_by_rounding() -> None:
     """15 × 15 pixels are no multiple of the processor's lanes, so that sums differ by their order, too."""
     size, places, seeds = 15, placed([0.0, 7.0, -11.0]), [1, 2, 3]

@@ -102,7 +102,7 @@ def test_the_truth_of_a_stored_view_has_the_mean_of_its_passes_and_other_seeds(t
     assert ShardRenderer(store, worker="test", load=LoadedScene.load).render(scene_id, 0)
     reader = SceneReader(store.root, scene_id)
     stored = np.stack([reader.read(int(row)).radiance for row in reader.refresh()]).reshape(64, 16, 24, 3)
-    truth = render_asked(store.root, "room", Shot(), 0, None, None, Amount(spp=128)).truth
+    truth = render_asked(store.root, "room", Shot(), 0, None, Amount(spp=128)).truth
     assert (truth.spp, len(truth.parts)) == (128, 16)
     test = block_z_test(truth.parts.reshape(32, 16, 24, 3), stored, blocks=4)
     assert test.passed, test

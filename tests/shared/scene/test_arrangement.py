@@ -5,8 +5,8 @@ import pytest
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.statistics import Estimate, jackknife
-from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot, with_fov
-from photonfarm.scene.groups import Light, Power, Turn
+from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot
+from photonfarm.scene.groups import Fov, Light, Power, Turn
 from photonfarm.scene.modification import rest, sample_modification
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
@@ -42,10 +42,16 @@ def test_every_configuration_is_said_by_names_so_that_the_same_bits_come_of_it(s
         modification = sample_modification(spec, 3, index)
         view = sample_view(spec, modification.key(spec.radiance_id), 0, 0, modification)
         said = list_shot(spec, modification, view)
-        assert said.pop("fov") == spec.view.fov_deg
+        assert said["fov"] == spec.view.fov_deg
         shot = Shot.of(**said)
         np.testing.assert_array_equal(shot.apply(spec).vector, modification.vector)
         np.testing.assert_array_equal(shot.view(spec).vector, view.vector)
+    ranged = spec.model_copy(update={"view": spec.view.model_copy(update={"fov": Fov(min=30, max=90)})})
+    for index in range(20):
+        view = sample_view(ranged, b"0" * 16, 0, index)
+        said = Shot.of(**list_shot(ranged, rest(spec), view))
+        np.testing.assert_array_equal(said.view(ranged).vector, view.vector)
+        assert f"--fov {view.fov!s}" in describe_shot(ranged, rest(spec), view)
     placed = Shot.of(place={"sofa": (0.9, 0, -0.5)}, without=["vase"], camera=(1.6, 1, 1), look_at=(0, 0.1, 0))
     words = "--place sofa=0.9,0,-0.5 --without vase --camera 1.6,1,1 --look-at 0,0.1,0"
     assert describe_shot(spec, placed.apply(spec), placed.view(spec)) == words
@@ -139,8 +145,9 @@ def test_what_no_sample_shows_is_doubted_and_what_any_sample_may_show_is_not(spe
         modification = sample_modification(spec, 5, index)
         view = sample_view(spec, modification.key(spec.radiance_id), 0, 0, modification)
         assert not find_doubts(spec, modification, view)
-    wrong = Shot.of(place={"sofa": (0, 1, 0)}, without=["ceiling-light-1"], camera=(9, 1, 1), look_at=(0, 5, 0))
-    doubts = find_doubts(with_fov(spec, 50), wrong.apply(spec), wrong.view(spec), spec.view.fov_deg)
+    camera = {"camera": (9, 1, 1), "look_at": (0, 5, 0), "fov": 50}
+    wrong = Shot.of(place={"sofa": (0, 1, 0)}, without=["ceiling-light-1"], **camera)
+    doubts = find_doubts(spec, wrong.apply(spec), wrong.view(spec))
     beginnings = [
         "sofa stands at 0,1,0, outside",
         "ceiling-light-1 is removed",

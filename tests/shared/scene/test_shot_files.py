@@ -15,6 +15,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.export.snapshot import camera_to_world
 from photonfarm.farm import renderer_verbs
+from photonfarm.plan.chosen import Chosen
 from photonfarm.scene.arrangement import Arrangement, find_doubts
 from photonfarm.scene.camera_path import CameraPath, Cameras
 from photonfarm.scene.modification import rest
@@ -56,6 +57,29 @@ def test_cameras_of_a_transforms_json_see_what_they_saw(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.vector, view.vector)
 
 
+def test_each_camera_has_its_own_field_of_view_which_is_planned_where_the_spec_has_a_range(tmp_path: Path) -> None:
+    """The second frame says an angle, the others a focal length."""
+    lenses = {"fl_x": 4}, {"camera_angle_x": np.radians(50)}, {"fl_x": 6}
+    frames = [
+        {"transform_matrix": camera_to_world(view, SPEC).tolist(), **lens}
+        for view, lens in zip(views(3), lenses, strict=True)
+    ]
+    (file := tmp_path / "transforms.json").write_text(json.dumps({"w": 8, "h": 8, "frames": frames}))
+    wanted = [float(np.degrees(2 * np.arctan(4 / 4))), 50.0, float(np.degrees(2 * np.arctan(4 / 6)))]
+    found = read_cameras(file, SPEC)
+    np.testing.assert_allclose([view.fov for view in found], wanted, rtol=1e-6)
+    with pytest.raises(SpecError, match="fov = 90: samples of this spec have 60"):
+        Chosen.of(SPEC, rest(SPEC), found[0])
+    ranged = samples.small_spec(view=SPEC.view.model_dump() | {"fov": {"min": 45, "max": 75}})
+    (shot,) = Chosen.of(ranged, rest(ranged), read_cameras(file, ranged)[1]).shots
+    np.testing.assert_array_equal(shot.view(ranged).vector, found[1].vector)
+    doubts = [find_doubts(ranged, rest(ranged), view) for view in read_cameras(file, ranged)]
+    assert [any("the field of view is" in doubt for doubt in each) for each in doubts] == [True, False, False]
+    (cells := tmp_path / "rooms.csv").write_text("fov\n50\n60\n\n")
+    own = [camera.fov if camera else None for _, camera in read_configurations(cells, SPEC)]
+    assert own == [50, None]
+
+
 def test_a_transforms_json_is_a_camera_path_of_its_cameras(tmp_path: Path) -> None:
     path = CameraPath.load(transforms(tmp_path))
     assert isinstance(path, Cameras)
@@ -70,7 +94,6 @@ ROLLED = np.array([[0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]])
     ("changes", "says"),
     [
         ({"frames": [{"transform_matrix": ROLLED.tolist()}]}, "frame 1 of 1: is turned by 90.0°"),
-        ({"fl_x": 100}, "field of view"),
         ({"camera_angle_x": 1.0, "fl_x": None, "w": 8}, "no camera"),
         ({"h": 4}, "2.000 times as wide"),
         ({"k1": 0.1}, "distorts"),
@@ -133,7 +156,7 @@ def test_a_row_that_says_where_to_look_alone_is_seen_from_the_first_camera(tmp_p
     ("text", "says"),
     [
         ('[{"place": {"sofa": [0, 0, 0]}}]', "configuration 1 of 1: 'sofa' is no movable group of small; nearest"),
-        ('[{"fov": 10}]', "fov = 10"),
+        ('[{"fov": 0}]', "fov = 0"),
         ('[{"plaice": {}}]', "plaice"),
         ("[1]", "list of tables"),
         ("[]", "no configurations"),

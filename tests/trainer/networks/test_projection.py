@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import get_args
 
 import numpy as np
@@ -140,3 +141,28 @@ def test_rays_and_focal_length_are_those_of_the_camera(make_source) -> None:
     camera = Camera.of(view, source.spec)
     rays = Optics.of(source.spec).rays(torch.from_numpy(camera.world_to_camera).float()[None])
     np.testing.assert_allclose(rays[0].numpy(), camera.rays(), atol=1e-6)
+
+
+def test_views_of_several_fields_of_view_project_as_each_alone(make_source) -> None:
+    source = make_source(1, size=24)
+    position, present = source.cloud_at(0)
+    view, optics = source.read(0).view, Optics.of(source.spec)
+    seen = replace(view, fov=np.float32(30)), replace(view, fov=np.float32(110))
+    cameras = [Camera.of(each, source.spec) for each in seen]
+    to_camera = torch.stack([torch.from_numpy(camera.world_to_camera).float() for camera in cameras])
+    focal = torch.tensor([camera.focal_px for camera in cameras])
+    rays = optics.rays(to_camera, focal)
+    everything = (torch.from_numpy(position), torch.from_numpy(present), torch.ones(len(position), dtype=torch.bool))
+    together = [values.expand(2, *values.shape) for values in everything]
+    depth = torch.ones(2, 24, 24)
+    both = footprint(*together, to_camera, depth, optics, focal)
+    kept = []
+    for i, camera in enumerate(cameras):
+        np.testing.assert_allclose(rays[i].numpy(), camera.rays(), atol=1e-6)
+        own = replace(optics, focal_px=camera.focal_px)
+        alone = footprint(*(values[i : i + 1] for values in (*together, to_camera, depth)), own)
+        mine = both.point // len(position) == i
+        kept.append(int(mine.sum()))
+        assert torch.equal(both.point[mine] - i * len(position), alone.point)
+        assert torch.equal(both.pixel[mine] - i * 24 * 24, alone.pixel)
+    assert 0 < kept[0] < 0.8 * kept[1]

@@ -19,6 +19,7 @@ from small_room import rendered, trained
 
 from photonfarm.predict import open_run
 from photonfarm.predict.live import TRUTHS, Live, Speed
+from photonfarm.scene.groups import Fov
 from photonfarm.scene.spec import Film
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.web.server import PageServer
@@ -29,7 +30,9 @@ AT_REST = {"place": {}, "without": [], "camera": [-1.6, 1.5, 0.4], "look_at": [0
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory: pytest.TempPathFactory) -> Live:
     folder = tmp_path_factory.mktemp("live")
-    store = rendered(load_spec("room"), folder)
+    room = load_spec("room")
+    view = room.view.model_copy(update={"fov": Fov(min=30, max=110)})
+    store = rendered(room.model_copy(update={"view": view}), folder)
     run = trained(store, folder / "run", "guided_transport")
     return Live(lambda: open_run(run, store), most_spp=24)
 
@@ -180,6 +183,12 @@ def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks
             page.wait_for(f"document.querySelector('#network').toDataURL() !== {json.dumps(before)}")
             page.wait_for("document.querySelector('#of-truth').textContent.startsWith('truth · 24 samples')", 60)
             page.wait_for("!document.querySelector('#truth').classList.contains('old')")
+            before = page.value("document.querySelector('#network').toDataURL()")
+            page.value(
+                "(() => { const lens = document.querySelector('input[aria-label=\"field of view\"]'); lens.value = 100;"
+                "lens.dispatchEvent(new Event('input')); })()"
+            )
+            page.wait_for(f"document.querySelector('#network').toDataURL() !== {json.dumps(before)}")
             page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Random').click()")
             page.wait_for("document.querySelector('#truth').classList.contains('old')")
             page.wait_for("!document.querySelector('#truth').classList.contains('old')", 60)

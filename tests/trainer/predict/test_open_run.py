@@ -26,7 +26,7 @@ from photonfarm.renderer.jobs.truth import Amount
 from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.arrangement import Shot
-from photonfarm.scene.groups import Power, Turn
+from photonfarm.scene.groups import Fov, Power, Turn
 from photonfarm.scene.modification import rest
 from photonfarm.scene.shot_files import read_configurations
 from photonfarm.scene.spec import SceneSpec
@@ -41,6 +41,14 @@ PAGE = Path(__file__).resolve().parents[3] / "docs/what-if.md"
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return rendered(load_spec("room"), tmp_path_factory.mktemp("predict"))
+
+
+@pytest.fixture(scope="module")
+def zooming(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same where each view has its own field of view."""
+    room = load_spec("room")
+    view = room.view.model_copy(update={"fov": Fov(min=30, max=110)})
+    return rendered(room.model_copy(update={"view": view}), tmp_path_factory.mktemp("zooming"))
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +74,8 @@ def spec_of(store: Path) -> SceneSpec:
         ("store", "guided_transport_photons"),
         ("turning", "light_transport"),
         ("turning", "guided_transport_photons"),
+        ("zooming", "light_transport_photons"),
+        ("zooming", "guided_transport_photons"),
     ],
 )
 def test_a_frame_is_the_image_of_the_stored_sample_of_its_configuration_and_view(
@@ -279,12 +289,13 @@ def test_another_field_of_view_is_that_of_inputs_network_and_sensor(store: Path,
     with torch.no_grad():
         frames = [opened.predict(**camera) for opened in (wide, usual)]
     assert float(frames[0].inputs.depth[0, 8, 0]) != pytest.approx(float(frames[1].inputs.depth[0, 8, 0]), rel=0.05)
-    assert wide.network.optics.focal_px == pytest.approx(12 / np.tan(np.radians(50)))
+    assert frames[0].inputs.focal_px.tolist() == [pytest.approx(12 / np.tan(np.radians(50)))]
+    assert frames[1].inputs.focal_px is None
     assert [len(frame.doubts) for frame in frames] == [1, 0]
     import mitsuba as mi
 
     assert float(mi.traverse(wide._scene._sensor.aim(frames[0].view))["x_fov"][0]) == pytest.approx(100)
-    with pytest.raises(SpecError, match="fov_deg = 190"):
+    with pytest.raises(SpecError, match="fov = 190"):
         open_run(run, store, fov=190)
 
 
@@ -339,7 +350,7 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
 
 
 def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path, tmp_path: Path) -> None:
-    run, out = trained(store, tmp_path / "run", "guided"), tmp_path / "out"
+    run, out = trained(store, tmp_path / "run", "cnn"), tmp_path / "out"
     (rooms := tmp_path / "rooms.csv").write_text(
         "sofa.x,sofa.present,camera.x,camera.y,camera.z\n0.9,,-1.9,1.6,1.7\n,0,,,\n"
     )
@@ -368,6 +379,26 @@ def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path,
     assert not (out / "frame-0000/truth.png").exists()
     refused = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras), "--camera", "0,1,0"])
     assert "--cameras and --camera exclude each other" in refused.stderr
+
+
+def test_a_view_is_shown_and_planned_with_the_field_of_view_that_is_asked_for(zooming: Path, tmp_path: Path) -> None:
+    run, store = trained(zooming, tmp_path / "run", "light_transport"), tmp_path / "store"
+    shutil.copytree(zooming, store)
+    opened, (scene_id,) = open_run(run, store), Store(store).scene_ids()
+    camera = {"camera": (-1.9, 1.6, 1.7), "look_at": (0.7, 0.6, -0.5)}
+    with torch.no_grad():
+        near, usual, far, beyond = (opened.predict(**camera, fov=fov) for fov in (40, None, 100, 120))
+    assert [frame.view.fov for frame in (near, usual, far)] == [40, opened.spec.view.fov_deg, 100]
+    assert near.inputs.focal_px[0] > usual.inputs.focal_px[0] > far.inputs.focal_px[0]
+    assert [len(frame.doubts) for frame in (near, usual, far, beyond)] == [0, 0, 0, 1]
+    place = ["infer", "--store", str(store), "--run", str(run), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(umbrella, [*place, "--row", "1", "--fov", "45", "--store-it"], catch_exceptions=False)
+    assert "planned as a sample" in done.stderr.splitlines()
+    assert Store(store).scene(scene_id).plans()[-1].rows.view[0, 6] == 45
+    found = CliRunner().invoke(
+        umbrella, ["store", "find", "--store", str(store), "--fov", "45"], catch_exceptions=False
+    )
+    assert "--fov 45" in found.stdout
 
 
 def test_the_lines_of_the_page_make_a_frame_and_its_truth(

@@ -17,7 +17,8 @@ def open_run(
 ) -> OpenRun:
     """Load the network of a run folder, and from a store the scene that it was trained on.
 
-    `fov` is the cameras' field of view along the width in degrees, if not the spec's.
+    `fov` is the field of view along the width in degrees of all views that are not asked for with another; by default
+    each has its own, or the spec's.
 
     The renderer uses the card if there is one, else the processor, as PHOTONFARM_DEVICE says. Unless a `device` is
     named, the network uses the same, or the processor where torch cannot use that card.

@@ -300,7 +300,10 @@ def _check_frames(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:
 def _read_frames(run: TrainedRun, frames: Frames, source: SceneReader | PackedScene) -> Iterator[TrainingBatch]:
     """The frames one by one, in memory that is reused."""
     spec = source.spec
-    tensors = SampleTensors(spec, run.needs.fields, exposure=spec.exposure, points=run.settings.network.points)
+    lens = ("focal_px",) if any(view.fov for view in frames.views) else ()
+    tensors = SampleTensors(
+        spec, (*run.needs.fields, *lens), exposure=spec.exposure, points=run.settings.network.points
+    )
     memory, black = tensors.empty(1), np.zeros((2, spec.film.height, spec.film.width, 3), np.float32)
     for i, view in enumerate(frames.views):
         seen = frames.buffers(i), frames.visibility(i), frames.guides_of(i)

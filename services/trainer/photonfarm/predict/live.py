@@ -130,6 +130,7 @@ class Live:
             "network": self.run.architecture,
             "film": [spec.film.width, spec.film.height],
             "fov": spec.view.fov_deg,
+            "fov_range": spec.view.fov and spec.view.fov.model_dump(),
             "up": spec.view.up,
             "across": plan.across,
             "down": plan.down,

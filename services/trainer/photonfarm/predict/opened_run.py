@@ -29,7 +29,7 @@ from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
 from photonfarm.farm.devices import AUTO, CPU
 from photonfarm.plan.chosen import Chosen
-from photonfarm.scene.arrangement import Shot, find_doubts, with_fov
+from photonfarm.scene.arrangement import Shot, find_doubts
 from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces, rest
 from photonfarm.scene.spec import WITHOUT_SHADOWS
 from photonfarm.scene.spec_loading import locate
@@ -87,7 +87,7 @@ class Frame:
 class OpenRun:
     """A trained network and its scene. Not thread-safe: the scene is in one configuration at a time.
 
-    `spec` is the scene's, with the field of view; `network` holds the weights.
+    `spec` is the scene's; `network` holds the weights.
     """
 
     def __init__(self, run: TrainedRun, store: str | Path, device: str = "auto", fov: float | None = None) -> None:
@@ -98,12 +98,13 @@ class OpenRun:
 
         source = run.scene(store)
         self.store = None if run.packed else Store(store)
-        self.spec, self.scene_id = with_fov(locate(source.spec), fov), run.scene_id
+        self.spec, self.scene_id = locate(source.spec), run.scene_id
+        self._fov = Shot.of(fov=fov).fov
         geometry, self.cloud = source.base()
         self._scene: LoadedScene = load_scene(self.spec)
         torch.set_num_threads(run.settings.threads)
         self._run, self._needs, self._exposure = run, run.needs, self.spec.exposure
-        self._trained_fov, self.architecture = source.spec.view.fov_deg, run.settings.network.architecture
+        self.architecture = run.settings.network.architecture
         if device == AUTO and backend.device().card is None:
             device = CPU
         self._predictor_of: Callable[[SceneSpec], DevicePredictor] = lambda spec: run.predictor(
@@ -136,10 +137,10 @@ class OpenRun:
         """The network's image of a configuration from a view.
 
         Both may be a sample's; by default they are the scene at rest and its first view. What is `asked` changes them:
-        `place`, `move` and `without` by groups' names, `camera` and `look_at`, as a `Shot` has them. A network that is
-        given a noisy half gets one rendered, and guided_denoise the mean over `passes` of them; with `both`, the image
-        is the mean of two, each from a half of its own. Raises SpecError for what is impossible, IncompleteError where
-        photons or halves stay non-finite.
+        `place`, `move` and `without` by groups' names, `camera`, `look_at` and `fov`, as a `Shot` has them. A network
+        that is given a noisy half gets one rendered, and guided_denoise the mean over `passes` of them; with `both`,
+        the image is the mean of two, each from a half of its own. Raises SpecError for what is impossible,
+        IncompleteError where photons or halves stay non-finite.
         """
         self._check_halves(passes, both=both)
         began = time.perf_counter()
@@ -152,7 +153,7 @@ class OpenRun:
         images = [self._images(each)[0] for each in of_half]
         radiance = (images[0] if len(images) == 1 else torch.stack(images).mean(0)) / self._exposure
         seconds = {"edit": staged - began, "inputs": given - staged, "network": time.perf_counter() - given}
-        doubts = never_seen(find_doubts(self.spec, configuration, view, self._trained_fov))
+        doubts = never_seen(find_doubts(self.spec, configuration, view))
         return Frame(radiance, of_half[0], configuration, view, seconds, doubts)
 
     def truth(
@@ -220,6 +221,8 @@ class OpenRun:
     ) -> tuple[Modification, View]:
         """Bring the scene into the configuration that is asked for, as `predict`; returns that and the view."""
         shot = Shot.of(**asked)
+        if shot.fov is None:
+            shot = shot.model_copy(update={"fov": self._fov})
         wanted, seen = shot.apply(self.spec, configuration), shot.view(self.spec, view)
         if not np.array_equal(wanted.vector, self._modification.vector):
             self._apply(wanted)
@@ -252,7 +255,7 @@ class OpenRun:
 
     def _inputs(self, view: View) -> Inputs:
         """What the network reads of the present configuration from a view, a batch of one."""
-        key = view_key(self._key, view.vector)
+        key, camera = view_key(self._key, view.vector), Camera.of(view, self.spec)
         given: dict[str, Tensor] = {}
         if self._needs.guides or self._needs.surface:
             wanted = self.spec.guides if self._needs.guides else WITHOUT_SHADOWS
@@ -262,7 +265,8 @@ class OpenRun:
             buffers = self._scene.buffers(view, take=take_torch)
         images = {name: self._tensor(image) for name, image in arrays_of(buffers).items()}
         return Inputs(
-            world_to_camera=self._tensor(Camera.of(view, self.spec).world_to_camera.astype(np.float32)),
+            world_to_camera=self._tensor(camera.world_to_camera.astype(np.float32)),
+            focal_px=None if view.fov is None else torch.full((1,), camera.focal_px, device=self._device),
             depth=images["depth"],
             albedo=images["albedo"],
             normal=images["normal"],

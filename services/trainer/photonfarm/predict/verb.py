@@ -14,7 +14,6 @@ import click
 from photonfarm.cli.options import (
     address_options,
     arrangement_options,
-    fov_option,
     shot_file_options,
     start_options,
     store_option,
@@ -53,7 +52,6 @@ def _refuse_store(run: TrainedRun, **asked: object) -> None:
 @run_option
 @start_options
 @arrangement_options()
-@fov_option
 @click.option(
     "--truth",
     metavar="SPP|TIME|ERROR",
@@ -85,7 +83,6 @@ def infer(
     row: int | None,
     like: str | None,
     asked: Shot,
-    fov: float | None,
     truth: str | None,
     store_it: bool,
     cameras: Path | None,
@@ -106,11 +103,13 @@ def infer(
     --configurations and --cameras show all that files say, each in a folder: a configuration by its own camera, or by
     all of --cameras, or by that of the other options.
     """
+    from photonfarm.plan.chosen import Chosen
     from photonfarm.predict import infer as shows
     from photonfarm.predict.opened_run import OpenRun, require_renderer
     from photonfarm.renderer.jobs.truth import Amount
-    from photonfarm.scene.arrangement import Arrangement, Shot, with_fov
+    from photonfarm.scene.arrangement import Arrangement, Shot
     from photonfarm.scene.camera_path import CameraPath, Frames
+    from photonfarm.scene.modification import rest
     from photonfarm.scene.shot_files import read_shots
     from photonfarm.store.read.find import find_start
     from photonfarm.trainer.predictors.trained import TrainedRun
@@ -122,14 +121,12 @@ def infer(
     given = [name for name, value in kinds.items() if value is not None]
     of_frame: dict[str, object] = {"--store-it": store_it or None, "--truth": truth if buffers else None}
     if given != ["--configurations"]:
-        of_frame |= {"--camera": asked.camera, "--look-at": asked.look_at, "--fov": None if files else fov}
+        of_frame |= {"--camera": asked.camera, "--look-at": asked.look_at, "--fov": None if files else asked.fov}
     alone = [name for name, value in of_frame.items() if value is not None]
-    arranged = like is not None or asked != Shot() or truth is not None or fov is not None or store_it
+    arranged = like is not None or asked != Shot() or truth is not None or store_it
     if len(given) > 1 or (given and alone) or (buffers is not None and (arranged or row is not None)):
         others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
         raise click.UsageError(f"{' and '.join(others)} exclude each other")
-    if store_it and fov is not None:
-        raise click.UsageError("--store-it and --fov exclude each other: samples have the spec's field of view")
     amount = None if truth is None else Amount.parse(truth)
     along = orbit or (CameraPath.load(path) if path else None)
     if isinstance(along, CameraPath):
@@ -150,12 +147,12 @@ def infer(
             result = shows.show_path(opened, configuration, views, out, fps=fps, amount=amount)
     elif files is not None:
         require_renderer(trained)
-        spec = with_fov(trained.scene(store).spec, fov)
+        spec = trained.scene(store).spec
         begin, camera = find_start(store, trained.scene_id, row, like) or (None, None)
         changed, view = asked.apply(spec, begin), asked.view(spec, camera)
-        shots = read_shots(spec, cameras, configurations, changed, otherwise=view)
+        shots = read_shots(spec, cameras, configurations, changed, otherwise=view, fov=asked.fov)
         with tell_waiting(say, f"rendering {format_count(len(shots), 'image')} of {spec.name}"):
-            opened = OpenRun(trained, store, device, fov)
+            opened = OpenRun(trained, store, device)
             load_s = time.perf_counter() - began
             made: list[Path] = []
             for number, shot in enumerate(shots):
@@ -173,8 +170,10 @@ def infer(
         require_renderer(trained)
         start = find_start(store, trained.scene_id, row, like)
         asked.apply(spec := trained.scene(store).spec)  # a wrong name is refused before anything is loaded
+        if store_it and asked.fov is not None:
+            Chosen.of(spec, rest(spec), asked.view(spec))
         with tell_waiting(say, f"rendering {spec.name}"):
-            opened = OpenRun(trained, store, device, fov)
+            opened = OpenRun(trained, store, device)
             load_s = time.perf_counter() - began
             result = shows.show_frame(opened, asked, start, out, amount, load_s, store_it=store_it)
     _tell(result)

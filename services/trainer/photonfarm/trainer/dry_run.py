@@ -86,6 +86,8 @@ class MadeUpScene:
         for place, (origin, target) in enumerate(0.5 * torch.rand(size, 2, 3, generator=generator).numpy()):
             camera = Camera.of(View(origin - 0.5, target + 0.5), spec)
             inputs.world_to_camera[place] = torch.from_numpy(camera.world_to_camera)
+            if inputs.focal_px is not None:
+                inputs.focal_px[place] = camera.focal_px
         inputs.depth.add_(0.5)
         _make_unit(inputs.normal)
         if inputs.points is not None:

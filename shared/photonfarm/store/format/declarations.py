@@ -3,7 +3,7 @@
 docs/store-format.md repeats it for readers; a test compares the two, and every array carries it in its attributes.
 
 Shape letters: R rows of a plan, H W image, K photon slots, L lit points, G movable groups; of the base: P points,
-V vertices, F triangles, S shapes; ⌈P/8⌉ is P/8 rounded up; C fields of a modification.
+V vertices, F triangles, S shapes; ⌈P/8⌉ is P/8 rounded up; C fields of a modification, D of a view.
 """
 
 from __future__ import annotations
@@ -180,7 +180,7 @@ photon_bounce: modification R, slot K; |i1; 1
 PLAN_INPUTS = _declare(f"""
 modification: modification R, group G, component C; <f4; see fields
     what may change of each movable group, by the attributes groups and fields; NaN: unused row
-view: view R, component 6; <f4; see fields
+view: view R, component D; <f4; see fields
     a camera in {_WORLD}, by the attribute fields; NaN: unused row
 sample_modification: sample R; <i8; row of the scene
     the sample's modification; -1: unused row
@@ -251,16 +251,16 @@ FURTHER: dict[str, tuple[dict[str, Any], ...]] = {
         {"name": "power", "unit": "1", "rest": 1.0, "zero": "its lights are dark"},
         *({"name": colour, "unit": "1", "rest": 1.0, "zero": "none is emitted"} for colour in ("red", "green", "blue")),
     ),
-    "view": (),
+    "view": ({"name": "fov", "unit": "degrees", "rest": 0.0, "zero": "view.fov_deg of the spec"},),
 }
-"""What further columns hold, all of which a scene's vectors have if any of its groups changes so."""
+"""What further columns hold, all of which a scene's vectors have if any of its groups, or its cameras, change so."""
 
 
-def vector_attributes(name: str, groups: Sequence[str], *, further: bool) -> dict[str, Any]:
-    """The attributes that describe the columns of an array of inputs, perhaps with `further` ones.
+def vector_attributes(name: str, groups: Sequence[str], columns: int) -> dict[str, Any]:
+    """The attributes that describe the columns of an array of inputs, of which there are so many.
 
     They are empty for an array that holds no vectors.
     """
-    fields = [*FIELDS[name], *(FURTHER[name] if further else ())] if name in FIELDS else []
+    fields = [*FIELDS[name], *FURTHER[name]][:columns] if name in FIELDS else []
     described: dict[str, Any] = {"fields": fields} if fields else {}
     return described | ({"groups": list(groups)} if name == "modification" else {})

@@ -20,6 +20,7 @@ from photonfarm.core.errors import CorruptError
 from photonfarm.core.records import F32, LIT_POINTS
 from photonfarm.scene.modification import columns
 from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.view import view_columns
 from photonfarm.store.format.declarations import FIELDS, FURTHER, OUTPUTS, ArrayDeclaration
 
 if TYPE_CHECKING:
@@ -63,7 +64,11 @@ def output_arrays(spec: SceneSpec) -> dict[str, ArraySchema]:
 
 def bytes_of_rows(spec: SceneSpec) -> dict[RowKind, int]:
     """The stored bytes of one sample, one view and one modification, with inputs, uncompressed."""
-    row_bytes: dict[RowKind, int] = {"sample": 0, "view": 6 * 4, "modification": 4 * columns(spec) * len(spec.groups)}
+    row_bytes: dict[RowKind, int] = {
+        "sample": 0,
+        "view": 4 * view_columns(spec),
+        "modification": 4 * columns(spec) * len(spec.groups),
+    }
     for name, array in output_arrays(spec).items():
         if name != "radiance_wide":  # few rows need it
             row_bytes[array.kind] += int(np.prod(array.shape)) * array.dtype.itemsize

@@ -192,8 +192,9 @@ def build(
     with new_group(part, attributes) as group:
         for declared in declarations.PLAN_INPUTS:
             groups = [each.name for each in spec.groups]
-            more = declarations.vector_attributes(declared.name, groups, further=spec.further_changes)
-            schema.create_input(group, declared, getattr(rows, declared.name), more)
+            values = getattr(rows, declared.name)
+            more = declarations.vector_attributes(declared.name, groups, values.shape[-1])
+            schema.create_input(group, declared, values, more)
         schema.create_outputs(group, spec, count, shard_rows)
 
 

@@ -24,7 +24,7 @@ from photonfarm.scene.arrangement import Shot, describe_shot
 from photonfarm.scene.modification import Modification, modification_keys
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import load_spec
-from photonfarm.scene.view import View, view_keys
+from photonfarm.scene.view import AXES, View, view_keys
 from photonfarm.store.format import schema
 from photonfarm.store.format.shards import Shard
 from photonfarm.store.io.storage import look_into
@@ -166,7 +166,7 @@ class FoundSample:
     shot: str  # configuration and view by names, as options of the command line
     view_row: int
     view_key: str
-    view: tuple[float, ...]  # camera position, look-at point
+    view: tuple[float, ...]  # camera position, look-at point and, where each view has its own, field of view
     distance: float  # of the queried positions, the farthest, in scene units
     plan: int
     jobs: tuple[int, ...]  # of its own row, its view's and its modification's
@@ -211,9 +211,12 @@ class SceneMatch:
         distance = np.zeros(len(rows))
         if (asked := query.asked) is not None:
             distinct, place = np.unique(modification[rows], return_inverse=True)
-            distance = asked.fits(self._scene.spec, inputs.vectors("modification", distinct))[place]
+            distance = asked.fits(spec := self._scene.spec, inputs.vectors("modification", distinct))[place]
             distinct, place = np.unique(view[rows], return_inverse=True)
             vectors = inputs.vectors("view", distinct).astype(np.float64)
+            if asked.fov is not None:
+                own = vectors[:, 6] if vectors.shape[1] > len(AXES) else np.full(len(vectors), spec.view.fov_deg)
+                distance = np.maximum(distance, np.abs(own - np.float32(asked.fov))[place])
             for wanted, columns in ((asked.camera, slice(0, 3)), (asked.look_at, slice(3, 6))):
                 if wanted is not None:
                     off = np.linalg.norm(vectors[:, columns] - np.array(wanted, np.float32), axis=1)

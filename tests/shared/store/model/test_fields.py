@@ -10,8 +10,11 @@ import zarr
 
 from photonfarm.core.errors import CorruptError
 from photonfarm.data import Scene
+from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import Request
-from photonfarm.scene.modification import FIELDS, FURTHER, rebuild_surfaces, sample_modification
+from photonfarm.scene.arrangement import Shot
+from photonfarm.scene.modification import FIELDS, FURTHER, rebuild_surfaces, rest, sample_modification
+from photonfarm.scene.view import AXES, Camera, sample_views
 from photonfarm.store import SceneStore, Store
 from photonfarm.store.format import declarations, schema
 from photonfarm.store.format.metadata import seal
@@ -78,6 +81,38 @@ def test_turns_and_light_are_stored_and_found(store: Store) -> None:
     np.testing.assert_array_equal(dataset[0]["modification"], expected.vector)
 
 
+def test_a_field_of_view_of_each_view_is_stored_and_found(store: Store) -> None:
+    """Configurations and places are those of the spec without a range; each view has one more number."""
+    view = samples.small_spec().view.model_dump() | {"fov_deg": 50, "fov": {"min": 40, "max": 80}}
+    spec, request = samples.small_spec(**samples.ALWAYS, view=view), Request(modifications=4, views_per_modification=3)
+    scene = store.scene(store.plan(spec, request, shard_rows=4).scene_id)
+    scene.write_base(*samples.base())
+    samples.commit_all(scene)
+    plan = zarr.open_group(scene.folder / "plans/000000", mode="r")
+    assert [field["name"] for field in plan["view"].attrs["fields"]] == [*AXES, "fov"]
+    vectors = scene.plans()[0].rows.view[:12]
+    assert (vectors.shape, len(np.unique(vectors[:, 6]))) == ((12, 7), 12)
+    assert 40 <= vectors[:, 6].min() < 50 < 70 < vectors[:, 6].max() <= 80
+    sample = samples.reader_of(scene).read(1)
+    np.testing.assert_array_equal(sample.view.vector, vectors[1])
+    focal = Camera.of(sample.view, spec).focal_px
+    assert focal == pytest.approx(0.5 * spec.film.width / np.tan(np.radians(vectors[1, 6] / 2)))
+    asked = Shot.of(fov=float(vectors[1, 6]))
+    assert find_samples(store, [scene.scene_id], Query.of(asked=asked)).count == 1
+    start = find_start(store.root, scene.scene_id, 1, None)
+    assert start is not None
+    np.testing.assert_array_equal(start[1].vector, vectors[1])
+    assert store.plan(spec, Chosen.of(spec, *start), shard_rows=4).new == 0, "the same view comes of its names"
+    dataset = Scene(store.root, scene.scene_id).torch(fields=["view", "world_to_camera"])
+    np.testing.assert_array_equal(dataset[1]["view"], vectors[1])
+    assert float(dataset[1]["focal_px"]) == pytest.approx(focal)
+    assert checked_store.checked(store).exit_code == 0
+    other = samples.small_spec(view=view | {"fov": {"min": 30, "max": 80}})
+    same = sample_views(other, [b"0" * 16], 0, [0], rest(other).vector[None])[0]
+    without = sample_views(samples.small_spec(), [b"0" * 16], 0, [0], rest(other).vector[None])[0]
+    np.testing.assert_array_equal(same[:6], without)
+
+
 def test_columns_are_found_by_name_in_any_order() -> None:
     known: Any = declarations.FIELDS["modification"]
     values = np.arange(8, dtype=np.float32).reshape(1, 2, 4)
@@ -88,7 +123,7 @@ def test_columns_are_found_by_name_in_any_order() -> None:
 
 def test_a_field_of_a_newer_program_is_refused(scene: SceneStore) -> None:
     plan = zarr.open_group(scene.folder / "plans/000000", mode="r+")
-    plan["view"].update_attributes({"fields": [*plan["view"].attrs["fields"], {"name": "fov"}]})
+    plan["view"].update_attributes({"fields": [*plan["view"].attrs["fields"], {"name": "aperture"}]})
     seal(scene.folder / "plans/000000")
-    with pytest.raises(CorruptError, match="has the field fov, which this program does not know"):
+    with pytest.raises(CorruptError, match="has the field aperture, which this program does not know"):
         SceneStore(scene.storage, scene.scene_id).plans()

@@ -98,7 +98,7 @@ def test_every_array_is_stored_as_the_document_declares_it(scene: SceneStore) ->
         assert len(about["shape"]) == len(array.shape)
         assert about["chunk_key_encoding"] == {"name": "default", "configuration": {"separator": "."}}
         rows = {"R": 8, "P": 3, "V": 3, "F": 1, "S": 1}[str(array.shape[0])]
-        lengths = {"G": 1, "C": 4, "H": 8, "W": 8, "K": 8, "L": 16, "⌈P/8⌉": 2, "⌈K/8⌉": 1}
+        lengths = {"G": 1, "C": 4, "D": 6, "H": 8, "W": 8, "K": 8, "L": 16, "⌈P/8⌉": 2, "⌈K/8⌉": 1}
         inner = [n if isinstance(n, int) else lengths[n] for n in array.shape[1:]]
         assert about["shape"] == [rows, *inner]
         is_output = array in declarations.OUTPUTS

@@ -17,7 +17,14 @@ import numpy as np
 import numpy.typing as npt
 
 Places = npt.NDArray[np.floating[Any]]
-"""Rigid camera-to-world matrices [K, 4, 4], one for each image."""
+"""Camera-to-world matrices [K, 4, 4], one for each image.
+
+The axes across and up are of unit length or, for a field of view wider than the sensor's, longer, by how much wider the
+image plane is.
+"""
+
+RIGID = 1e-6
+"""How far the length of an axis may be from 1 by rounding alone."""
 
 
 @dataclass(slots=True)
@@ -26,14 +33,21 @@ class Poses:
 
     to_world: list[mi.Vector3f]  # [K] each: the columns of the matrices, the camera's x, y, z and its origin
     to_camera: list[mi.Vector3f]  # [K] each: those of their inverses
+    widths: mi.Float | None  # [K]: of the image planes, over that of the sensor; None: all are the sensor's
 
     @classmethod
     def of(cls, places: Places) -> Poses:
         """The poses as device data."""
+        length, widths = np.linalg.norm(places[:, :3, 0], axis=1), None
+        if (np.abs(length - 1) > RIGID).any():
+            places = places.copy()
+            places[:, :3, :2] /= length[:, None, None]
+            widths = mi.Float(length.tolist())
+            dr.make_opaque(widths)
         matrix = mi.Matrix4f(*(mi.Float(places[:, row, column].tolist()) for row in range(4) for column in range(4)))
         dr.make_opaque(matrix)  # a single pose would be a literal
         transform = mi.AffineTransform4f(matrix)
-        poses = cls(_columns(transform), _columns(transform.inverse()))
+        poses = cls(_columns(transform), _columns(transform.inverse()), widths)
         dr.eval(poses)
         return poses
 
@@ -66,6 +80,8 @@ class PosedSensor:
         self, time: float, wavelengths: float, position: mi.Point2f, aperture: mi.Point2f, active: mi.Bool | bool = True
     ) -> tuple[mi.Ray3f, mi.Spectrum]:
         """A ray through a position of the film, and its weight, as ``mi.Sensor.sample_ray`` returns them."""
+        if self.poses.widths is not None:  # the sensor's own image plane goes on beyond its film
+            position = 0.5 + (position - 0.5) * dr.gather(mi.Float, self.poses.widths, self.image)
         ray, weight = self.sensor.sample_ray(time, wavelengths, position, aperture, active)
         to_near = self.sensor.near_clip() * dr.rcp(ray.d.z)
         *axes, origin = self._gather_columns(self.poses.to_world)
@@ -80,7 +96,14 @@ class PosedSensor:
         *axes, moved = self._gather_columns(self.poses.to_camera)
         seen_from = dr.zeros(mi.Interaction3f)
         seen_from.p = dr.fma(axes[2], it.p.z, dr.fma(axes[1], it.p.y, dr.fma(axes[0], it.p.x, moved)))
-        ds, weight = self.sensor.sample_direction(seen_from, aperture, active)
+        if self.poses.widths is None:
+            ds, weight = self.sensor.sample_direction(seen_from, aperture, active)
+        else:  # a pinhole's weight is d/(A z³), A the area of the image plane at distance 1, d and z those of the point
+            distance, shrunk = dr.norm(seen_from.p), dr.rcp(dr.gather(mi.Float, self.poses.widths, self.image))
+            seen_from.p = mi.Point3f(seen_from.p.x * shrunk, seen_from.p.y * shrunk, seen_from.p.z)
+            ds, weight = self.sensor.sample_direction(seen_from, aperture, active)
+            weight *= dr.square(shrunk) * distance * dr.rcp(ds.dist)
+            ds.dist = distance
         *axes, origin = self._gather_columns(self.poses.to_world)
         ds.p, ds.n = origin + _turn_to_world(axes, ds.p), mi.Normal3f(_turn_to_world(axes, ds.n))
         ds.d = (ds.p - it.p) * dr.rcp(ds.dist)

@@ -14,7 +14,6 @@ import click
 from photonfarm.cli.options import (
     arrangement_options,
     device_option,
-    fov_option,
     json_option,
     start_options,
     store_option,
@@ -175,7 +174,6 @@ def measure_frames(
 @store_option
 @start_options
 @arrangement_options()
-@fov_option
 @click.option(
     "--spp",
     metavar="SPP|TIME|ERROR",
@@ -204,7 +202,6 @@ def render(
     row: int | None,
     like: str | None,
     asked: Shot,
-    fov: float | None,
     spp: str | None,
     pass_number: int | None,
     out: Path | None,
@@ -224,7 +221,7 @@ def render(
     from photonfarm.scene.arrangement import Shot
 
     say = partial(click.echo, err=True)
-    again = row is not None and (like, asked, fov, spp) == (None, Shot(), None, None)
+    again = row is not None and (like, asked, spp) == (None, Shot(), None)
     if not again and pass_number is not None:
         raise click.UsageError("--pass: is of a stored sample, which --row alone renders again")
     if out is not None:
@@ -238,7 +235,7 @@ def render(
         sys.exit(repeated.exit_code)
     amount = truth.Amount.parse(spp or "64")
     with tell_waiting(say, f"rendering {scene}"):
-        image = truth.render_asked(store, scene, asked, row, like, fov, amount)
+        image = truth.render_asked(store, scene, asked, row, like, amount)
     for doubt in image.doubts:
         say(f"warning: {doubt}")
     image.write(file := out or Path("render.png"))

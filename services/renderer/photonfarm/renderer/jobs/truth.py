@@ -25,7 +25,7 @@ from photonfarm.core.keys import Key, make_key, view_key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, clean_error, jackknife
 from photonfarm.renderer.jobs.estimates import halves_of
-from photonfarm.scene.arrangement import Shot, describe_shot, find_doubts, list_shot, with_fov
+from photonfarm.scene.arrangement import Shot, describe_shot, find_doubts, list_shot
 from photonfarm.scene.groups import names_of_ids
 from photonfarm.scene.modification import Modification
 from photonfarm.scene.spec import SceneSpec
@@ -238,7 +238,7 @@ class RenderedImage:
 
 
 def render_asked(
-    store: str | Path, named: str, asked: Shot, row: int | None, like: str | None, fov: float | None, amount: Amount
+    store: str | Path, named: str, asked: Shot, row: int | None, like: str | None, amount: Amount
 ) -> RenderedImage:
     """Render what is asked for of a spec, or of a scene of the store, which only has to be there for the latter.
 
@@ -253,7 +253,7 @@ def render_asked(
     if row is not None or like is not None:
         stored = scene_or_spec(Store(store), named)
         start = find_start(store, stored.scene_id, row, like)
-    spec = with_fov(load_named(store, named) if stored is None else locate(stored.spec), fov)
+    spec = load_named(store, named) if stored is None else locate(stored.spec)
     configuration, view = start or (None, None)
     configuration, view = asked.apply(spec, configuration), asked.view(spec, view)
     scene = load_scene(spec)

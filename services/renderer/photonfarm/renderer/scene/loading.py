@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
@@ -52,7 +53,7 @@ class AimedSensor:
             "film": film,
             "sampler": {"type": "independent", "sample_count": spec.transport.half_spp},
         }
-        self._spec = spec
+        self._spec, self._fov_deg = spec, spec.view.fov_deg
         self.sensor = mi.load_dict(self._described)
         self._parameters = mi.traverse(self.sensor)
 
@@ -63,14 +64,25 @@ class AimedSensor:
 
     def aim(self, view: View) -> Any:
         """The sensor, looking at this view."""
-        put_transform(self._parameters, self.place(view))
+        if (fov_deg := float(view.fov or self._spec.view.fov_deg)) != self._fov_deg:
+            self._parameters["x_fov"] = dr.opaque(mi.Float, fov_deg)
+            self._fov_deg = fov_deg
+        put_transform(self._parameters, _pose(Camera.of(view, self._spec)))
         return self.sensor
 
     def place(self, view: View) -> NDArray[np.float64]:
-        """The camera-to-world matrix (4, 4) of a view: Mitsuba's camera has +x to the left, +y up, +z ahead."""
-        camera, to_world = Camera.of(view, self._spec), np.eye(4)
-        to_world[:3] = np.stack([-camera.right, -camera.down, camera.forward, camera.origin], axis=1)
+        """The camera-to-world matrix (4, 4) of a view for `at_origin`, as `Places` has it."""
+        camera, usual = Camera.of(view, self._spec), Camera.of(replace(view, fov=None), self._spec)
+        to_world = _pose(camera)
+        to_world[:, :2] *= usual.focal_px / camera.focal_px
         return to_world
+
+
+def _pose(camera: Camera) -> NDArray[np.float64]:
+    """The camera-to-world matrix (4, 4) of a camera: Mitsuba's has +x to the left, +y up, +z ahead."""
+    to_world = np.eye(4)
+    to_world[:3] = np.stack([-camera.right, -camera.down, camera.forward, camera.origin], axis=1)
+    return to_world
 
 
 def load_scene(spec: SceneSpec, beside: Path | None = None) -> Any:

@@ -39,6 +39,7 @@ class Live {
     this.without = new Set();
     this.camera = [...this.room.camera];
     this.target = [...this.room.look_at];
+    this.fov = this.room.fov;
   }
 
   // What the server is asked about.
@@ -51,7 +52,7 @@ class Live {
       if (turn && this.turn[name]) say("turn", name, this.turn[name]);
       if (power && this.power[name] !== 1) say("power", name, this.power[name]);
     }
-    return said;
+    return this.room.fov_range ? { ...said, fov: this.fov } : said;
   }
 
   address(state) {
@@ -198,6 +199,11 @@ class Live {
       made.addEventListener("click", () => act(made));
       $("actions").append(made);
     };
+    const lens = Object.assign(document.createElement("input"), { type: "range", ...this.room.fov_range, step: "any", ariaLabel: "field of view" });
+    this.showLens = () => { lens.value = this.fov; };
+    lens.addEventListener("input", () => { this.fov = Number(lens.value); this.change(); });
+    if (this.room.fov_range) $("actions").append("field of view ", lens);
+    this.showLens();
     button("At rest", () => this.set(() => this.start()));
     button("Random", () => this.set(() => {
       const between = ({ min, max }) => min + Math.random() * (max - min);
@@ -222,6 +228,7 @@ class Live {
   set(act) {
     act();
     for (const group of this.room.groups) for (const show of group.show) show();
+    this.showLens();
     this.change();
   }
 

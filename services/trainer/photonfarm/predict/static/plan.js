@@ -107,8 +107,8 @@ export class Plan {
   }
 
   paintCamera(context) {
-    const { camera, target, room } = this.live, from = this.to(camera), to = this.to(target);
-    const angle = Math.atan2(to[1] - from[1], to[0] - from[0]), half = (room.fov * Math.PI) / 360, long = 46 * this.ratio;
+    const { camera, target, fov } = this.live, from = this.to(camera), to = this.to(target);
+    const angle = Math.atan2(to[1] - from[1], to[0] - from[0]), half = (fov * Math.PI) / 360, long = 46 * this.ratio;
     context.beginPath();
     context.moveTo(...from);
     for (const side of [-half, half]) context.lineTo(from[0] + long * Math.cos(angle + side), from[1] + long * Math.sin(angle + side));

@@ -136,7 +136,7 @@ class Guided(Network):
     def measure_places(self, inputs: Inputs) -> Tensor:
         """Where each pixel's surface is, from the eye, over the scene's size, (B, H, W, 3)."""
         to_camera = inputs.world_to_camera
-        rays = self.optics.rays(to_camera)
+        rays = self.optics.rays(to_camera, inputs.focal_px)
         ahead = (rays * to_camera[:, None, None, 2, :3]).sum(-1)
         return rays * (inputs.depth / (ahead * self.scale))[..., None]
 

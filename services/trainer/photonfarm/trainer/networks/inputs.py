@@ -223,6 +223,7 @@ class Inputs:
     noisy: NoisyColour | None = None
     guides: GuideInputs | None = None
     surface: SurfaceInputs | None = None
+    focal_px: Tensor | None = None  # (B,) focal lengths, pixels, where views have fields of view of their own
 
     @property
     def reflects(self) -> Tensor:
@@ -233,6 +234,7 @@ class Inputs:
     def of(cls, tensors: Mapping[str, Tensor], noisy: NoisyColour | None = None) -> Inputs:
         """The inputs that a `SceneDataset` has read, (B, …) by field, in the same memory; and noisy colour."""
         inputs = cls(tensors["world_to_camera"], tensors["depth"], tensors["albedo"], tensors["normal"], noisy=noisy)
+        inputs = replace(inputs, focal_px=tensors.get("focal_px"))
         if POINTS[0] in tensors:
             surfaces = (tensors.get(name) for name in POINT_SURFACES)
             points = PointInputs(*(tensors[name] for name in POINTS), *surfaces)  # in their order

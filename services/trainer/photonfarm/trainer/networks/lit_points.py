@@ -134,7 +134,7 @@ class LitPoints(nn.Module):
     def _surfaces(self, inputs: Inputs) -> tuple[Tensor, Tensor, Tensor]:
         """The ray, position and normal of each pixel's surface, (B, H, W, 3) each."""
         guides, to_camera = require(inputs.guides), inputs.world_to_camera
-        rays = self._optics.rays(to_camera)
+        rays = self._optics.rays(to_camera, inputs.focal_px)
         eye = -(to_camera[:, :, :3].mT @ to_camera[:, :, 3:]).mT - self.centre
         distance = guides.mean_depth / (rays * to_camera[:, None, None, 2, :3]).sum(-1)
         at = eye[:, None] + rays * distance[..., None]

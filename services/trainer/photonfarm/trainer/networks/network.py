@@ -172,7 +172,9 @@ class Network(nn.Module):
     def image_space(self, inputs: Inputs) -> Tensor:
         """View ray, depth, albedo and normal as one tensor, (B, H, W, 10)."""
         depth = inputs.depth[..., None] / self.scale
-        return torch.cat([self.optics.rays(inputs.world_to_camera), depth, inputs.albedo, inputs.normal], dim=-1)
+        return torch.cat(
+            [self.optics.rays(inputs.world_to_camera, inputs.focal_px), depth, inputs.albedo, inputs.normal], dim=-1
+        )
 
     def synthesise(self, channels: Tensor) -> Tensor:
         """(B, H, W, C) → (B, H, W, outputs). Channels stay last in memory, as CPUs and tensor cores take them."""
@@ -188,5 +190,6 @@ class Network(nn.Module):
 
     def project(self, features: Tensor, position: Tensor, present: Tensor, seen: Tensor, inputs: Inputs) -> Tensor:
         """Features of points at world positions, (B, P, C), as the mean in each pixel, (B, H, W, C)."""
-        kept = footprint(position, present, seen, inputs.world_to_camera, inputs.depth, self.optics)
+        view = inputs.world_to_camera, inputs.depth
+        kept = footprint(position, present, seen, *view, self.optics, inputs.focal_px)
         return project_mean(features, kept, self.optics.height, self.optics.width)

@@ -38,11 +38,11 @@ class PhotonLight:
 
     def __call__(self, inputs: Inputs) -> list[Tensor]:
         """(B, H, W, 3) for each of `photon_map.WINDOWS`."""
-        photons, view = require(inputs.photons), (inputs.world_to_camera, inputs.depth)
+        photons, view, own = require(inputs.photons), (inputs.world_to_camera, inputs.depth), inputs.focal_px
         on_side = arrives_on_seen_side(photons.position, photons.direction, photons.normal, inputs.world_to_camera)
         wanted = photons.present & on_side & (photons.bounce >= self._first) & (photons.bounce <= self._last)
-        kept = footprint(photons.position, wanted, photons.seen, *view, self._optics)
-        return gather_light(photons.power * self._exposure, kept, seen_area(self._optics, *view, inputs.normal))
+        kept = footprint(photons.position, wanted, photons.seen, *view, self._optics, own)
+        return gather_light(photons.power * self._exposure, kept, seen_area(self._optics, *view, inputs.normal, own))
 
 
 WINDOWS = (0.07, 0.17)
@@ -56,14 +56,16 @@ GRAZING = 0.05
 """The cosine between ray and normal below which a pixel is left out: the area of surfaces seen edge-on is unbounded."""
 
 
-def seen_area(optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Tensor) -> Tensor:
+def seen_area(
+    optics: Optics, world_to_camera: Tensor, depth: Tensor, normal: Tensor, focal_px: Tensor | None = None
+) -> Tensor:
     """The area of each pixel's surface, (B, H, W) in scene units²; 0 if there is none, or it is seen almost edge-on.
 
     z² / (f² |n · d|) for depth z, focal length f in pixels, unit shading normal n, and d the ray that crosses depth 1.
     """
-    rays, forward = optics.rays(world_to_camera), world_to_camera[:, None, None, 2, :3]
+    rays, forward = optics.rays(world_to_camera, focal_px), world_to_camera[:, None, None, 2, :3]
     along, facing = (rays * forward).sum(dim=-1), (rays * normal).sum(dim=-1).abs()
-    area = (depth / optics.focal_px) ** 2 * along / facing.clamp(min=GRAZING)
+    area = (depth / optics.focal(focal_px, 2)) ** 2 * along / facing.clamp(min=GRAZING)
     return area.masked_fill(facing < GRAZING, 0)
 
 

@@ -21,7 +21,7 @@ from photonfarm.trainer.runs.settings import Occlusion
 class Optics:
     """The optics that all cameras of a scene share, and the rule by which hidden points are found."""
 
-    focal_px: float
+    focal_px: float  # of views that have none of their own
     width: int
     height: int
     near: float  # scene units, near plane of window depth
@@ -31,19 +31,26 @@ class Optics:
 
     @classmethod
     def of(cls, spec: SceneSpec, occlusion: Occlusion = "exact", tolerance: float = 1e-3) -> Optics:
-        """The optics of a spec; the focal length is that of every `Camera` of it."""
+        """The optics of a spec."""
         camera = Camera.of(View(np.zeros(3, np.float32), np.ones(3, np.float32)), spec)
         return cls(camera.focal_px, camera.width, camera.height, spec.view.near, spec.view.far, occlusion, tolerance)
 
-    def rays(self, world_to_camera: Tensor) -> Tensor:
+    def focal(self, focal_px: Tensor | None, axes: int) -> Tensor | float:
+        """The focal length to divide an array by, whose first axis is B and which has so many further ones.
+
+        `focal_px` (B,) are those of the views; None: all have the scene's.
+        """
+        return self.focal_px if focal_px is None else focal_px.reshape(-1, *[1] * axes)
+
+    def rays(self, world_to_camera: Tensor, focal_px: Tensor | None = None) -> Tensor:
         """Unit world directions through the pixel centres, (B, H, W, 3): normalise(T⁻¹ K⁻¹ (u+.5, v+.5, 1))."""
         columns, rows = (
             torch.arange(n, device=world_to_camera.device).to(world_to_camera) for n in (self.width, self.height)
         )
-        x = (columns + 0.5 - 0.5 * self.width) / self.focal_px
-        y = (rows + 0.5 - 0.5 * self.height) / self.focal_px
+        x = (columns + 0.5 - 0.5 * self.width) / self.focal(focal_px, 1)
+        y = (rows + 0.5 - 0.5 * self.height) / self.focal(focal_px, 1)
         right, down, forward = (world_to_camera[:, None, None, i, :3] for i in range(3))
-        direction = x[:, None] * right + y[:, None, None] * down + forward
+        direction = x[..., None, :, None] * right + y[..., :, None, None] * down + forward
         return direction / torch.linalg.vector_norm(direction, dim=-1, keepdim=True)
 
 
@@ -76,15 +83,21 @@ class Footprint:
 
 @torch.no_grad()
 def footprint(
-    position: Tensor, present: Tensor, seen: Tensor, world_to_camera: Tensor, depth: Tensor, optics: Optics
+    position: Tensor,
+    present: Tensor,
+    seen: Tensor,
+    world_to_camera: Tensor,
+    depth: Tensor,
+    optics: Optics,
+    focal_px: Tensor | None = None,
 ) -> Footprint:
     """The kept points, and their pixels.
 
     position (B, P, 3) world, present and seen (B, P) bool, world_to_camera (B, 3, 4), depth (B, H, W) along the forward
-    axis. Image coordinates are floored. Points are dropped if they are flagged as absent, behind the camera, outside
-    the image, or occluded. By the rule "exact", points that are not `seen` are occluded, whatever the depth. By the
-    rule "window" [supplement 1.2], points that lie behind the rendered depth by more than the tolerance, seen or not,
-    and none where the depth is 0, as nothing was hit there.
+    axis, focal_px (B,) as in `Inputs`. Image coordinates are floored. Points are dropped if they are flagged as absent,
+    behind the camera, outside the image, or occluded. By the rule "exact", points that are not `seen` are occluded,
+    whatever the depth. By the rule "window" [supplement 1.2], points that lie behind the rendered depth by more than
+    the tolerance, seen or not, and none where the depth is 0, as nothing was hit there.
 
     Window depth is OpenGL's, w(z) = (1/near − 1/z) / (1/near − 1/far), 0 at the near plane and 1 at the far plane. The
     supplement's ε = 1e-3 is only sensible there: on linear depth it removes points of slanted surfaces [method 2].
@@ -93,8 +106,9 @@ def footprint(
     x, y, z = (position @ world_to_camera[:, :, :3].mT + world_to_camera[:, None, :, 3]).unbind(-1)
     ahead = (present & seen if is_exact else present) & (z > 0)
     z = z.masked_fill(~ahead, 1)  # avoids division by zero; dropped below
-    column = torch.floor(optics.focal_px * x / z + 0.5 * optics.width)
-    row = torch.floor(optics.focal_px * y / z + 0.5 * optics.height)
+    focal = optics.focal(focal_px, 1)
+    column = torch.floor(focal * x / z + 0.5 * optics.width)
+    row = torch.floor(focal * y / z + 0.5 * optics.height)
     kept = ahead & (column >= 0) & (column < optics.width) & (row >= 0) & (row < optics.height)
     u, v = (each.masked_fill(~kept, 0).long() for each in (column, row))
     pixel = v * optics.width + u

@@ -43,7 +43,7 @@ CUT_AT_ALL = 0.05
 """The shares of a group's places from which on something is said."""
 
 
-_VIEWS = {"view.origin", "view.look_at", "view.far", "view.near", "view.fov_deg"}
+_VIEWS = {"view.origin", "view.look_at", "view.far", "view.near", "view.fov_deg", "view.fov"}
 """The keys of a spec that, where they are doubted, explain what cameras do not see."""
 _DARKNESS = {"transport.max_depth", "emitters", "scene"}
 """Those that explain why pictures are dark."""

@@ -213,15 +213,20 @@ def list_own_files(path: Path, parameters: Mapping[str, str]) -> list[str]:
     image nor table of numbers, and a type that is no plugin's name, as Mitsuba would look for a library there.
     """
     root = parse(path)
-    names = sorted({str(PurePosixPath(name)) for name in _list_names(root)})
+    of_spectra = [file for node in root.iter() if (file := node.get("filename")) is not None]
+    names = sorted({str(PurePosixPath(name)) for name in (*_list_names(root), *of_spectra)})
     for name in names:
         if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts or {*name} & {*"\\$"}:
             raise SpecError(f"{path}: filename = {name!r} is no file below the scene's folder; copy it there")
         if PurePosixPath(name).suffix.lower() not in OWN_FILES:
             raise SpecError(f"{path}: filename = {name!r} is none of {', '.join(OWN_FILES)}")
-    values = {f"${node.get('name')}": node.get("value", "") for node in root.iter("default")}
-    values |= {f"${name}": value for name, value in parameters.items()}
+    values = [(node.get("name", ""), node.get("value", "")) for node in root.iter("default")] + [*parameters.items()]
     for node in root.iter():
-        if (kind := node.get("type")) is not None and not _TYPE.fullmatch(values.get(kind, kind)):
-            raise SpecError(f"{path}: line {line_of(node)}: type = {kind!r} is no plugin's name")
+        where, kind = f"{path}: line {line_of(node)}", node.get("type")
+        if node.tag == "path" or "$" in node.get("name", ""):
+            raise SpecError(f"{where}: <{node.tag}> may name files elsewhere; write what it stands for instead")
+        if kind is not None:
+            possible = [value for name, value in values if kind.startswith(f"${name}")]
+            if not all(map(_TYPE.fullmatch, (kind.removeprefix("$"), *possible))):
+                raise SpecError(f"{where}: type = {kind!r} is no plugin's name")
     return names

@@ -1,6 +1,7 @@
 """A network on its own: the file that `pack` writes predicts as its run does, anywhere; and as ONNX."""
 
 import gc
+import io
 import json
 import re
 import shlex
@@ -177,7 +178,8 @@ def describe(**changes: Any) -> Callable[[dict[str, bytes]], None]:
 
 def name_scene(content: str) -> Callable[[dict[str, bytes]], None]:
     """Another scene in the place of its own."""
-    return lambda members: members.update({"scene/scene.xml": content.encode()})
+    scene = f'<scene version="3.0.0">{content}</scene>'
+    return lambda members: members.update({"scene/scene.xml": scene.encode()})
 
 
 @pytest.mark.parametrize(
@@ -193,11 +195,16 @@ def name_scene(content: str) -> Callable[[dict[str, bytes]], None]:
         (lambda members: members.update({ABOUT: b"[]"}), StoreError),
         (describe(format=2), StoreError),
         (describe(spec={}), StoreError),
-        (name_scene('<scene version="3.0.0"><bsdf type="../evil"/></scene>'), SpecError),
-        (name_scene('<scene version="3.0.0"><default name="a" value="/evil"/><bsdf type="$a"/></scene>'), SpecError),
-        (name_scene('<scene version="3.0.0"><string name="filename" value="/etc/x.obj"/></scene>'), SpecError),
-        (name_scene('<scene version="3.0.0"><string name="filename" value="evil.so"/></scene>'), SpecError),
-        (name_scene("no XML"), StoreError),
+        (name_scene('<bsdf type="../evil"/>'), SpecError),
+        (name_scene('<default name="a" value="/evil"/><bsdf type="$a"/>'), SpecError),
+        (name_scene('<string name="filename" value="/etc/x.obj"/>'), SpecError),
+        (name_scene('<default name="a" value="/evil"/><default name="a" value="b"/><bsdf type="$a"/>'), SpecError),
+        (name_scene('<default name="k" value="a"/><default name="$k" value="/evil"/><bsdf type="$a"/>'), SpecError),
+        (name_scene('<default name="a" value="filename"/><string name="$a" value="/etc/x.obj"/>'), SpecError),
+        (name_scene('<spectrum name="a" filename="/etc/x.spd"/>'), SpecError),
+        (name_scene('<path value="/etc"/><string name="filename" value="x.obj"/>'), SpecError),
+        (name_scene('<string name="filename" value="evil.so"/>'), SpecError),
+        (name_scene("<no XML"), StoreError),
     ],
 )
 def test_a_file_that_pack_did_not_write_is_refused_by_its_name(
@@ -212,7 +219,17 @@ def test_a_file_that_pack_did_not_write_is_refused_by_its_name(
 def test_a_file_that_is_cut_short_or_would_grow_is_refused(packed: Path, tmp_path: Path) -> None:
     bomb = rewrite(packed, tmp_path / "bomb.photonfarm", describe(more=" " * 10**6), compression=zipfile.ZIP_DEFLATED)
     (short := tmp_path / "short.photonfarm").write_bytes(packed.read_bytes()[:-100])
-    for file in (bomb, short):
+    (base := tmp_path / "base.npz").write_bytes(zipfile.ZipFile(packed).read("base.npz"))
+    np.lib.format.write_array_header_1_0(
+        header := io.BytesIO(), {"descr": "<f4", "fortran_order": False, "shape": (10**13,)}
+    )
+    deflated = rewrite(base, tmp_path / "deflated", lambda _: None, compression=zipfile.ZIP_DEFLATED).read_bytes()
+    vast = rewrite(base, tmp_path / "vast", lambda arrays: arrays.update({"cloud.face.npy": header.getvalue()}))
+    made = [
+        rewrite(packed, tmp_path / "deflated.photonfarm", lambda members: members.update({"base.npz": deflated})),
+        rewrite(packed, tmp_path / "vast.photonfarm", lambda members: members.update({"base.npz": vast.read_bytes()})),
+    ]
+    for file in (bomb, short, *made):
         refused = CliRunner().invoke(umbrella, ["infer", "--run", str(file)])
         assert isinstance(refused.exception, SystemExit | StoreError)
         with pytest.raises(StoreError, match=file.name):

@@ -121,6 +121,8 @@ def read_network(file: Path) -> tuple[TrainSettings, dict[str, Any], PackedScene
             if is_own(settings.network.architecture) or state["scene_id"] != spec.scene_id or "network" not in state:
                 raise ValueError("its weights are of another scene, or of code that it does not hold")
             check_version(file, state["settings"]["network"])
+            with zipfile.ZipFile(folder / BASE) as archive:
+                _list_members(archive, folder / BASE)
             with read_arrays(folder / BASE, "base", "pack") as arrays:
                 geometry = Geometry(**_read_record("geometry", arrays))
                 cloud = BasePointCloud(**_read_record("cloud", arrays), pivots=spec.pivots)
@@ -133,16 +135,9 @@ def read_network(file: Path) -> tuple[TrainSettings, dict[str, Any], PackedScene
 
 
 def _unpack(file: Path, folder: Path) -> None:
-    """Unpack a file whose members are what `write_network` wrote, by their names and sizes; else ValueError.
-
-    Members are not compressed, so that together they are no larger than the file.
-    """
+    """Unpack a file whose members are what `write_network` wrote, by their names and sizes; else ValueError."""
     with zipfile.ZipFile(file) as archive:
-        members = archive.infolist()
-        if any(member.compress_type for member in members):
-            raise ValueError("its members are compressed")
-        if sum(member.file_size for member in members) > file.stat().st_size:
-            raise ValueError("its members are larger than the file")
+        members = _list_members(archive, file)
         if (found := json.loads(archive.read(ABOUT)).get("format")) != FORMAT:
             raise StoreError(f"{file}: has format {found!r}, but this version reads format {FORMAT}")
         for member in members:
@@ -157,6 +152,16 @@ def _unpack(file: Path, folder: Path) -> None:
                 shutil.copyfileobj(content, out)
 
 
+def _list_members(archive: zipfile.ZipFile, file: Path) -> list[zipfile.ZipInfo]:
+    """The members of an archive; ValueError if they are compressed, or together larger than its file."""
+    members = archive.infolist()
+    if any(member.compress_type for member in members):
+        raise ValueError(f"members of {file.name} are compressed")
+    if sum(member.file_size for member in members) > file.stat().st_size:
+        raise ValueError(f"members of {file.name} are larger than the file")
+    return members
+
+
 FAULTS = (
     zipfile.BadZipFile,
     ValueError,
@@ -167,6 +172,7 @@ FAULTS = (
     NotImplementedError,
     ParseError,
     RuntimeError,
+    MemoryError,  # of an array that says that it is larger than it is
 )
 """The errors of reading a file that was not written here."""
 

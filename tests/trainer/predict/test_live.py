@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import threading
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -217,6 +218,30 @@ def test_two_pages_see_each_their_own_configuration(address: str) -> None:
                     pass
                 np.testing.assert_array_equal(pixels[..., :3], read_picture(told))
             assert page.errors == []
+
+
+@needs_chromium
+def test_a_clip_shows_an_old_truth_as_pale_as_the_page(address: str) -> None:
+    begin = (
+        "(() => { const capture = HTMLCanvasElement.prototype.captureStream;"
+        "HTMLCanvasElement.prototype.captureStream = function (...how) {"
+        "window.clip = this; return capture.call(this, ...how); };"
+        "[...document.querySelectorAll('button')].find((b) => b.textContent === 'Record').click(); })()"
+    )
+    halves = (
+        "(({ width, height }, at) => [0, width / 2].map((x) => at.getImageData(x, 0, width / 2, height).data"
+        ".reduce((sum, value, i) => sum + (i % 4 < 3 ? value : 0), 0)))(window.clip, window.clip.getContext('2d'))"
+    )
+    with chromium() as page:
+        page.open(address, 800, 1500)
+        page.wait_for("window.live?.isDone", 60)
+        page.value(begin)
+        page.wait_for(f"{halves}[1] > 0")
+        network, truth = page.value(halves)
+        page.value("document.querySelector('#truth').classList.add('old')")
+        page.wait_for(f"{halves}[1] < {0.9 * truth}")
+        time.sleep(0.2)  # further pictures of the clip, each over the one before
+        assert page.value(halves) == [network, pytest.approx(0.35 * truth, rel=0.02)]
 
 
 def drag_sofa(page: Page) -> None:

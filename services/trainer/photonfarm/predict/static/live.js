@@ -237,10 +237,13 @@ class Live {
     if (this.recorder) { this.recorder.stop(); return; }
     const [wide, high] = [$("network").width, $("network").height], factor = Math.max(1, Math.round(480 / wide));
     const both = Object.assign(document.createElement("canvas"), { width: 2 * factor * wide, height: factor * high });
-    const context = both.getContext("2d"), parts = [];
+    const context = both.getContext("2d", { alpha: false }), parts = [];
     const draw = () => {
       context.imageSmoothingEnabled = false;
+      context.globalAlpha = 1;
+      context.clearRect(0, 0, both.width, both.height);
       context.drawImage($("network"), 0, 0, factor * wide, factor * high);
+      context.globalAlpha = getComputedStyle($("truth")).opacity; // an old truth is as pale as on the page
       context.drawImage($("truth"), factor * wide, 0, factor * wide, factor * high);
     };
     const drawing = setInterval(draw, 40);

@@ -52,6 +52,7 @@ def test_a_truth_ends_where_its_own_error_is_small_enough_or_its_samples_are_man
         assert off == pytest.approx(found.own_error(), rel=0.5)
     monkeypatch.setattr(truth, "MOST_SPP", 128)
     assert render_truth(room, key, somewhere, Amount(error=1e-9)).spp == 128
+    assert [render_truth(room, key, somewhere, Amount(spp=spp)).spp for spp in (1, 2, 5)] == [4, 4, 6], "two passes"
 
 
 def test_what_stands_in_a_wall_or_beyond_and_a_camera_inside_of_something_are_said(

@@ -182,14 +182,14 @@ def render_truth(scene: LoadedScene, key: Key, view: View, amount: Amount) -> Tr
     most = SMALL_HALF if amount.spp is None else amount.spp // (2 * PARTS)
     began, refined = time.perf_counter(), RefinedTruth(scene.spec, max(1, min(scene.spec.transport.half_spp, most)))
     refined.add(scene, key, view, LEAST_PASSES)
-    while missing := _count_missing(refined, amount, time.perf_counter() - began):
+    while (missing := _count_missing(refined, amount, time.perf_counter() - began)) > 0:
         for first in range(0, missing, scene.samples_at_once):
             refined.add(scene, key, view, min(missing - first, scene.samples_at_once))
     return refined.result()
 
 
 def _count_missing(refined: RefinedTruth, amount: Amount, seconds: float) -> int:
-    """The passes to render next, after so many seconds; 0 if there are enough.
+    """The passes to render next, after so many seconds; 0 or less if there are enough.
 
     A mean over n passes has an error in proportion to 1/n. It is looked at after as many passes again, at the most.
     """

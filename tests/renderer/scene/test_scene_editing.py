@@ -1,6 +1,7 @@
 """The built-in room edited in place: nothing of an edit is left over, and nothing is compiled for the next."""
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -170,6 +171,28 @@ def test_what_did_not_move_is_not_built_again_and_rays_meet_the_same(room: Loade
         assert of_moved is not None
         assert of_all is not None
         np.testing.assert_array_equal(of_moved.position, of_all.position)
+
+
+def test_shapes_that_are_no_meshes_and_those_that_leave_the_scene_s_box_are_met_where_they_are(
+    file_scene: Callable[..., LoadedScene], tmp_path: Path
+) -> None:
+    """Bit by bit, as where Mitsuba gives Embree every shape anew, and so is the light of a sky around the box."""
+    ball = '<shape type="sphere" id="Ball"><point name="center" x="0" y="1" z="0"/><float name="radius" value="0.5"/>'
+    tall = '<shape type="cube" id="Tall"><transform name="to_world"><scale x="0.1" y="3" z="0.1"/></transform></shape>'
+    box = {"min": [-9, 1, -9], "max": [9, 1, 9]}
+    described = {"name": "ball", "shapes": ["Ball"], "at": [0, 1, 0], "box": box, "removal_probability": 0.5}
+    content = f'{ball}</shape>{tall}<emitter type="constant"/>'
+    edited, whole = (file_scene(tmp_path, content, objects=[described]) for _ in range(2))
+    assert edited._changing is not None
+    whole._changing = None
+    view = View(np.array([0, 2, 3.5], np.float32), np.array([0, 1, 0], np.float32))
+    for x, present in ((1, True), (2, True), (8, True), (1.5, True), (1.5, False), (-1, True)):
+        standing = Modification(np.array([[x, 0, 0]], np.float32), np.array([present]))
+        for loaded in (edited, whole):
+            loaded.apply(standing)
+        np.testing.assert_array_equal(corners(edited), corners(whole))
+        same_image_and_buffers(edited, whole, view)
+        assert (1 in edited.find_groups([view])) == (present and x < 8)
 
 
 def test_embree_can_be_told_to_expect_changes_and_each_scene_is_told_by_itself() -> None:

@@ -46,6 +46,8 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("preview room --out p.png", 2, ["--out: 'p.png'", "preview.html"]),
         ("work --job 3", 2, ["--scene"]),
         ("redis --port 70000", 2, ["'--port'"]),
+        ("up room --also guided 9 --also guided 8", 2, ["--also names a network twice"]),
+        ("up room --also guided 9 --train-steps 0", 2, ["--train-steps 0 trains none"]),
         ("up room --modifications 1", 3, ["1 configuration is planned", "--modifications 2 plans enough"]),
         ("up room --hold-out 0.1 --modifications 3", 3, ["hold_out = 0.1: of the 3", "--hold-out 0.16", "tions 4"]),
         ("up cornell --modifications 3 --views 2 --hold-out 0.9999", 3, ["6 views planned all"]),

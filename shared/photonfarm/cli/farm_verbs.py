@@ -367,7 +367,9 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
         named = {f"--{name}": options.pop(name) for name in ("preset", "architecture")}
         given = [word for name, value in named.items() if value is not None for word in (name, value)]
         options["train_options"] = [*given, *(word for pair in options.pop("pairs") for word in ("--set", pair))]
-        options["also"] = dict(options["also"])
+        asked, options["also"] = options["also"], dict(options["also"])
+        if len(options["also"]) < len(asked):
+            raise click.UsageError("--also names a network twice; each trains in the one folder of its name")
         if options["also"] and not options["train_steps"]:
             raise click.UsageError("--also trains beside a network, and --train-steps 0 trains none")
         for own in ([], *(["--architecture", name] for name in options["also"])) if options["train_steps"] else ():

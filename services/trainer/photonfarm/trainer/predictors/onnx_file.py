@@ -93,7 +93,8 @@ def _export(network: NamedNetwork, inputs: dict[str, Tensor]) -> Any:
     from onnxscript import optimizer
 
     batch = torch.export.Dim("batch", min=1)
-    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it warns of a package that has nothing to do with this
+    for name in ("torch.onnx", "onnx_ir"):  # which warn of what the user has no part in
+        logging.getLogger(name).setLevel(logging.ERROR)
     with torch.no_grad(), warnings.catch_warnings(action="ignore"):  # torch's, of its own code
         shapes = {"tensors": tuple({0: batch} for _ in inputs)}
         program = torch.export.export(network, tuple(inputs.values()), dynamic_shapes=shapes, strict=True)

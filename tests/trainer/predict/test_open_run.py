@@ -373,6 +373,9 @@ def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path,
     (cameras := tmp_path / "transforms.json").write_text(json.dumps({"frames": 2 * [{"transform_matrix": matrix}]}))
     done = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras)], catch_exceptions=False)
     assert len({Path(line).parent.name for line in done.stdout.split()}) == 1 + 2, "the first has its own camera"
+    (own := out / "frame.json").write_text(json.dumps(said[0]))
+    CliRunner().invoke(umbrella, [*place[:-1], str(own)], catch_exceptions=False)
+    assert {file.name for file in out.iterdir()} == {"frame-0000", own.name}, "what it reads stays"
     rooms.write_text("sofa.x\n0.9\n")
     CliRunner().invoke(umbrella, place, catch_exceptions=False)
     assert {file.name for file in out.iterdir()} == {"frame-0000"}

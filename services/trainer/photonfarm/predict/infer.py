@@ -68,14 +68,14 @@ class InferResult:
     doubts: tuple[str, ...] = ()
 
 
-def remove_others(out: Path, made: Collection[Path]) -> None:
+def remove_others(out: Path, made: Collection[Path], read: Collection[Path]) -> None:
     """Remove from a folder what earlier calls have made there and this one has not, as it shows other things.
 
-    Raises StoreError if that is refused.
+    What this one has read stays. Raises StoreError if that is refused.
     """
     with store_errors("remove the pictures of an earlier call", out):
         for file in {*out.glob("*"), *out.glob(f"{FOLDERS}/*")} - {*made}:
-            if MADE.fullmatch(file.name) and file.is_file():
+            if MADE.fullmatch(file.name) and file.is_file() and not any(map(file.samefile, read)):
                 file.unlink()
         for folder in out.glob(FOLDERS):
             if folder.is_dir() and not any(folder.iterdir()):

@@ -116,6 +116,7 @@ def infer(
 
     began = time.perf_counter()
     files = cameras or configurations
+    read = [file for file in (cameras, configurations, path, buffers) if file]
     kinds = {"--camera-path": path, "--orbit": orbit, "--buffers": buffers}
     kinds |= {"--cameras" if cameras else "--configurations": files}
     given = [name for name, value in kinds.items() if value is not None]
@@ -160,7 +161,7 @@ def infer(
                 shown = shows.show_frame(opened, Shot(), shot, folder, amount, load_s)
                 _tell(shown, f"{folder.name}: ")
                 made += shown.files
-        shows.remove_others(out, made)
+        shows.remove_others(out, made, read)
         return
     elif buffers is not None:
         result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
@@ -177,7 +178,7 @@ def infer(
             load_s = time.perf_counter() - began
             result = shows.show_frame(opened, asked, start, out, amount, load_s, store_it=store_it)
     _tell(result)
-    shows.remove_others(out, result.files)
+    shows.remove_others(out, result.files, read)
 
 
 def _tell(result: InferResult, where: str = "") -> None:

@@ -360,6 +360,8 @@ def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path,
     assert done.exit_code == 0
     assert Counter(Path(line).parent.name for line in done.stdout.split()) == {"frame-0000": 6, "frame-0001": 6}
     said = [json.loads((out / f"frame-{i:04}/frame.json").read_text()) for i in range(2)]
+    for each in said:
+        assert f"own squared error is {100 * each['truth_error'] / each['mean_square']:.2g} % of" in done.stderr
     assert [each["without"] for each in said] == [["vase"], ["sofa", "vase"]]
     assert [each["place"] for each in said] == [{"sofa": [0.9, 0, 0.3]}, {}]
     assert [each["camera"] for each in said] == [[-1.9, 1.6, 1.7], [1.9, 1.6, 1.7]]

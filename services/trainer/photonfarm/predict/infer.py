@@ -124,10 +124,13 @@ def show_frame(
         about |= {"spp": truth.spp, "squared_error": error.mean, "interval": error.interval, "mean_square": power}
         about["truth_error"] = truth.own_error()
         low, high = error.interval or (error.mean, error.mean)
-        share = f"{100 * error.mean / power:.2g} % of the image's mean square" if power > 0 else "of a black image"
+        share, own_share = (
+            f"{100 * each / power:.2g} % of the image's mean square" if power > 0 else "of a black image"
+            for each in (error.mean, about["truth_error"])
+        )
         said.append(
             f"squared error {error.mean:.5f}, with probability 0.95 from {low:.5f} to {high:.5f}: {share}; truth of "
-            f"{truth.spp} samples per pixel, with an error of {about['truth_error']:.2g} of its own"
+            f"{truth.spp} samples per pixel, whose own squared error is {own_share}"
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
     if store_it:

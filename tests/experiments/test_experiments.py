@@ -377,7 +377,7 @@ def test_a_run_that_its_rounds_ended_has_come_to_its_end(tiny: Experiment, tmp_p
     stages = trained(tiny, tmp_path / "work", step=1)
     (run,) = tiny.trained()
     log = tmp_path / "work/runs/light_transport/metrics.jsonl"
-    for reason, is_its_end in (("stopped", False), ("rounds", True), ("learned noise", True)):
+    for reason, is_its_end in (("stopped", False), ("rounds", True), ("learned by heart", True)):
         log.write_text(json.dumps({"step": 1, "kind": "end", "reason": reason}) + "\n")
         assert stages._is_trained(run) is is_its_end
 

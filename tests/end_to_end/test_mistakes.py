@@ -52,7 +52,7 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("up room --hold-out 0.1 --modifications 3", 3, ["hold_out = 0.1: of the 3", "--hold-out 0.16", "tions 4"]),
         ("up cornell --modifications 3 --views 2 --hold-out 0.9999", 3, ["6 views planned all"]),
         ("--config none.toml status", 3, ["none.toml"]),
-        ("infer --row 0", 4, ["run: there is no such folder"]),
+        ("infer --row 0", 4, ["run: there is no such run; `photonfarm train` makes one"]),
     ],
 )
 def test_in_an_empty_folder(here: Path, command: str, code: int, names: list[str]) -> None:

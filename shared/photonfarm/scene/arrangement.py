@@ -183,7 +183,10 @@ def _check_changes(spec: SceneSpec, name: str, key: str) -> None:
     """Raise SpecError, with what to add, if this cannot change of a group by its spec."""
     able = [each.name for each in spec.groups if (not each.stays if key == "place" else getattr(each, key, None))]
     if name not in able:
-        where = "a light's table" if key in ("power", "colour") else "its table"
+        where = "its table"
+        if key in ("power", "colour"):
+            is_object = any(each.name == name for each in spec.objects)
+            where = "a table of [[lights]], if it shines," if is_object else "a light's table"
         raise SpecError(
             f"{key} of {name!r}: the spec of {spec.name} gives one to {', '.join(able) or 'no group'}; "
             f"{GIVEN_BY[key]} in {where} adds it, and makes another scene"

@@ -50,6 +50,8 @@ def test_a_truth_ends_where_its_own_error_is_small_enough_or_its_samples_are_man
         # what it says of itself is what it is off by
         off = np.mean((found.radiance - good.radiance) ** 2) * room.spec.exposure**2 - good.own_error()
         assert off == pytest.approx(found.own_error(), rel=0.5)
+    with pytest.raises(SpecError, match=r"an image of shape \(2, 3\), and the truth has"):
+        good.error(np.zeros((2, 3)))
     monkeypatch.setattr(truth, "MOST_SPP", 128)
     assert render_truth(room, key, somewhere, Amount(error=1e-9)).spp == 128
     assert [render_truth(room, key, somewhere, Amount(spp=spp)).spp for spp in (1, 2, 5)] == [4, 4, 6], "two passes"

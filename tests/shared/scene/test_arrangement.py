@@ -98,7 +98,10 @@ def test_angles_powers_and_colours_have_names_too(spec: SceneSpec, turning: Scen
     ("asked", "said"),
     [
         ({"turn": {"lamp": 5}}, r"turn of 'lamp': the spec of room gives one to sofa; turn = \{.*\} in its table adds"),
-        ({"power": {"sofa": 2}}, r"gives one to ceiling-light-1, sky; power = \{.*\} in a light's table"),
+        (
+            {"power": {"sofa": 2}},
+            r"gives one to ceiling-light-1, sky; power = \{.*\} in a table of \[\[lights\]\], if it shines, adds",
+        ),
         ({"colour": {"sky": (1, 0, 0)}}, r"gives one to ceiling-light-1; colour = \["),
         (
             {"move": {"sky": (1, 0, 0)}},

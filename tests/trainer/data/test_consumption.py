@@ -155,7 +155,7 @@ def test_a_run_goes_on_as_it_was_begun_and_ends_where_it_ended(
         )
     )
     assert {file: file.read_bytes() for file in run.iterdir() if file.is_file()} == left
-    assert any("--steps N trains on" in line for line in said)
+    assert any("has ended at step 2 (steps); with --steps N it goes on" in line for line in said)
     with pytest.raises(SpecError, match="batch = 8, and 2"):
         call(max_steps=3, preset="small", **settings)
     assert call(max_steps=3).settings == begun.model_copy(update={"max_steps": 3})

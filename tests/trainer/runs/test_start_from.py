@@ -79,7 +79,7 @@ def test_weights_of_another_network_are_refused_by_each_setting(
 
 def test_a_folder_that_holds_no_run_is_refused_before_samples_are_waited_for(tmp_path: Path) -> None:
     changes = {"start_from": str(tmp_path / "none"), "max_seconds": 60.0}
-    with pytest.raises(StoreError, match="there is no such folder"):
+    with pytest.raises(StoreError, match="there is no such run"):
         service.run("cornell", tmp_path / "store", tmp_path / "run", "small", changes, log=str)
 
 

@@ -124,13 +124,10 @@ def show_frame(
         about |= {"spp": truth.spp, "squared_error": error.mean, "interval": error.interval, "mean_square": power}
         about["truth_error"] = truth.own_error()
         low, high = error.interval or (error.mean, error.mean)
-        share, own_share = (
-            f"{100 * each / power:.2g} % of the image's mean square" if power > 0 else "of a black image"
-            for each in (error.mean, about["truth_error"])
-        )
         said.append(
-            f"squared error {error.mean:.5f}, with probability 0.95 from {low:.5f} to {high:.5f}: {share}; truth of "
-            f"{truth.spp} samples per pixel, whose own squared error is {own_share}"
+            f"squared error {error.mean:.5f}, with probability 0.95 from {low:.5f} to {high:.5f}: "
+            f"{truth.describe_error(error.mean)}; truth of {truth.spp} samples per pixel, whose own squared error is "
+            f"{truth.describe_error(truth.own_error())}"
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
     if store_it:

@@ -104,13 +104,16 @@ class Truth:
         """The mean of both, (H, W, 3)."""
         return self.halves.mean(axis=0)
 
-    def error(self, radiance: F32) -> Estimate:
+    def error(self, radiance: Any) -> Estimate:
         """The mean squared error of an image against the clean one, radiance × exposure, the noise taken out.
 
-        The image must not have seen the truth. The standard error is that of the truth's noise, by the jackknife over
-        its parts.
+        The image is an array or a tensor, (H, W, 3), linear radiance, and must not have seen the truth. The standard
+        error is that of the truth's noise, by the jackknife over its parts. Raises SpecError for another shape.
         """
-        image, parts = radiance * np.float32(self.exposure), self.parts * self.exposure
+        given = np.asarray(radiance.detach().cpu() if hasattr(radiance, "detach") else radiance)
+        if given.shape != self.parts.shape[2:]:
+            raise SpecError(f"radiance: an image of shape {given.shape}, and the truth has {self.parts.shape[2:]}")
+        image, parts = given * np.float32(self.exposure), self.parts * self.exposure
         total = np.tensordot(self.passes, parts, 1)
 
         def measure(left: NDArray[np.float64], passes: int) -> float:
@@ -130,6 +133,13 @@ class Truth:
     def power(self) -> float:
         """The mean square of the clean image, radiance × exposure: the error of a black image."""
         return self.error(np.zeros_like(self.radiance)).mean
+
+    def describe_error(self, error: float) -> str:
+        """A squared error in words, as a share of the mean square."""
+        power = self.power()
+        return (
+            f"{100 * error / power:.2g} % of the image's mean square" if power > 0 else f"{error:.2g}, of a black image"
+        )
 
 
 class RefinedTruth:
@@ -228,7 +238,10 @@ class RenderedImage:
 
     def line(self) -> str:
         """What was rendered, in words."""
-        noise = f"{self.truth.spp} samples per pixel in {self.truth.seconds:.3g} s"
+        noise = (
+            f"{self.truth.spp} samples per pixel in {self.truth.seconds:.3g} s, whose own squared error is "
+            f"{self.truth.describe_error(self.truth.own_error())}"
+        )
         return f"{describe_shot(self.spec, self.configuration, self.view)}: {noise}"
 
     def write(self, file: Path) -> None:

@@ -151,7 +151,7 @@ class ResidentSamples:
         moved = fresh.to(self._device)
         if fresh.rows and is_asynchronous(self._device):  # whose memory may hold other samples from now on
             torch.cuda.current_stream(self._device).synchronize()
-        parts = {row: _take_one(moved, place) for place, row in enumerate(fresh.rows)}
+        parts = {row: take_one(moved, place) for place, row in enumerate(fresh.rows)}
         for row, part in parts.items():
             if self._has_room(needed := count_bytes(part)):
                 self._kept[row] = _map_batch(torch.clone, part)
@@ -172,7 +172,7 @@ def count_bytes(record: Any) -> int:
     return sum(count_bytes(getattr(record, f.name)) for f in fields(record)) if is_dataclass(record) else 0
 
 
-def _take_one(batch: TrainingBatch, place: int) -> TrainingBatch:
+def take_one(batch: TrainingBatch, place: int) -> TrainingBatch:
     """One sample of a batch, in the batch's memory."""
     one = _map_batch(lambda tensor: tensor[place : place + 1], batch)
     return replace(one, rows=(batch.rows[place],), units=(batch.units[place],))

@@ -98,7 +98,7 @@ def read_settings(run: Path) -> TrainSettings:
         settings = TrainSettings.model_validate(document)
     except FileNotFoundError as error:
         if not run.is_dir():
-            raise StoreError(f"{run}: there is no such folder") from error
+            raise StoreError(f"{run}: there is no such run; `photonfarm train` makes one") from error
         raise StoreError(
             f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
         ) from error

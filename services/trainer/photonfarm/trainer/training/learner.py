@@ -234,9 +234,7 @@ class Learner:
 
     @torch.no_grad()
     def measure_excess(self, image: Tensor, batch: TrainingBatch) -> Tensor | None:
-        """The loss of each image less its floor, (B,), which no network but by heart gets below.
-
-        None if half A is not whole.
+        """The loss of images less its floor, (), which no network but by heart gets below; None if half A is not whole.
 
         The clean image's loss is noise alone, mean (B − I)². For halves A and B that is mean (A − B)² / 2, with the
         loss's own weights; A may be the input. Where both are targets, what is left is mean (f − A)(f − B), whose mean
@@ -246,19 +244,17 @@ class Learner:
         if noisy is None:
             brightness = image.mean(dim=-1, keepdim=True)
             weight = 1 if self._settings.loss == "linear" else 1 / (brightness**2 + RELATIVE_EPSILON)
-            return (weight * (image - target[:, 0]) * (image - target[:, 1])).mean(dim=(1, 2, 3))
+            return torch.mean(weight * (image - target[:, 0]) * (image - target[:, 1]))
         if not self._sees_halves:
             return None
         apart = (noisy.colour[:, None] - target[:, -1:]) / math.sqrt(2)
-        halves, clean = target[:, -1:], image[:, None] + apart
-        each = [slice(n, n + 1) for n in range(len(image))]
-        return torch.stack([self._loss(image[n], halves[n]) - self._loss(image[n], clean[n]) for n in each])
+        return self._loss(image, target[:, -1:]) - self._loss(image, image[:, None] + apart)
 
     def _note_excess(self, number: int, image: Tensor, batch: TrainingBatch) -> None:
         """Add a step to the running mean of the excess."""
         if (excess := self.measure_excess(image, batch)) is not None:
-            decay, mean = min(MEMORY, (1 + number) / (10 + number)), excess.mean()
-            self.excess = mean if self.excess is None else torch.lerp(mean, self.excess, decay)
+            decay = min(MEMORY, (1 + number) / (10 + number))
+            self.excess = excess if self.excess is None else torch.lerp(excess, self.excess, decay)
 
     @torch.no_grad()
     def _note_gradient(self, batch: TrainingBatch) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, group_means
-from photonfarm.trainer.data.batch import TrainingBatch
+from photonfarm.trainer.data.batch import TrainingBatch, take_one
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors, Predictor, measure
 
 Show = Callable[[int, tuple[int, ...], F32, F32], None]
@@ -83,7 +83,7 @@ def validate(
     show: Show | None = None,
     *,
     loss: str = "linear",
-    measure_excess: Callable[[Tensor, TrainingBatch], Tensor | None] = lambda *_: None,
+    measure_excess: Callable[[Tensor, TrainingBatch], Tensor | None] | None = None,
 ) -> Validation:
     """Measure a network over held-out samples; `show` gets targets and predictions of the first `SHOWN` or more.
 
@@ -105,8 +105,10 @@ def validate(
 
     def predict_and_keep(batch: TrainingBatch) -> F32:
         images = predict(batch)
-        excess = measure_excess(torch.from_numpy(images).to(batch.target.device), batch)
-        excesses.extend([] if excess is None else excess.tolist())
+        on_device = torch.from_numpy(images).to(batch.target.device)
+        for place in range(len(batch.rows)) if measure_excess is not None else ():
+            excess = measure_excess(on_device[place : place + 1], take_one(batch, place))
+            excesses.extend([] if excess is None else [float(excess)])
         if show is not None and len(shown) * len(batch.rows) < SHOWN:
             shown.append((batch.rows, batch.target.mean(dim=1).cpu().numpy(), images.copy()))
         return images

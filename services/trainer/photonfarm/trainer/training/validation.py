@@ -105,10 +105,11 @@ def validate(
 
     def predict_and_keep(batch: TrainingBatch) -> F32:
         images = predict(batch)
-        on_device = torch.from_numpy(images).to(batch.target.device)
-        for place in range(len(batch.rows)) if measure_excess is not None else ():
-            excess = measure_excess(on_device[place : place + 1], take_one(batch, place))
-            excesses.extend([] if excess is None else [float(excess)])
+        if measure_excess is not None:
+            on_device = torch.from_numpy(images).to(batch.target.device)
+            for place in range(len(batch.rows)):
+                excess = measure_excess(on_device[place : place + 1], take_one(batch, place))
+                excesses.extend([] if excess is None else [float(excess)])
         if show is not None and len(shown) * len(batch.rows) < SHOWN:
             shown.append((batch.rows, batch.target.mean(dim=1).cpu().numpy(), images.copy()))
         return images

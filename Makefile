@@ -22,7 +22,7 @@ $(DEV): constraints.txt scripts/setup.sh pyproject.toml
 	@touch $@ $(STAMP)
 
 demo: $(STAMP)
-	env -u PYTHONDONTWRITEBYTECODE $(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 750 --reference-views 6 --set filter_direct=true --also guided_denoise 120 --store demo/store --run demo/run --out demo
+	env -u PYTHONDONTWRITEBYTECODE $(BIN)/photonfarm up room --modifications 128 --views 2 --shard-rows 8 --workers 2 --train-steps 1000 --reference-views 6 --set filter_direct=true --also guided_denoise 120 --store demo/store --run demo/run --out demo
 
 # Three at a time on two cores, as many tests wait; a file's tests together, as they share servers and scenes; in order,
 # as the longest files come early; a process that crashes ends it, as xdist never ends with another one in its place.

@@ -125,7 +125,7 @@ class FrameCosts:
 def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
     """Write an image with layers by name, (H, W, 3) or (H, W), float16 or float32; "" is the one shown first.
 
-    Whole numbers become float32, which has all of a few million.
+    Integers are written as float32, which is exact up to 2²⁴.
 
     Channels are R, G, B of colours, X, Y, Z of normals, Z of depths, and V of other single values. Raises StoreError
     if OpenEXR is not installed, or the disk refuses.

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 FORMAT = 1
 ABOUT, WEIGHTS, BASE, SCENE = "network.json", "weights.safetensors", "base.npz", "scene"
 TRAINED = ("step", "seconds", "last_error", "store", "versions")
-"""What goes with the weights of what a checkpoint says of training: among it the plans, from which all rows follow."""
+"""What a checkpoint says of training that goes with the weights; it includes the plans, from which all rows follow."""
 
 
 def note_training(state: Mapping[str, Any]) -> dict[str, Any]:

@@ -97,7 +97,7 @@ class RenderedRoom:
         guide: Callable[[LoadedScene, View], Guide] | None = None,
         frames_ms: Sequence[float] = FRAMES_MS,
     ) -> dict[str, Any]:
-        """Of each frame's time the samples per pixel that fit, the time that they take, and the error."""
+        """The samples per pixel that fit each frame's time, the time that they take, and the error."""
         guides: Sequence[Guide] = ()
         further_s = 0.0
         if denoise is not None and guide is not None:

@@ -1,17 +1,15 @@
 """A request for samples, expanded into rows and jobs, without what is planned already; and samples of another store.
 
-Shape letters: R rows of a plan, G movable groups, C columns of the scene's modification vectors, D of its view
-vectors. J is `shard_rows`, the samples of one job.
+Shape letters: R rows of a plan, G movable groups, C columns of modification vectors, D columns of view vectors.
 
 A request names every combination of its modifications, of `views_per_modification` views of each, and of `passes` noisy
 passes of each view. Configurations that come out equal (both objects removed, say) are one modification, which gets the
-views of all of them, so that no view is drawn twice and the share of each configuration among the samples stays that
-of the sampling. In particular a static scene has one modification, and `modifications` × `views_per_modification`
-different views of it. Views that come out equal, since the spec fixes the camera, are one view: no sample is planned
-twice.
+views of all of them: no view is drawn twice, and each configuration keeps the share of samples that it was drawn with.
+So a static scene has one modification, and `modifications` × `views_per_modification` different views of it. Views that
+come out equal, since the spec fixes the camera, are one view: no sample is planned twice.
 
-The views of a configuration are numbered from 0; growing any number of a request therefore names a superset of the
-old samples, and only the new ones are planned. New views and passes refer to the rows that are there.
+The views of a configuration are numbered from 0, so growing any number of a request names a superset of the old
+samples, and only the new ones are planned. New views and passes refer to the rows that are there.
 """
 
 from __future__ import annotations

@@ -168,9 +168,7 @@ class Frames:
     photon_seen: NDArray[np.bool_]  # (F, K)
     photons: Photons | None  # of the configuration; None for a scene without
     guides: Guides  # (F, …) of all views
-    group: NDArray[np.int16] | None = (
-        None  # (F, H, W) what the pixels' centres show, by its place in `names`; −1: nothing
-    )
+    group: NDArray[np.int16] | None = None  # (F, H, W) what pixels' centres show, by its place in `names`; −1: nothing
     names: tuple[str, ...] = ()  # of what never moves, "", and of the groups; both are missing in older files
 
     def __len__(self) -> int:

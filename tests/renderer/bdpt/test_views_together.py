@@ -66,7 +66,7 @@ def wider(place: np.ndarray, fov: float) -> np.ndarray:
 @pytest.mark.parametrize("settings", SETTINGS)
 @pytest.mark.parametrize("record", [False, True])
 def test_views_of_several_fields_of_view_are_those_rendered_alone(settings: dict[str, Any], record: bool) -> None:
-    """By a sensor of that field of view; light paths' splats and weights among them."""
+    """A sensor of that field of view makes it; light paths' splats and weights are among what is compared."""
     scene, fovs, seeds = box(), [25.0, 60.0, 100.0], [1, 2, 3]
     places = placed([0.0, 7.0, -11.0])
     bdpt = mi.load_dict({"type": "bdpt", "max_depth": 5, "record": record, **settings})

@@ -113,7 +113,7 @@ def take(run: Path, store: Path | str = "nowhere", asked: dict[str, Any] = ASKED
 def test_a_network_on_its_own_predicts_bit_for_bit_what_its_run_does_and_renders_the_truth(
     store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, architecture: str
 ) -> None:
-    """Without the store, the run and the scene's files; and it leaves no trace."""
+    """The store, the run and the scene's files are not there; and it leaves no trace."""
     run, passes = trained(store, tmp_path / "run", architecture), 2 if architecture == "guided_denoise" else 1
     image, truth, doubts = take(run, store, passes=passes)
     invoke("--store", store, "--run", run, "--out", tmp_path / "elsewhere/yard.photonfarm")
@@ -289,7 +289,7 @@ def name_inputs(frame: Frame, settings: TrainSettings) -> dict[str, np.ndarray]:
 def test_the_onnx_makes_the_network_s_image_of_named_inputs_whatever_the_batch(
     store: Path, tmp_path: Path, architecture: str, passes: int
 ) -> None:
-    """To a hundred-thousandth of the brightest value; torch and onnxruntime add in another order."""
+    """The two agree to a hundred-thousandth of the brightest value, as they add in another order."""
     onnxruntime = pytest.importorskip("onnxruntime")
     run = trained(store, tmp_path / "run", architecture)
     assert invoke("--store", store, "--run", run, "--out", tmp_path / "it.onnx").exit_code == 0

@@ -181,13 +181,15 @@ class Live:
         while not judged.refined.is_enough or (judged.refined.spp < self.most_spp and time.perf_counter() < until):
             self.run.refine(judged.refined, judged.frame)
         truth = judged.refined.result()
-        error = truth.error(judged.frame.radiance.numpy(force=True))
+        error = truth.error(judged.frame.radiance)
+        interval = "" if error.standard_error is None else f" ± {1.96 * error.standard_error:.2g}"
         return {
             "picture": self._draw(truth.radiance),
             "spp": truth.spp,
             "seconds": truth.seconds,
             "done": truth.spp >= self.most_spp,
-            "error": format_error(error.mean, error.standard_error, truth.power()),
+            "error": f"{error.mean:.3g}{interval} (mean square of radiance × exposure, 95 %), "
+            f"{truth.describe_error(error.mean)}",
         }
 
     def _draw(self, radiance: F32) -> str:
@@ -204,13 +206,6 @@ class Live:
     def submit_shown(self, asked: str) -> dict[str, Any]:
         """Plan the configuration and the view as a sample."""
         return {"said": self.run.plan_sample(*self.run.stage(**_read(asked)))}
-
-
-def format_error(error: float, deviation: float | None, power: float) -> str:
-    """A mean squared error with its 95 % interval, and as a share of the image's mean square."""
-    interval = "" if deviation is None else f" ± {1.96 * deviation:.2g}"
-    share = f", {100 * error / power:.2g} % of the image's mean square" if power > 0 else ""
-    return f"{error:.3g}{interval} (mean square of radiance × exposure, 95 %){share}"
 
 
 def _serve_file(path: Path) -> Callable[[], Answer]:

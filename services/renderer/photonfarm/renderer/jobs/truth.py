@@ -137,9 +137,7 @@ class Truth:
     def describe_error(self, error: float) -> str:
         """A squared error in words, as a share of the mean square."""
         power = self.power()
-        return (
-            f"{100 * error / power:.2g} % of the image's mean square" if power > 0 else f"{error:.2g}, of a black image"
-        )
+        return f"{100 * error / power:.2g} % of the image's mean square" if power > 0 else "of a black image"
 
 
 class RefinedTruth:
@@ -336,8 +334,8 @@ def write_beside(
     """Write a network's image, (H, W, 3), linear radiance, and the truth beside it, into a folder; returns the files.
 
     Pictures are as a display shows them, and of the difference red where the network is too bright, blue where it is
-    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance, and the
-    `groups`, (H, W), as `LoadedScene.find_groups` has them; frame.json is `about`.
+    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance, and the `groups`,
+    (H, W), as `LoadedScene.find_groups` has them; frame.json is `about`.
     """
     layers: dict[str, NDArray[Any]] = {"prediction": prediction, "group": groups}
     shown = {"prediction": pictures.enlarge(prediction * np.float32(exposure))}

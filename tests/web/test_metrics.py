@@ -196,10 +196,11 @@ def refused(words: list[str]) -> int:
     return ended.value.code
 
 
-def test_a_port_that_is_taken_is_an_error_as_a_scraper_would_not_find_another(scene: SceneStore, store: Store) -> None:
+@pytest.mark.parametrize("verb", ["serve-metrics", "web"])
+def test_a_port_that_is_asked_for_and_taken_is_an_error(scene: SceneStore, store: Store, verb: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         where = ["--host", "127.0.0.1", "--port", str(taken.getsockname()[1])]
-        assert refused(["serve-metrics", "--store", str(store.root), *where]) == StoreError.exit_code
+        assert refused([verb, "--store", str(store.root), *where]) == StoreError.exit_code
 
 
 def test_a_store_that_is_gone_is_an_answer_of_503(scene: SceneStore, store: Store) -> None:

@@ -29,7 +29,7 @@ from photonfarm.store import SceneStore, Store
 from photonfarm.web import images
 from photonfarm.web.farm_pages import FarmPages, SceneSamples
 from photonfarm.web.images import POINT, Cached
-from photonfarm.web.server import PageServer, make_page_routes
+from photonfarm.web.server import PageServer, listen, make_page_routes
 
 EVIL = "<img src=x onerror=alert(1)>"
 """A name that a page must show as it is."""
@@ -251,9 +251,11 @@ def test_a_row_that_is_not_complete_is_not_there(server: PageServer, scene: Scen
     assert asked(server, f"/api/sample/{scene.scene_id}/{row}")[0] == 404
 
 
-@pytest.mark.parametrize("method", ["POST", "DELETE", "NONSENSE"])
+@pytest.mark.parametrize("method", ["POST", "PUT", "NONSENSE"])
 def test_nothing_can_be_written(server: PageServer, method: str) -> None:
-    assert asked(server, "/api/state", method)[0] == 501
+    status, headers, content = asked(server, "/api/state", method)
+    assert (status, headers["Allow"], headers["Content-Type"]) == (405, "GET, HEAD", "application/json")
+    assert method in json.loads(content)["error"]
 
 
 def test_what_a_page_of_elsewhere_posts_is_no_further_request(server: PageServer) -> None:
@@ -264,8 +266,17 @@ def test_what_a_page_of_elsewhere_posts_is_no_further_request(server: PageServer
         connection.sendall(head.encode() + inside)
         with connection.makefile("rb") as answers:
             answer = answers.read()
-    assert answer.startswith(b"HTTP/1.1 501 ")
+    assert answer.startswith(b"HTTP/1.1 405 ")
     assert answer.count(b"HTTP/1.1 ") == 1
+
+
+def test_where_the_usual_port_is_taken_a_free_one_is_used_and_that_is_said() -> None:
+    said: list[str] = []
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        usual = taken.getsockname()[1]
+        with listen("127.0.0.1", None, (), usual=usual, warn=said.append) as other:
+            assert other.server_address[1] != usual
+    assert [str(usual) in sentence for sentence in said] == [True]
 
 
 def test_a_name_of_elsewhere_is_refused(server: PageServer) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -34,39 +35,39 @@ _watch_options = combine_options(
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
-    default=WEB_PORT,
-    show_default=True,
-    help="If it is taken, a free one is taken instead.",
+    help=f"[default: {WEB_PORT}, or a free one if that is taken]",
 )
-def web(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any) -> None:
+def web(
+    store: str | Path, redis_url: str, runs: tuple[Path, ...], host: str, port: int | None, names: tuple[str, ...]
+) -> None:
     """Serve pages that show the farm while it works: samples, noise, queue, workers, training, predictions.
 
     They only read, and fetch nothing from elsewhere. /metrics is for Prometheus. Ends on Ctrl-C.
     """
-    from photonfarm.core.processes import free_port
     from photonfarm.web.farm_pages import FarmPages
-    from photonfarm.web.server import make_page_routes, serve
+    from photonfarm.web.server import listen, make_page_routes, serve
 
     pages = FarmPages(store, _watch(store, redis_url, runs))
-    serve(make_page_routes(pages), say=click.echo, **where | {"port": free_port(where["port"])})
+    server = listen(host, port, names, usual=WEB_PORT, warn=partial(click.echo, err=True))
+    serve(server, make_page_routes(pages), click.echo)
 
 
 @click.command("serve-metrics")
 @_watch_options
 @click.option("--port", type=click.IntRange(0, 65535), default=METRICS_PORT, show_default=True, help="0: a free one.")
-def serve_metrics(store: str | Path, redis_url: str, runs: tuple[Path, ...], **where: Any) -> None:
+def serve_metrics(
+    store: str | Path, redis_url: str, runs: tuple[Path, ...], host: str, port: int, names: tuple[str, ...]
+) -> None:
     """Serve /metrics for Prometheus: samples, core time, queue, workers, failures, training.
 
     `web` serves the same beside its pages. Ends on Ctrl-C.
     """
     from photonfarm.web.images import Cached
-    from photonfarm.web.server import make_metric_routes, serve
+    from photonfarm.web.server import listen, make_metric_routes, serve
 
-    serve(
-        make_metric_routes(Cached(_watch(store, redis_url, runs).look).get),
-        say=lambda address: click.echo(f"{address}metrics"),
-        **where,
-    )
+    routes = make_metric_routes(Cached(_watch(store, redis_url, runs).look).get)
+    server = listen(host, port, names, usual=METRICS_PORT, warn=partial(click.echo, err=True))
+    serve(server, routes, lambda address: click.echo(f"{address}metrics"))
 
 
 def _watch(store: str | Path, redis_url: str, runs: tuple[Path, ...]) -> FarmWatch:

@@ -8,6 +8,7 @@ The farm's pages and the metrics have no second table.
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import re
@@ -118,6 +119,10 @@ class WrongRequestError(ValueError):
     """What a path asks for is impossible."""
 
 
+class NotAllowedError(Exception):
+    """What is asked for is possible, and this server was started without the right to do it."""
+
+
 class _Handler(BaseHTTPRequestHandler):
     server: PageServer
     protocol_version = "HTTP/1.1"
@@ -138,11 +143,19 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection = True
         _, is_origin, asking = self.headers.get("Origin", "").partition("://")
         if not self.server.writes:
-            self._refuse(HTTPStatus.NOT_IMPLEMENTED, "this server has no way to write")
+            self._refuse_method()
         elif not is_origin or asking != self.headers.get("Host"):
             self._refuse(HTTPStatus.FORBIDDEN, "only a page of this server may ask for that")
         else:
             self._find(self.server.writes)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:  # noqa: ARG002
+        """Refuse what the library finds at fault, such as another method, as everything is refused here: in JSON."""
+        self.close_connection = True
+        if code == HTTPStatus.NOT_IMPLEMENTED:
+            self._refuse_method()
+        else:
+            self._refuse(status := HTTPStatus(code), message or status.phrase)
 
     def _find(self, routes: Routes) -> None:
         if not self._is_asked_by_name():
@@ -168,6 +181,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._refuse(HTTPStatus.NOT_FOUND, str(error))
         except WrongRequestError as error:
             self._refuse(HTTPStatus.BAD_REQUEST, str(error))
+        except NotAllowedError as error:
+            self._refuse(HTTPStatus.FORBIDDEN, str(error))
         except (PhotonfarmError, OSError) as error:
             self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, str(error))
         except Exception:
@@ -176,16 +191,22 @@ class _Handler(BaseHTTPRequestHandler):
         else:
             self._send(HTTPStatus.OK, kind, content, "private, max-age=86400" if stays else "no-store")
 
-    def _refuse(self, status: HTTPStatus, sentence: str) -> None:
-        self._send(status, JSON, json.dumps({"error": sentence}).encode(), "no-store")
+    def _refuse_method(self) -> None:
+        allowed = "GET, HEAD, POST" if self.server.writes else "GET, HEAD"
+        self._refuse(HTTPStatus.METHOD_NOT_ALLOWED, f"{self.command}: this server answers {allowed} alone", allowed)
 
-    def _send(self, status: HTTPStatus, kind: str, content: bytes, keep: str) -> None:
+    def _refuse(self, status: HTTPStatus, sentence: str, allowed: str = "") -> None:
+        self._send(status, JSON, json.dumps({"error": sentence}).encode(), "no-store", allowed)
+
+    def _send(self, status: HTTPStatus, kind: str, content: bytes, keep: str, allowed: str = "") -> None:
         self.send_response(status)
         for name, value in HEADERS.items():
             self.send_header(name, value)
         self.send_header("Content-Type", kind)
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Cache-Control", keep)
+        if allowed:
+            self.send_header("Allow", allowed)
         if self.close_connection:
             self.send_header("Connection", "close")
         self.end_headers()
@@ -211,7 +232,7 @@ class PageServer(ThreadingHTTPServer):
         self, routes: Routes, host: str, port: int, names: tuple[str, ...] = (), *, writes: Routes = ()
     ) -> None:
         """Listen; raises OSError if that is impossible. It answers to `names` besides its host's and this machine's."""
-        self.routes, self.writes = routes, writes
+        self.routes, self.writes, self.asked_host = routes, writes, host
         self.names = {*LOCAL_NAMES, host.lower(), *(name.lower() for name in names)}
         super().__init__((host, port), _Handler)
 
@@ -220,19 +241,38 @@ class PageServer(ThreadingHTTPServer):
         log.debug("a connection broke off", exc_info=True)
 
 
-def serve(
-    routes: Routes, *, host: str, port: int, names: tuple[str, ...], say: Callable[[str], None], writes: Routes = ()
-) -> None:
-    """Serve until Ctrl-C, once the address was said. Raises StoreError if nothing can listen there."""
-    logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+def listen(
+    host: str, port: int | None, names: tuple[str, ...], *, usual: int, warn: Callable[[str], None]
+) -> PageServer:
+    """A server that listens and serves nothing yet: on a port, by default the `usual` one.
+
+    Where that is taken, and no other was asked for, a free one is taken, and `warn` is told. Raises StoreError if
+    nothing can listen there.
+    """
+    wanted = usual if port is None else port
     try:
-        server = PageServer(routes, host, port, names, writes=writes)
+        return PageServer((), host, wanted, names)
     except OSError as error:
-        raise StoreError(f"--host {host} --port {port}: cannot listen there: {error.strerror}") from error
+        if port is not None or error.errno != errno.EADDRINUSE:
+            raise StoreError(f"--host {host} --port {wanted}: cannot listen there: {error.strerror}") from error
+    warn(f"port {usual} is taken, and a free one is used instead; --port names another")
+    return PageServer((), host, 0, names)
+
+
+def serve(server: PageServer, routes: Routes, say: Callable[[str], None], *, writes: Routes = ()) -> None:
+    """Serve until Ctrl-C, once the address was said."""
+    logging.basicConfig(format="%(asctime)s %(name)s: %(message)s", stream=sys.stderr)
+    signal.signal(signal.SIGTERM, _end)
+    server.routes, server.writes = routes, writes
     with server:
-        say(f"http://{host}:{server.server_address[1]}/")
+        say(f"http://{server.asked_host}:{server.server_address[1]}/")
         try:
             server.serve_forever()
         except KeyboardInterrupt:
             return
+
+
+def _end(number: int, _: object) -> None:
+    """End the process; a second signal would break off what runs at its exit."""
+    signal.signal(number, signal.SIG_IGN)
+    sys.exit(0)

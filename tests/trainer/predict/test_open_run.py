@@ -136,7 +136,9 @@ def test_a_network_runs_where_torch_has_no_card_though_one_renders(
     card = backend.Device(backend.DEFAULT_VARIANT, Card(0, "a card", "9.0", 1 << 34), "")
     monkeypatch.setattr(backend, "device", lambda: card)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert open_run(run, store)._device == torch.device("cpu")
+    opened = open_run(run, store)
+    assert opened._device == torch.device("cpu")
+    assert repr(opened) == f"<run cnn (run), scene room ({opened.scene_id}), 24 × 16 pixels, on cpu>"
 
 
 def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_path: Path) -> None:

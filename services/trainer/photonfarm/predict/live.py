@@ -29,7 +29,7 @@ from photonfarm.scene.arrangement import Shot, describe_shot
 from photonfarm.scene.groups import Light, Movable
 from photonfarm.scene.spec import Film
 from photonfarm.web.images import encode
-from photonfarm.web.server import JSON, KINDS, PNG, Answer, NotThereError, Routes, WrongRequestError
+from photonfarm.web.server import JSON, KINDS, PNG, Answer, NotAllowedError, NotThereError, Routes, WrongRequestError
 from photonfarm.web.server import STATIC as FARM_PAGES
 
 PAGES = Path(__file__).parent / "static"
@@ -105,8 +105,6 @@ class Live:
 
     def writes(self) -> Routes:
         """What is written: a sample is planned, where that is allowed."""
-        if not self.may_submit:
-            return []
         return [(re.compile("/submit/([A-Za-z0-9_-]{1,8000})"), False, self._answer(self.submit_shown))]
 
     def _answer(self, make: Callable[..., dict[str, Any]]) -> Callable[..., Answer]:
@@ -204,7 +202,9 @@ class Live:
         return {"command": f"{self.begins} {describe_shot(self.run.spec, configuration, view)}"}
 
     def submit_shown(self, asked: str) -> dict[str, Any]:
-        """Plan the configuration and the view as a sample."""
+        """Plan the configuration and the view as a sample. Raises NotAllowedError where viewers may not."""
+        if not self.may_submit:
+            raise NotAllowedError("nothing is planned here; `photonfarm live --may-submit` lets viewers do that")
         return {"said": self.run.plan_sample(*self.run.stage(**_read(asked)))}
 
 

@@ -115,6 +115,15 @@ class OpenRun:
         self._of_films: dict[Film, dict[str, Any]] = {}
         self._apply(rest(self.spec))
 
+    def __repr__(self) -> str:
+        return f"<run {self.describe()}>"
+
+    def describe(self) -> str:
+        """The network with its folder, the scene, the size of images and the device, in words."""
+        film = self.spec.film
+        scene = f"scene {self.spec.name} ({self.scene_id})"
+        return f"{self._run.name}, {scene}, {film.width} × {film.height} pixels, on {self._device}"
+
     def with_film(self, film: Film) -> OpenRun:
         """The same in its present configuration, with images of another size; the network was not trained on that."""
         if film not in self._of_films:

@@ -198,9 +198,7 @@ def _tell(result: InferResult, where: str = "") -> None:
 @click.option(
     "--port",
     type=click.IntRange(0, 65535),
-    default=LIVE_PORT,
-    show_default=True,
-    help="If it is taken, a free one is taken instead.",
+    help=f"[default: {LIVE_PORT}, or a free one if that is taken]",
 )
 @click.option(
     "--truth", "most_spp", type=click.IntRange(1), default=4096, show_default=True, help="Most samples per pixel."
@@ -212,7 +210,7 @@ def live(
     device: str,
     host: str,
     names: tuple[str, ...],
-    port: int,
+    port: int | None,
     most_spp: int,
     may_submit: bool,
 ) -> None:
@@ -221,18 +219,26 @@ def live(
     The network's picture follows each move; as soon as nothing moves, `bdpt` renders the truth, and the error between
     both stands below. Nothing is written without --may-submit. Ends on Ctrl-C.
     """
-    from photonfarm.core.processes import free_port
     from photonfarm.predict.live import Live
     from photonfarm.predict.opened_run import OpenRun
     from photonfarm.trainer.predictors.trained import TrainedRun
-    from photonfarm.web.server import serve
+    from photonfarm.web.server import listen, serve
 
-    trained = TrainedRun.load(run)
+    trained, say = TrainedRun.load(run), partial(click.echo, err=True)
     _refuse_store(trained, may_submit=may_submit)
+    server = listen(host, port, names, usual=LIVE_PORT, warn=say)
     stored = "" if trained.packed else f"--store {shlex.quote(str(store))} "
     begins = f"photonfarm infer {stored}--run {shlex.quote(str(run))} --truth 256"
-    shown = Live(lambda: OpenRun(trained, store, device), most_spp, begins, may_submit)
-    serve(shown.routes(), host=host, port=free_port(port), names=names, say=click.echo, writes=shown.writes())
+    with tell_waiting(say, f"loading {trained.name}"):
+        shown = Live(lambda: OpenRun(trained, store, device), most_spp, begins, may_submit)
+    say(shown.run.describe())
+    say(
+        f"whoever reaches the page may plan samples in {store}"
+        if may_submit
+        else "read-only; --may-submit plans samples"
+    )
+    say("Ctrl-C ends it")
+    serve(server, shown.routes(), click.echo, writes=shown.writes())
 
 
 @click.command()

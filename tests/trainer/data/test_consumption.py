@@ -122,7 +122,9 @@ def test_training_in_one_call_is_told_of_and_alive_as_by_the_command_line(scene,
     assert said[-2].startswith("step 3/3, ")
     assert not any("continues" in line for line in said)
     train(store, scene.scene_id, run, redis_url=server.url, log=said.append, **settings)
-    assert f"continues at step 3 of run {run}" in said
+    assert not any("continues" in line for line in said), "it has ended"
+    train(store, scene.scene_id, run, redis_url=server.url, log=said.append, **{**settings, "max_steps": 4})
+    assert f"{run}: continues at step 3" in said
     assert (run / "tensorboard").is_dir() == (find_spec("tensorboard") is not None)
     with pytest.raises(IncompleteError):
         service.check(run)

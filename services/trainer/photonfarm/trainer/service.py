@@ -172,8 +172,6 @@ def _train(
                     follow(record)
 
         def note_draws(draws: int, samples: int) -> None:
-            if draws and not progress.has_begun:
-                log(f"continues at step {draws // settings.batch} of run {folder}")
             progress.note_draws(draws, samples)
             report_draws(draws, samples)
 

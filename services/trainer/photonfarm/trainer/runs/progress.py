@@ -125,7 +125,6 @@ class RunProgress:
         self._step = self._samples = 0
         self._phase: tuple[TimeKind, float] = ("wait_data", clock())
         self._history: deque[tuple[float, int]] = deque(maxlen=WINDOW)
-        self.has_begun = False  # draws have been noted
 
     def phase(self, kind: TimeKind) -> None:
         """Note what the time is spent on from now on."""
@@ -134,7 +133,7 @@ class RunProgress:
 
     def note_draws(self, draws: int, samples: int) -> None:
         """Note the samples drawn so far, and those that have arrived."""
-        self._step, self._samples, self.has_begun = draws // self._batch, samples, True
+        self._step, self._samples = draws // self._batch, samples
 
     def look(self) -> dict[str, Any]:
         """The present state, as the file holds it."""

@@ -57,11 +57,10 @@ class Hooks:
 
     stop: Stop = field(default_factory=Stop)  # ends the session once it is set
     on_record: Callable[[dict[str, Any]], object] | None = None  # gets each record of metrics.jsonl as it is written
-    on_draws: Callable[[int, int], object] | None = None  # at the beginning and after each step: draws so far, and
-    # samples that have arrived
+    on_draws: Callable[[int, int], object] | None = None  # gets draws so far, and samples that have arrived
     on_phase: Callable[[TimeKind], object] | None = None  # what the time is spent on from now on
     on_images: Show | None = None  # at each validation, with the first held-out samples
-    on_wait: Callable[[str], object] = lambda _: None  # gets a sentence on what others do in the store
+    on_wait: Callable[[str], object] = lambda _: None  # gets a sentence on what is waited for, or goes on
     ranks: Ranks = field(default_factory=Ranks)  # the processes that share each batch; this one is rank 0
     waited: float = 0.0  # seconds that have passed already
     clock: Callable[[], float] = time.monotonic
@@ -127,8 +126,10 @@ class Session:
         self._watch.turn("other")
         if (reason := self._end_before.get("reason")) is not None and self._ends_again(reason):
             goes_on = "further passes or images" if reason == LEARNED_BY_HEART else "--steps N"
-            self._hooks.on_wait(f"run {self._run} has ended at step {self._step} ({reason}); with {goes_on} it goes on")
+            self._hooks.on_wait(f"{self._run}: has ended at step {self._step} ({reason}); with {goes_on} it goes on")
             return TrainingOutcome(self._step, reason, self._last_error)
+        if self._step and self._ended() is None:
+            self._hooks.on_wait(f"{self._run}: continues at step {self._step}")
         while (reason := self._ended()) is None:
             due = self._step % self._settings.validate_every == 0 and self._step != self._validated
             if due and self._wait(self._can_validate):
@@ -143,8 +144,7 @@ class Session:
             self._end_no_worse()
         self._save()
         advice = advise(read_log(self._run / METRICS))
-        said = None if advice is None else advice.sentence
-        self._log.write("end", step=self._step, reason=reason, advice=said, **self._counts())
+        self._log.write("end", step=self._step, reason=reason, advice=advice and advice.sentence, **self._counts())
         return TrainingOutcome(self._step, reason, self._last_error)
 
     def _begin(self) -> None:

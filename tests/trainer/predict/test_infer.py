@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from analytic_room import analytic_base, analytic_spec, render, visibility
 from analytic_room_samples import commit_job, known
 from click.testing import CliRunner
@@ -20,9 +21,11 @@ from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.predict import infer, open_run, opened_run
 from photonfarm.scene.camera_path import Frames, orbit
-from photonfarm.scene.modification import Modification
-from photonfarm.scene.view import View
+from photonfarm.scene.modification import Modification, rebuild
+from photonfarm.scene.view import Camera, View
 from photonfarm.store import SceneReader, SceneStore, Store
+from photonfarm.trainer.networks.inputs import Inputs, map_tensors
+from photonfarm.trainer.predictors.onnx_file import list_inputs
 from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.training.loop import train
 
@@ -120,6 +123,35 @@ def test_a_sample_is_shown_beside_its_target(store: Path, scene: SceneStore, tra
         assert [file.name for file in found.files] == ["prediction.png", "target.png"]
         said = f"row {row}: held out; squared error " if wanted else f"row {row}: a training sample, "
         assert found.sentence.startswith(said)
+
+
+def test_a_file_of_buffers_has_the_inputs_of_an_onnx_network_as_the_page_says(
+    store: Path, scene: SceneStore, trained, frames, tmp_path: Path
+) -> None:
+    run = replace(trained("guided_transport_photons"), exposure=2.0)
+    (reader := SceneReader(store, scene.scene_id)).refresh()
+    file = tmp_path / "walk.npz"
+    frames(reader.read(5).modification, orbit(scene.spec, 2), reader.read_photons(5)).write(file)
+    with np.load(file) as archive:
+        stored = dict(archive)
+    source, light = run.scene(store), ("emission", "direct", "gloss", "point_light")
+    position, present = rebuild(source.base()[1], Modification.from_vector(stored["modification"]))
+    cameras = [Camera.of(View.from_vector(view), source.spec) for view in stored["view"]]
+    made = {"world_to_camera": np.stack([camera.world_to_camera for camera in cameras])}
+    for name, values in stored.items():
+        if name.startswith("guide_"):
+            bare = name.removeprefix("guide_")
+            made[bare] = values * source.spec.exposure if bare in light else values
+        elif name in ("depth", "albedo", "normal", "point_seen", "photon_seen"):
+            made[name] = values
+        elif name.startswith("photon_"):
+            made[name] = np.stack([values] * 2)
+    made |= {"point_position": np.stack([position] * 2), "point_present": np.stack([present] * 2)}
+    asked = list_inputs(run, source.spec, 1)
+    assert made.keys() == asked.keys()
+    for i, batch in enumerate(infer._read_frames(run, Frames.read(file), source)):
+        tensors = {name: torch.from_numpy(made[name][i : i + 1]).to(like.dtype) for name, like in asked.items()}
+        map_tensors(lambda one, other: torch.testing.assert_close(one, other) or one, Inputs.of(tensors), batch.inputs)
 
 
 def test_a_row_that_is_not_there_is_told_from_one_that_is_not_complete(

@@ -112,7 +112,7 @@ def show_frame(
     about: dict[str, Any] = {
         "scene": opened.scene_id,
         **list_shot(*shot),
-        "doubts": [*frame.doubts, *opened.look_closer(frame.configuration, frame.view)],
+        "doubts": frame.doubts,
         "groups": names_of_ids(opened.spec.groups),
         "seconds": seconds,
     }

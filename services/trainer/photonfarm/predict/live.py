@@ -159,7 +159,7 @@ class Live:
         return {
             "picture": self._draw(radiance),
             "ms": 1e3 * seconds,
-            "warnings": [*frame.doubts, *(self.run.look_closer(frame.configuration, frame.view) if full else ())],
+            "warnings": frame.doubts if full else frame.beyond,
         }
 
     @torch.no_grad()

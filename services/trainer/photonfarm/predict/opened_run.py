@@ -13,7 +13,8 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -65,9 +66,9 @@ def require_renderer(run: TrainedRun) -> None:
     """Raise SpecError if the renderer is not installed; otherwise let it find the run's scene."""
     if not can_render():
         raise SpecError(
-            "the buffers of a camera path come from the renderer, which is not installed here (pip install "
-            f"'photonfarm[render]'); where it is, run `photonfarm buffers --scene {run.scene_id}` with the same path, "
-            "and give its file as --buffers FILE"
+            "what a network reads of a new view comes from the renderer, which is not installed here (pip install "
+            f"'photonfarm[render]'); where it is, `photonfarm buffers --scene {run.scene_id}` writes a file of that "
+            "along a camera path, for `photonfarm infer --buffers FILE`"
         )
     os.environ.update(make_environment(run.folder))
 
@@ -81,7 +82,13 @@ class Frame:
     configuration: Modification
     view: View
     seconds: Mapping[str, float]  # of the scene's edit, of the inputs, of the network; on a card, of the host alone
-    doubts: tuple[str, ...]  # what the network never saw, each a sentence; `OpenRun.look_closer` finds more
+    beyond: tuple[str, ...]  # what the network never saw by the spec, each a sentence
+    look_closer: Callable[[], tuple[str, ...]] = field(repr=False)  # `OpenRun.look_closer` of this frame
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What the network never saw, each a sentence, as `photonfarm infer` says it; rays are traced to find some."""
+        return (*self.beyond, *self.look_closer())
 
 
 class OpenRun:
@@ -162,8 +169,9 @@ class OpenRun:
         images = [self._images(each)[0] for each in of_half]
         radiance = (images[0] if len(images) == 1 else torch.stack(images).mean(0)) / self._exposure
         seconds = {"edit": staged - began, "inputs": given - staged, "network": time.perf_counter() - given}
-        doubts = never_seen(find_doubts(self.spec, configuration, view))
-        return Frame(radiance, of_half[0], configuration, view, seconds, doubts)
+        beyond = never_seen(find_doubts(self.spec, configuration, view))
+        closer = partial(self.look_closer, configuration, view)
+        return Frame(radiance, of_half[0], configuration, view, seconds, beyond, closer)
 
     def truth(
         self,

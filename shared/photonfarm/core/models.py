@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 Probability = Annotated[float, Field(ge=0, le=1)]
 
@@ -50,9 +51,7 @@ def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None)
         place = fault["loc"]
         if fault["type"] == "too_short" and any(place == each["loc"][:-1][: len(place)] for each in faults):
             continue  # only as its faulty entries were left out
-        key = _key(place, of)
-        rule = _RULES[fault["type"]].format(**fault.get("ctx", {})) if fault["type"] in _RULES else fault["msg"]
-        rule = rule.removeprefix("Value error, ")
+        key, rule = _key(place, of), rule_of(fault)
         if not key:  # of the whole
             yield rule
         elif fault["type"] == "value_error":
@@ -62,8 +61,19 @@ def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None)
         elif fault["type"] == "extra_forbidden":
             yield f"{key}: unknown key; nearest: {nearest(str(fault['loc'][-1]), known)}"
         else:
-            value = repr(fault["input"])
-            yield f"{key} = {value if len(value) <= INPUT_SHOWN else f'{value[:INPUT_SHOWN]}…'}: {rule}"
+            yield f"{key} = {show_value(fault['input'])}: {rule}"
+
+
+def rule_of(fault: ErrorDetails) -> str:
+    """The rule that a fault breaks, in words."""
+    rule = _RULES[fault["type"]].format(**fault.get("ctx", {})) if fault["type"] in _RULES else fault["msg"]
+    return rule.removeprefix("Value error, ")
+
+
+def show_value(value: Any) -> str:
+    """A value as it is written, or how it begins."""
+    text = repr(value)
+    return text if len(text) <= INPUT_SHOWN else f"{text[:INPUT_SHOWN]}…"
 
 
 _RULES = {
@@ -80,6 +90,7 @@ _RULES = {
     "int_type": "a whole number is required",
     "less_than": "below {lt} is required",
     "less_than_equal": "{le} or less is required",
+    "literal_error": "is none of {expected}",
     "model_type": "a table is required",
     "multiple_of": "a multiple of {multiple_of} is required",
     "string_type": "text is required",

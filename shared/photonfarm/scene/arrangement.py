@@ -6,15 +6,16 @@ This module alone turns names into modification vectors, and back. The command l
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, ValidationError
+from pydantic_core import ErrorDetails
 
 from photonfarm.core.errors import SpecError
-from photonfarm.core.models import Factor, Frozen, nearest, sentences
+from photonfarm.core.models import Factor, Frozen, nearest, rule_of, show_value
 from photonfarm.scene.groups import Box, Degrees, Light, Movable
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
@@ -69,11 +70,12 @@ class Arrangement(Frozen):
 
     @classmethod
     def of(cls, /, **values: Any) -> Self:
-        """The checked values; raises SpecError with a sentence for each that is impossible."""
+        """The checked values; raises SpecError with a sentence for each that is impossible, as it was written."""
         try:
             return cls(**values)
         except ValidationError as error:
-            raise SpecError("; ".join(sentences(error, cls.model_fields))) from error
+            said = dict.fromkeys(_describe_fault(fault, values, cls.model_fields) for fault in error.errors())
+            raise SpecError("; ".join(said)) from error
 
     @classmethod
     def from_modification(cls, spec: SceneSpec, modification: Modification) -> Self:
@@ -177,6 +179,22 @@ class Shot(Arrangement):
         if np.array_equal(made.origin, made.target):
             raise SpecError(f"camera = {_text(_shorten(made.origin))}: is where it looks at; give another look_at")
         return made
+
+
+def _describe_fault(fault: ErrorDetails, values: Mapping[str, Any], known: Iterable[str]) -> str:
+    """What is wrong with a field of an arrangement: its key, the group, the value and the rule."""
+    key, *inside = map(str, fault["loc"])
+    if fault["type"] == "extra_forbidden":
+        return f"{key}: unknown key; nearest: {nearest(key, known)}"
+    value, of = values[key], ""
+    if isinstance(value, Mapping) and inside:
+        value, of = value.get(inside[0]), f" of {inside[0]!r}"
+    rule = rule_of(fault)
+    if fault["type"] in ("missing", "too_long") or (fault["type"] == "tuple_type" and key != "without"):
+        rule = "three numbers are required"
+    elif fault["type"] == "dict_type":
+        rule = "values by the names of groups are required"
+    return f"{key}{of} = {show_value(_as_list(value))}: {rule}"
 
 
 def _check_changes(spec: SceneSpec, name: str, key: str) -> None:

@@ -114,7 +114,7 @@ def test_any_setting_is_set_by_its_key_and_its_own_option_comes_first(
     ("pair", "named"),
     [
         ("widht=8", r"widht: .*nearest: width"),
-        ("width=0", r"network\.width = 0"),
+        ("width=0", r"training: width = 0"),
         ("beta1=much", "beta1 = 'much'"),
         ("gradient_clip=1", "gradient_clip = 1: .*bias it"),
         ('network={"width": 8}', "network: .*width=32"),

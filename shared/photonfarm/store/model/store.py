@@ -183,7 +183,7 @@ def check_format(storage: Storage) -> str:
         if are_there(storage):
             raise CorruptError(f"{file}: is missing, and scenes are there: {_put_back()}") from error
         if not set(storage.names("")) - {TMP}:
-            remedy = "`photonfarm submit` makes one, and --store names another"
+            remedy = "`photonfarm submit` makes one, or name another (--store)"
             raise StoreError(f"{storage.where}: there is no store; {remedy}") from error
         raise StoreError(f"{storage.where}: is not a store: {FORMAT_FILE} is missing") from error
     except OSError as error:

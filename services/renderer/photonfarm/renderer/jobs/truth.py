@@ -10,9 +10,9 @@ import json
 import math
 import re
 import time
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, SupportsFloat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,9 +66,12 @@ class Amount:
 
     def __post_init__(self) -> None:
         """Raise SpecError unless one positive amount is given."""
-        given = [value for value in (self.spp, self.seconds, self.error) if value is not None]
-        if len(given) != 1 or not 0 < given[0] < math.inf:
-            raise SpecError("truth: one of spp, seconds and error is required, above 0")
+        given = {key: value for key, value in asdict(self).items() if value is not None}
+        if len(given) != 1 or not all(
+            isinstance(each, SupportsFloat) and 0 < float(each) < math.inf for each in given.values()
+        ):
+            said = ", ".join(f"{key} = {value!r}" for key, value in given.items()) or "truth"
+            raise SpecError(f"{said}: one of spp, seconds and error is required, a number above 0")
 
     @classmethod
     def parse(cls, text: str) -> Self:

@@ -152,7 +152,7 @@ class BatchStream:
         if not self.held_out:
             fault = "none is held out, and one is needed to validate on"
         other = self._feed.other_hold_out()
-        remedy = f"plan more {one}s" if other is None else f"--hold-out {other:g} holds out one {one} of these"
+        remedy = f"plan more {one}s" if other is None else f"hold_out = {other:g} holds out one {one} of these"
         raise SpecError(
             f"hold_out = {self._settings.hold_out:g}: of the {len(self.arrived)} samples planned {fault}; {remedy}"
         )

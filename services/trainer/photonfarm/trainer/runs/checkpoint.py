@@ -38,9 +38,6 @@ DENOISER = "mitsuba-oidn"  # which filters what some networks are given
 LASTING = ("scene_id", "exposure", "network", "batch", "hold_out", "optimiser", "loss", "seed", "start_from")
 """The settings that a run keeps for ever. The others may change when it is resumed."""
 
-OPTIONS = ("architecture", "precision", "demodulation", "batch", "hold_out", "optimiser", "loss", "seed", "start_from")
-"""The settings with an option of their own on the command line; --set takes the others."""
-
 UNREADABLE = (SafetensorError, OSError, RuntimeError, ValueError, LookupError, TypeError, AttributeError)
 """The errors of reading bytes that were not written here."""
 
@@ -181,20 +178,11 @@ def check_continues(path: Path, state: Mapping[str, Any], identity: Mapping[str,
     lasting = {key: values for key, values in changed.items() if key.split(".")[0] in LASTING}
     if lasting:
         differences = "; ".join(
-            f"{key} = {then!r}, and {now!r} is asked for now" for key, (then, now) in lasting.items()
+            f"{key.removeprefix('network.')} = {then!r}, and {now!r} is asked for now"
+            for key, (then, now) in lasting.items()
         )
-        options = " ".join(_format_option(key, then) for key, (then, _) in lasting.items() if key not in kept)
-        same = f"the same values{f' ({options})' if options else ''}"
-        raise SpecError(f"{path}: was trained with {differences}; use another run directory, or {same}")
+        raise SpecError(f"{path}: was trained with {differences}; use another run folder, or the same values")
     return changed
-
-
-def _format_option(key: str, value: Any) -> str:
-    """The command-line option that sets a key to a value."""
-    name = key.split(".")[-1]
-    if name in OPTIONS:
-        return f"without --{name.replace('_', '-')}" if value is None else f"--{name.replace('_', '-')} {value}"
-    return f"--set {name}={'null' if value is None else value}"
 
 
 def check_same_store(path: Path, state: Mapping[str, Any], plans: Sequence[Mapping[str, Any]]) -> None:

@@ -342,4 +342,5 @@ def make_settings(base: str | TrainSettings, changes: Mapping[str, Any]) -> Trai
         kept = base.model_dump()
         return TrainSettings.model_validate({**kept, **others, "network": {**kept["network"], **network}})
     except ValidationError as error:
-        raise SpecError(f"the settings of the training: {'; '.join(sentences(error, KEYS))}") from error
+        said = "; ".join(sentence.removeprefix("network.") for sentence in sentences(error, KEYS))
+        raise SpecError(f"the settings of the training: {said}") from error

@@ -44,7 +44,8 @@ class Frozen(BaseModel):
 def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None) -> Iterator[str]:
     """One sentence for each fault that a model found: its key, the value and the rule.
 
-    `known` are the allowed keys. Entries of lists are called by their names in the document `of`, where they have one.
+    `known` are the allowed keys, perhaps each with where it stands. Entries of lists are called by their names in the
+    document `of`, where they have one.
     """
     faults = error.errors()
     for fault in faults:
@@ -59,7 +60,10 @@ def sentences(error: ValidationError, known: Iterable[str] = (), of: Any = None)
         elif fault["type"] == "missing":
             yield f"{key}: is missing, and required"
         elif fault["type"] == "extra_forbidden":
-            yield f"{key}: unknown key; nearest: {nearest(str(fault['loc'][-1]), known)}"
+            name, places = str(place[-1]), known if isinstance(known, Mapping) else {}
+            others = [each for each in known if each != name]
+            remedy = f"it belongs {where}" if (where := places.get(name)) else f"nearest: {nearest(name, others)}"
+            yield f"{key}: unknown key; {remedy}"
         else:
             yield f"{key} = {show_value(fault['input'])}: {rule}"
 
@@ -90,7 +94,7 @@ _RULES = {
     "int_type": "a whole number is required",
     "less_than": "below {lt} is required",
     "less_than_equal": "{le} or less is required",
-    "literal_error": "is none of {expected}",
+    "literal_error": "must be {expected}",
     "model_type": "a table is required",
     "multiple_of": "a multiple of {multiple_of} is required",
     "string_type": "text is required",

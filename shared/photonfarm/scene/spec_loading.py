@@ -105,10 +105,17 @@ def parse_with_lights(
     return spec, scene.lights
 
 
-def _keys(model: type[BaseModel]) -> set[str]:
-    """The keys of a model and of those in it."""
+def _keys(model: type[BaseModel]) -> dict[str, str]:
+    """The keys of a model and of those in it, each with the outermost tables that have it; "" if none of them does."""
     schema = model.model_json_schema()
-    return {key for part in (schema, *schema.get("$defs", {}).values()) for key in part.get("properties", ())}
+    tables = {name: part.get("properties", {}) for name, part in schema["$defs"].items()}
+    places: dict[str, list[str]] = {key: [] for keys in (schema["properties"], *tables.values()) for key in keys}
+    for outer, of in schema["properties"].items():
+        places[outer].append("above all tables")
+        for kind in re.findall(r"#/\$defs/(\w+)", json.dumps(of)):
+            for key in tables[kind]:
+                places[key].append(f"in [[{outer}]]" if of.get("type") == "array" else f"in [{outer}]")
+    return {key: " or ".join(found) for key, found in places.items()}
 
 
 def _check_shapes(spec: SceneSpec, scene: SceneFile, where: str) -> None:

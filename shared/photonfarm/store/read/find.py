@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from photonfarm.core.errors import CorruptError, SpecError, StoreError
 from photonfarm.core.keys import Key, view_key
-from photonfarm.core.models import differing
+from photonfarm.core.models import differing, nearest
 from photonfarm.plan.request import UNUSED, PlannedContent
 from photonfarm.scene.arrangement import Shot, describe_shot
 from photonfarm.scene.modification import Modification, modification_keys
@@ -74,7 +74,8 @@ def scene_named(store: Store, text: str) -> str:
     if len(matching) != 1:
         held = f"{len(matching)} scenes have" if matching else "no scene has"
         each_named = ", ".join(f"{each} ({name_of(store, each) or 'unreadable'})" for each in matching or ids)
-        known = f"give one of the ids {each_named}" if ids else "the store has no scenes yet"
+        alike = "" if matching else f"; nearest: {nearest(text, {name_of(store, each) or '' for each in ids})}"
+        known = f"give one of the ids {each_named}{alike}" if ids else "the store has no scenes yet"
         raise StoreError(f"{store.storage.where}: {held} the id or name {text!r}; {known}")
     return matching[0]
 

@@ -155,8 +155,8 @@ def test_a_sample_is_complete_with_the_jobs_of_its_row_view_and_modification(sto
 def test_scenes_are_named_by_id_its_beginning_or_their_name(store: Store, scene: SceneStore) -> None:
     for name in (scene.scene_id, scene.scene_id[:6], "small"):
         assert scene_named(store, name) == scene.scene_id
-    with pytest.raises(StoreError):
-        scene_named(store, "other")
+    with pytest.raises(StoreError, match="nearest: small"):
+        scene_named(store, "smal")
     other = store.add(samples.small_spec(points=20))
     third = store.add(samples.small_spec(name="third", points=30))
     assert len(store.scene_ids()) == 3

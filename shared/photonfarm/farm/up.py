@@ -95,8 +95,7 @@ def run_farm(
     references = reference_views > 0
     trained = {"trainer": (run, train_steps, [*train_options])} if train_steps else {}
     for name, steps in also.items():
-        beside_run = run.with_name(f"{run.name}-{name}")
-        trained[f"trainer-{name}"] = (beside_run, steps, [*train_options, "--architecture", name])
+        trained[f"trainer-{name}"] = (run_beside(run, name), steps, [*train_options, "--architecture", name])
     runs = [each for each, *_ in trained.values()]
     for each in runs:
         check_run(each, named.spec, store)
@@ -168,6 +167,12 @@ def run_farm(
                 raise IncompleteError(f"{error}. After that, {second}") from error
             raise
         _call(preview, environment)
+
+
+def run_beside(run: Path, name: str) -> Path:
+    """The folder of a further network's run: RUN-NAME, beside RUN."""
+    named = run if run.name.strip(".") else run.resolve()  # a folder such as . has no name of its own
+    return named.with_name(f"{named.name}-{name}")
 
 
 def _checked_hold_out(spec: SceneSpec, store: str | Path, asked: float | None, request: Request, say: Log) -> float:

@@ -49,6 +49,12 @@ def test_what_cannot_be_planned_is_refused_before_anything_is_made(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_run_of_a_further_network_lies_beside_the_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert up.run_beside(Path("runs/first"), "cnn") == Path("runs/first-cnn")
+    assert up.run_beside(Path(), "cnn") == tmp_path.with_name(f"{tmp_path.name}-cnn")
+
+
 def test_the_last_line_is_the_complete_one_also_where_a_process_fails(
     store: Store, redis_server: EmbeddedRedis, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -165,8 +165,8 @@ class Session:
         self._send_begin(continues=False)
         settle_files(self._run, None)
         self._log.cut(-1)
-        if (other := self._settings.start_from) is not None:
-            begun = start_from(Path(other), self._learner, self._feed.spec.scene_id, self._settings)
+        if self._settings.start_from is not None:
+            begun = start_from(self._learner, self._feed.spec.scene_id, self._settings, self._hooks.on_wait)
             self._log.write("start", step=0, **begun)
         checkpoint.save(self._run / INITIAL, {"network": self._learner.state()["network"], **self._identity()})
         return {}

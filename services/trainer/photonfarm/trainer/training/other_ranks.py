@@ -51,7 +51,7 @@ def assist(source: Callable[[str, float], SceneReader], settings: TrainSettings,
         if value["continues"]:
             good.restore(checkpoint.load(run / CHECKPOINT), run)
         elif settings.start_from:
-            start_from(Path(settings.start_from), learner, value["scene_id"], settings)
+            start_from(learner, value["scene_id"], settings)
         with name_compile_errors(settings.compile):
             while (received := ranks.receive())[0] != "end":
                 command, value = received

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -57,13 +57,16 @@ def _name_differences(run: Path, state: Mapping[str, Any], settings: TrainSettin
         )
 
 
-def start_from(run: Path, learner: Learner, scene_id: str, settings: TrainSettings) -> dict[str, Any]:
-    """Give an untrained learner the weights by which a run predicts; its steps, rate and optimiser begin anew.
+def start_from(
+    learner: Learner, scene_id: str, settings: TrainSettings, warn: Callable[[str], object] = str
+) -> dict[str, Any]:
+    """Give an untrained learner the weights by which the run `settings.start_from` predicts; all else begins anew.
 
-    Descriptors of points begin anew too, unless the run is of this scene and has as many points. Returns what the log
-    says of it. Raises StoreError if there is no such run; SpecError, with each setting that differs, if its weights are
-    of another network.
+    Descriptors of points begin anew too, unless the run is of this scene and has as many points. `warn` is told if the
+    run was trained on what is held out now. Returns what the log says of it. Raises StoreError if there is no such run;
+    SpecError, with each setting that differs, if its weights are of another network.
     """
+    run = Path(str(settings.start_from))
     state, own = checkpoint.load(run / CHECKPOINT), learner.network.state_dict()
     weights = dict(average["weights"] if (average := state.get("average")) else state["network"])
     changed = differing(state["settings"]["network"], settings.network.model_dump(mode="json"))
@@ -76,4 +79,11 @@ def start_from(run: Path, learner: Learner, scene_id: str, settings: TrainSettin
         _name_differences(run, state, settings, changed)
         raise SpecError(f"start_from = {str(run)!r}: its weights do not fit the network as its code is now")
     learner.begin_with(weights)
-    return {"run": str(run), "of_step": state["step"], "of_scene": state["scene_id"], "anew": anew}
+    share = state["settings"]["hold_out"]
+    if knows := state["scene_id"] == scene_id and share < settings.hold_out:
+        warn(
+            f"warning: run {run} held out {share:g}, and so was trained on a part of the {settings.hold_out:g} that is "
+            "held out now: the held-out error is not one of unseen views; with the same hold_out it is"
+        )
+    about = {"run": str(run), "of_step": state["step"], "of_scene": state["scene_id"], "anew": anew}
+    return {**about, "knows_held_out": knows}

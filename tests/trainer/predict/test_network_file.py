@@ -182,9 +182,25 @@ def name_scene(content: str) -> Callable[[dict[str, bytes]], None]:
     return lambda members: members.update({"scene/scene.xml": scene.encode()})
 
 
+def edit_base(name: str, edit: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, bytes]], None]:
+    """Another array in the place of one of the base."""
+
+    def change(members: dict[str, bytes]) -> None:
+        arrays = dict(np.load(io.BytesIO(members["base.npz"])))
+        np.savez(made := io.BytesIO(), **{**arrays, name: edit(arrays[name])})
+        members["base.npz"] = made.getvalue()
+
+    return change
+
+
 @pytest.mark.parametrize(
     ("change", "kind"),
     [
+        (edit_base("cloud.position", lambda array: array[:5]), StoreError),
+        (edit_base("cloud.normal", lambda array: array[:, 0]), StoreError),
+        (edit_base("cloud.albedo", lambda array: array.astype("U8")), StoreError),
+        (edit_base("cloud.group", lambda array: array + 9), StoreError),
+        (edit_base("geometry.faces", lambda array: array + 9), StoreError),
         (lambda members: members.update({"scene/../../stolen.obj": b""}), StoreError),
         (lambda members: members.update({"/tmp/stolen.obj": b""}), StoreError),
         (lambda members: members.update({"scene/plugins/evil.so": b""}), StoreError),

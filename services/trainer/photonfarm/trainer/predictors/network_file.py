@@ -20,15 +20,17 @@ from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING, Any
 from xml.etree.ElementTree import ParseError
 
+import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core.archives import read_arrays, write_arrays
 from photonfarm.core.errors import PhotonfarmError, SpecError, StoreError, store_errors
 from photonfarm.core.files import whole_file
-from photonfarm.core.records import BasePointCloud, Geometry, arrays_of
+from photonfarm.core.records import STATIC, BasePointCloud, Geometry, arrays_of
 from photonfarm.scene.files import OWN_FILES, list_own_files
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import find_scene, locate
+from photonfarm.store.format import declarations
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import check_version
 from photonfarm.trainer.runs.settings import TrainSettings
@@ -118,14 +120,15 @@ def read_network(file: Path) -> tuple[TrainSettings, dict[str, Any], PackedScene
                 list_own_files(folder / scene, spec.scene.parameters)
             state = checkpoint.load(folder / WEIGHTS, without="copy the file again")
             settings = TrainSettings.model_validate(state["settings"])
-            if is_own(settings.network.architecture) or state["scene_id"] != spec.scene_id or "network" not in state:
+            is_whole = state["scene_id"] == spec.scene_id and isinstance(state["network"], dict)
+            if is_own(settings.network.architecture) or not is_whole:
                 raise ValueError("its weights are of another scene, or of code that it does not hold")
             check_version(file, state["settings"]["network"])
             with zipfile.ZipFile(folder / BASE) as archive:
                 _list_members(archive, folder / BASE)
-            with read_arrays(folder / BASE, "base", "pack") as arrays:
-                geometry = Geometry(**_read_record("geometry", arrays))
-                cloud = BasePointCloud(**_read_record("cloud", arrays), pivots=spec.pivots)
+            with read_arrays(folder / BASE, "base", "pack") as stored:
+                arrays = dict(stored)
+            geometry, cloud = _read_base(arrays, spec)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -190,9 +193,29 @@ def _name_faults(file: Path, folder: Path) -> Iterator[None]:
         raise StoreError(f"{file}: is not a network that `photonfarm pack` wrote, or damaged: {reason}") from error
 
 
-def _read_record(kind: str, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Any]:
-    names = [name for name in arrays if name.startswith(f"{kind}.")]
-    return {name.removeprefix(f"{kind}."): arrays[name] for name in names}
+INDICES = {"faces": "V", "face_shape": "S", "shape_group": "G", "group": "G", "face": "F"}
+"""The arrays of a base that hold indices, each with how many there are of what they name."""
+
+
+def _read_base(arrays: Mapping[str, NDArray[Any]], spec: SceneSpec) -> tuple[Geometry, BasePointCloud]:
+    """Geometry and cloud in the arrays of a base; ValueError unless they are as the store's format declares them."""
+    lengths: dict[str | int, int] = {"P": spec.points, "G": len(spec.groups)}
+    found: dict[str, NDArray[Any]] = {}
+    for kind, declared in declarations.BASE.items():
+        for each in declared:
+            found[each.name] = array = arrays[f"{kind}.{each.name}"]
+            for letter, length in zip(each.shape, array.shape, strict=False):
+                lengths.setdefault(letter, length)
+            shape = tuple(length if isinstance(length, int) else lengths.get(length) for length in each.shape)
+            if (array.shape, array.dtype) != (shape, np.dtype(each.dtype)):
+                is_, wanted = f"{array.dtype} {array.shape}", f"{np.dtype(each.dtype)} {shape}"
+                raise ValueError(f"{kind}.{each.name} is {is_}, and {wanted} is required")
+    for name, letter in INDICES.items():
+        least = STATIC if letter == "G" else 0
+        if (found[name] < least).any() or (found[name] >= lengths[letter]).any():
+            raise ValueError(f"{name} has an index outside {least} to {lengths[letter] - 1}")
+    geometry, cloud = ({each.name: found[each.name] for each in declared} for declared in declarations.BASE.values())
+    return Geometry(**geometry), BasePointCloud(**cloud, pivots=spec.pivots)
 
 
 def _with_file(spec: SceneSpec, file: str) -> SceneSpec:

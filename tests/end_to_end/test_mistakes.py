@@ -53,6 +53,8 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("up cornell --modifications 3 --views 2 --hold-out 0.9999", 3, ["6 views planned all"]),
         ("--config none.toml status", 3, ["none.toml"]),
         ("infer --row 0", 4, ["run: there is no such run; `photonfarm train` makes one"]),
+        ("infer --run none.photonfarm", 4, ["none.photonfarm: there is no such file; `photonfarm pack` writes one"]),
+        ("pack --out net.onxx", 2, ["--out: 'net.onxx'", ".photonfarm", ".onnx"]),
     ],
 )
 def test_in_an_empty_folder(here: Path, command: str, code: int, names: list[str]) -> None:

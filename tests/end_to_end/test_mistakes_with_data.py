@@ -164,7 +164,10 @@ DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
         (NOTHING, "train den.toml --run new --set widht=3", 3, ["widht: unknown key; nearest: width"]),
         (NOTHING, "train den.toml --run new --set width=many", 3, ["training: width = 'many': a whole number"]),
         (NOTHING, "train den.toml --run new --loss huber", 3, ["loss = 'huber': is refused"]),
-        (NOTHING, "train den.toml --run den.toml", 2, ["'--run'"]),
+        (NOTHING, "train den.toml --run den.toml", 2, ["'--run'", "is a file", "`infer`, `live`"]),
+        (NOTHING, "train den.toml --run new --start-from den.toml", 2, ["'--start-from'", "is a file"]),
+        (NOTHING, "train den.toml --run new --set start_from=den.toml", 4, ["den.toml: is a file", "`infer`, `live`"]),
+        (NOTHING, "evaluate --run den.toml", 2, ["'--run'", "is a file"]),
         (
             lambda f: cut(f / "run/checkpoint.safetensors"),
             "evaluate",

@@ -13,6 +13,7 @@ import click
 from click.core import ParameterSource
 
 from photonfarm.cli.options import (
+    RunFolder,
     arrangement_options,
     device_option,
     json_option,
@@ -230,7 +231,7 @@ def top_up(
 @click.option(
     "--run",
     "runs",
-    type=click.Path(path_type=Path),
+    type=RunFolder(),
     multiple=True,
     help="Folder of a training run; may be repeated.  [default: that of an `up` at work here]",
 )

@@ -41,6 +41,23 @@ class StorePlace(click.Path):
         return value
 
 
+class RunFolder(click.Path):
+    """The folder of a training run, by default as a Path."""
+
+    name = "folder"
+
+    def __init__(self, path_type: type = Path) -> None:
+        super().__init__(path_type=path_type, file_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """The folder, which need not be there; fails for a file."""
+        if Path(value).is_file():
+            from photonfarm.farm.training import NO_FOLDER
+
+            self.fail(f"{str(value)!r} {NO_FOLDER}.", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 class WholeNumber(click.IntRange):
     """A whole number in a range, also written like 1e3 or 10_000."""
 
@@ -69,7 +86,7 @@ store_option = click.option(
 )
 run_option = click.option(
     "--run",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=RunFolder(),
     default="run",
     show_default=True,
     help="The trainer's folder.",

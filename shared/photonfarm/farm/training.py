@@ -24,10 +24,19 @@ SETTINGS = "settings.json"
 VIEWS = "views"
 INITIAL = "initial.safetensors"
 CHECKPOINT = "checkpoint.safetensors"
+ALONE = ".photonfarm"
+"""How the name of a network on its own ends."""
+
 METADATA = "photonfarm"
 """The key of a checkpoint's JSON document in the header of its file."""
 
 MOST_HEADER_BYTES = 1 << 26
+
+NO_FOLDER = (
+    "is a file, and a training run is a folder; from a network on its own, as `photonfarm pack` writes it, one can "
+    "only predict: `infer`, `live` and `open_run` take it"
+)
+"""What is wrong with a file that is given as a run."""
 
 WAITS = "waits for samples"
 """The phase of a trainer that has nothing to train on."""

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 
 import click
 
-from photonfarm.cli.options import address_options, combine_options, names_redis, redis_option, store_option
+from photonfarm.cli.options import (
+    RunFolder,
+    address_options,
+    combine_options,
+    names_redis,
+    redis_option,
+    store_option,
+)
 from photonfarm.farm.running_farm import METRICS_PORT, WEB_PORT
 
 if TYPE_CHECKING:
@@ -21,7 +28,7 @@ _watch_options = combine_options(
     click.option(
         "--run",
         "runs",
-        type=click.Path(path_type=Path, file_okay=False),
+        type=RunFolder(),
         multiple=True,
         help="Folder of a training run; may be repeated.  [default: that of an `up` at work here, or run]",
     ),

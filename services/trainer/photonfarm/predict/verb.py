@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 
 LIVE_PORT = 8430
+ONNX = ".onnx"
 
 run_option = click.option(
     "--run",
@@ -249,7 +250,7 @@ def live(
     type=click.Path(path_type=Path, dir_okay=False),
     default="network.photonfarm",
     show_default=True,
-    help="A file; one that ends in .onnx is the network alone, as ONNX.",
+    help="A file that ends in .photonfarm; or in .onnx: the network alone, as ONNX.",
 )
 def pack(store: str | Path, run: Path, out: Path) -> None:
     """Write a trained network as one file, from which `infer`, `live` and `open_run` predict on any machine.
@@ -257,6 +258,10 @@ def pack(store: str | Path, run: Path, out: Path) -> None:
     It has weights, settings, the scene with its files, and the point cloud; neither samples nor the state of training.
     With --out NAME.onnx it is the network alone, whose inputs are named as in `photonfarm.data`.
     """
+    from photonfarm.farm.training import ALONE
+
+    if out.suffix not in (ALONE, ONNX):
+        raise click.BadParameter(f"{str(out)!r}: ends neither in {ALONE} nor in {ONNX}", param_hint="--out")
     from photonfarm.trainer.predictors.network_file import write_network
     from photonfarm.trainer.predictors.onnx_file import write_onnx
     from photonfarm.trainer.predictors.trained import TrainedRun
@@ -264,7 +269,7 @@ def pack(store: str | Path, run: Path, out: Path) -> None:
 
     trained = TrainedRun.load(run)
     os.environ.update(make_environment(run))
-    write = write_onnx if out.suffix == ".onnx" else write_network
+    write = write_onnx if out.suffix == ONNX else write_network
     with tell_waiting(partial(click.echo, err=True), f"writing {out.name}"):
         write(trained, store, out)
     click.echo(f"{out}: {trained.name}, {format_bytes(out.stat().st_size)}")

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import click
 
-from photonfarm.cli.options import json_option, store_option
+from photonfarm.cli.options import RunFolder, json_option, store_option
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
@@ -33,7 +33,7 @@ MEASURING = (
         "runs",
         cls=RepeatableOption,
         multiple=True,
-        type=click.Path(path_type=Path, file_okay=False),
+        type=RunFolder(),
         default=["run"],
         envvar="PHOTONFARM_RUN",
         show_default=True,

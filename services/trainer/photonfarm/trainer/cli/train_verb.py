@@ -10,13 +10,13 @@ from typing import Any, get_args
 
 import click
 
-from photonfarm.cli.options import json_option, redis_option, store_option
+from photonfarm.cli.options import RunFolder, json_option, redis_option, store_option
 from photonfarm.trainer.runs.settings import KEYS, PRESETS, Architecture, Loss, Optimiser, Precision, make_settings
 from photonfarm.trainer.runs.user_code import is_own
 
 run_option = click.option(
     "--run",
-    type=click.Path(path_type=Path, file_okay=False),
+    type=RunFolder(),
     envvar="PHOTONFARM_RUN",
     default="run",
     show_default=True,
@@ -113,7 +113,7 @@ def collect_changes(params: Mapping[str, Any]) -> dict[str, Any]:
 @click.option("--seed", type=click.IntRange(0), help="Of the weights and the draws; 0 is a seed.  [default: 0]")
 @click.option(
     "--start-from",
-    type=click.Path(file_okay=False),
+    type=RunFolder(str),
     metavar="RUN",
     help="Begin with the weights of another run, of this scene or a similar one.",
 )

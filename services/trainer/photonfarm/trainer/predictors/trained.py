@@ -10,8 +10,9 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-from photonfarm.core.errors import SpecError
+from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import BasePointCloud, Geometry
+from photonfarm.farm.training import ALONE
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.networks import build, find_needs
@@ -54,6 +55,8 @@ class TrainedRun:
             return cls(
                 folder, settings, spec.scene_id, spec.exposure, state["network"], 1, packed, note_training(state)
             )
+        if folder.suffix == ALONE and not folder.exists():
+            raise StoreError(f"{folder}: there is no such file; `photonfarm pack` writes one")
         settings, state = read_settings(folder), checkpoint.load(folder / name)
         identity = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}
         checkpoint.check_continues(folder / name, state, identity)

@@ -22,7 +22,7 @@ from photonfarm.core.files import whole_file
 from photonfarm.core.models import sentences
 from photonfarm.core.pictures import display
 from photonfarm.core.records import F32
-from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, SETTINGS, VIEWS
+from photonfarm.farm.training import CHECKPOINT, INITIAL, METRICS, NO_FOLDER, SETTINGS, VIEWS
 from photonfarm.scene.spec_loading import SCENES_VARIABLE
 from photonfarm.trainer.runs.settings import EARLIER, KEYS, NetworkSettings, TrainSettings
 
@@ -102,6 +102,8 @@ def read_settings(run: Path) -> TrainSettings:
         raise StoreError(
             f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
         ) from error
+    except NotADirectoryError as error:
+        raise StoreError(f"{run}: {NO_FOLDER}") from error
     except OSError as error:
         raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:

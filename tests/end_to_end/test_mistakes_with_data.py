@@ -145,7 +145,7 @@ DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
         (NOTHING, "infer --without piano", 3, ["'piano' is no movable group of den; nearest: mirror"]),
         (NOTHING, "infer --orbit 3 --camera 0,1,0", 2, ["--orbit and --camera exclude each other"]),
         (NOTHING, "infer --row 999", 4, ["there is no row 999"]),
-        (NOTHING, "infer --row 0 --device gpu", 3, ["device = 'gpu': must be auto, cpu"]),
+        (NOTHING, "infer --row 0 --device gpu", 2, ["'--device'", "'gpu' is none of auto"]),
         (NOTHING, "infer --row 0 --out den.toml/x", 4, ["den.toml/x"]),
         (NOTHING, "infer --buffers den.toml", 4, ["den.toml: holds no buffers"]),
         (NOTHING, "infer --camera-path none.json", 2, ["'none.json'"]),

@@ -197,13 +197,14 @@ def device_option(command: Callable[..., Any]) -> Callable[..., Any]:
         show_default=True,
         show_envvar=True,
         metavar="auto|cpu|cuda[:N]",
-        callback=_device,
+        callback=check_device,
         help="What renders: the processor, the first NVIDIA card, card N as nvidia-smi numbers them; auto: a card, "
         "where there is one that can.",
     )(on_device)
 
 
-def _device(ctx: click.Context, param: click.Parameter, name: str) -> str:  # noqa: ARG001
+def check_device(ctx: click.Context, param: click.Parameter, name: str) -> str:  # noqa: ARG001
+    """The name of a device; fails for one that has another form."""
     from photonfarm.farm.devices import NAMES
 
     if not NAMES.fullmatch(name):

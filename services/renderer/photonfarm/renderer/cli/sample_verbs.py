@@ -18,12 +18,24 @@ from photonfarm.cli.options import (
     start_options,
     store_option,
 )
+from photonfarm.core.errors import SpecError
 from photonfarm.core.formatting import format_count
 from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import tell_waiting
 
 if TYPE_CHECKING:
+    from photonfarm.renderer.jobs.truth import Amount
     from photonfarm.scene.arrangement import Arrangement, Shot
+
+
+def parse_amount(ctx: click.Context, param: click.Parameter, text: str | None) -> Amount | None:  # noqa: ARG001
+    """How much an option asks to render; fails for text that says no amount."""
+    from photonfarm.renderer.jobs.truth import Amount
+
+    try:
+        return None if text is None else Amount.parse(text)
+    except SpecError as error:
+        raise click.BadParameter(f"{error}.") from error
 
 
 @click.command()
@@ -176,7 +188,9 @@ def measure_frames(
 @arrangement_options()
 @click.option(
     "--spp",
+    "amount",
     metavar="SPP|TIME|ERROR",
+    callback=parse_amount,
     help="Samples per pixel (256), for how long to render (20s), or until the image's own squared error is so small a "
     "share of its mean square (0.1%).  [default: 64]",
 )
@@ -202,7 +216,7 @@ def render(
     row: int | None,
     like: str | None,
     asked: Shot,
-    spp: str | None,
+    amount: Amount | None,
     pass_number: int | None,
     out: Path | None,
     as_json: bool,
@@ -221,23 +235,23 @@ def render(
     from photonfarm.scene.arrangement import Shot
 
     say = partial(click.echo, err=True)
-    again = row is not None and (like, asked, spp) == (None, Shot(), None)
+    again = row is not None and (like, asked, amount) == (None, Shot(), None)
     if not again and pass_number is not None:
         raise click.UsageError("--pass: is of a stored sample, which --row alone renders again")
-    if out is not None:
-        truth.check_suffix(out)
+    if out is not None and out.suffix not in truth.SUFFIXES:
+        raise click.BadParameter(f"{str(out)!r}: ends in none of {', '.join(truth.SUFFIXES)}", param_hint="--out")
     if again:
         repeated = repeat(store, scene, row or 0, pass_number, say)
         if out is not None:
             repeated.write(out)
             say(f"written to {out}")
-        click.echo(json.dumps(repeated.document(), indent=1) if as_json else repeated.line())
+        document = {**repeated.document(), "files": [] if out is None else [str(out)]}
+        click.echo(json.dumps(document, indent=1) if as_json else repeated.line())
         sys.exit(repeated.exit_code)
-    amount = truth.Amount.parse(spp or "64")
     with tell_waiting(say, f"rendering {scene}"):
-        image = truth.render_asked(store, scene, asked, row, like, amount)
+        image = truth.render_asked(store, scene, asked, row, like, amount or truth.Amount(spp=64))
     for doubt in image.doubts:
         say(f"warning: {doubt}")
     image.write(file := out or Path("render.png"))
     say(f"written to {file}")
-    click.echo(json.dumps(image.document(), indent=1) if as_json else image.line())
+    click.echo(json.dumps({**image.document(), "files": [str(file)]}, indent=1) if as_json else image.line())

@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import click
 
-from photonfarm.cli.options import RunFolder, json_option, store_option
+from photonfarm.cli.options import RunFolder, check_device, json_option, store_option
 from photonfarm.trainer.runs.settings import MOST_HELD_OUT, ReadyDenoiser
 
 
@@ -23,7 +23,12 @@ class RepeatableOption(click.Option):
 
 
 device_option = click.option(
-    "--device", default="auto", show_default=True, help="Of the networks: cpu, cuda, or auto, cuda where there is one."
+    "--device",
+    default="auto",
+    show_default=True,
+    metavar="auto|cpu|cuda[:N]",
+    callback=check_device,
+    help="Of the networks; auto: cuda where there is one.",
 )
 
 MEASURING = (

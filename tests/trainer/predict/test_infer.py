@@ -1,5 +1,6 @@
 """`photonfarm infer`: samples of a store and camera paths, as pictures; the renderer's part by the analytic scene."""
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,6 +21,7 @@ from photonfarm.core.records import LIT_POINTS, Guides, arrays_of
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.plan.request import Request
 from photonfarm.predict import infer, open_run, opened_run
+from photonfarm.predict.infer_result import list_made
 from photonfarm.scene.camera_path import Frames, orbit
 from photonfarm.scene.modification import Modification, rebuild
 from photonfarm.scene.view import Camera, View
@@ -120,7 +122,14 @@ def test_a_sample_is_shown_beside_its_target(store: Path, scene: SceneStore, tra
         target = display(reader.read(row).radiance.mean(axis=0), scene.spec.exposure)
         shown = pixels(tmp_path / "out/target.png")[::16, ::16].astype(int)
         assert np.abs(shown - target).max() <= 1
-        assert [file.name for file in found.files] == ["prediction.png", "target.png"]
+        with np.load(tmp_path / "out/frame.npz") as layers:
+            np.testing.assert_array_equal([layers["A"], layers["B"]], reader.read(row).radiance)
+            linear = display(layers["prediction"], scene.spec.exposure)
+        assert np.abs(pixels(tmp_path / "out/prediction.png")[::16, ::16].astype(int) - linear).max() <= 1
+        about = json.loads((tmp_path / "out/frame.json").read_text())
+        assert ("squared_error" in about, about["held_out"], about["row"]) == (wanted, wanted, row)
+        assert {"place", "without", "camera", "look_at", "doubts", "mean_square", "truth_error"} <= {*about}
+        assert {"prediction.png", "target.png", "frame.npz", "frame.json"} < {*about["files"]}
         said = f"row {row}: held out; squared error " if wanted else f"row {row}: a training sample, "
         assert found.sentence.startswith(said)
 
@@ -172,7 +181,8 @@ def test_a_path_becomes_pictures_an_animation_and_a_film(
     pytest.importorskip("imageio_ffmpeg", reason="the extra `video` is not installed")
     path = frames(Modification.from_vector(np.tile([0, 0, 0, 1], (2, 1))), orbit(scene.spec, 5))
     found = infer.show_frames(store, trained(), path, tmp_path / "out", fps=10)
-    assert {file.name for file in found.files} == {f"frame-000{i}.png" for i in range(5)} | {"path.gif", "path.mp4"}
+    films = {"path.gif", "path.mp4", "frame.json"}
+    assert {file.name for file in found.files} == {f"frame-000{i}.png" for i in range(5)} | films
     with Image.open(tmp_path / "out/path.gif") as gif:
         assert (gif.n_frames, gif.info["duration"], gif.info["loop"]) == (5, 100, 0)
     film = decoded(tmp_path / "out/path.mp4", 256, 256)
@@ -188,6 +198,13 @@ def test_a_path_becomes_pictures_an_animation_and_a_film(
     without = infer.show_frames(store, TrainedRun.load(tmp_path / "run"), path, tmp_path / "other")
     assert not (tmp_path / "other/path.mp4").exists()
     assert "pip install photonfarm[video]" in without.sentence
+
+
+def test_files_of_an_earlier_call_are_those_that_it_names_in_its_folder(tmp_path: Path) -> None:
+    for folder, about in ((".", {"files": ["prediction.png", "../a.png", "mine.txt"]}), ("frame-0001", [1])):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        (tmp_path / folder / "frame.json").write_text(json.dumps(about))
+    assert list_made(tmp_path) == {tmp_path / "prediction.png"}
 
 
 def test_what_cannot_be_shown_is_refused(
@@ -230,10 +247,10 @@ def test_the_verb_shows_a_row_or_a_file_of_buffers(
     reader.refresh()
 
     def shown(*arguments: str) -> bytes:
-        place = ["infer", "--store", str(store), "--run", str(run.folder), "--out", str(tmp_path / "out")]
+        place = ["infer", "--store", str(store), "--run", str(run.folder), "--out", str(tmp_path / "out"), "--json"]
         result = CliRunner().invoke(umbrella, [*place, *arguments], catch_exceptions=False)
         assert result.exit_code == 0, result.output
-        return Path(result.stdout.splitlines()[0]).read_bytes()
+        return Path(json.loads(result.stdout)["files"][0]).read_bytes()
 
     wanted = shown("--row", "7")
     assert shown("--row", "6") != wanted
@@ -246,6 +263,9 @@ def test_the_verb_shows_a_row_or_a_file_of_buffers(
     [
         (["--camera-path", __file__, "--orbit", "3"], "--camera-path and --orbit"),
         (["--buffers", __file__, "--truth", "8"], "--buffers and --truth"),
+        (["--truth", "5x"], "'5x': samples per pixel are required"),
+        (["--device", "gpu"], "'gpu' is none of auto"),
+        (["--run", __file__, "--row", "1"], "is a network on its own"),
         (["--buffers", __file__, "--without", "sofa"], "--buffers and what stands where"),
         (["--orbit", "0"], "'--orbit'"),
         (["--place", "sofa"], "NAME=X,Y,Z"),

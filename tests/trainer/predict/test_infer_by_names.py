@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -31,11 +30,12 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
     run = trained(store, tmp_path / "run", "guided")
     place = ["infer", "--store", str(store), "--run", str(run), "--out", str(tmp_path / "out")]
     asked = ["--row", "1", "--without", "vase", "--camera", "-1.9,1.6,1.7", "--truth", "8"]
-    done = CliRunner().invoke(umbrella, [*place, *asked], catch_exceptions=False)
+    done = CliRunner().invoke(umbrella, [*place, *asked, "--json"], catch_exceptions=False)
     assert done.exit_code == 0
     names = {"prediction.png", "truth.png", "difference.png", "frame.exr", "frame.npz", "frame.json"}
-    assert {Path(line).name for line in done.stdout.split()} == names
     said = json.loads((tmp_path / "out/frame.json").read_text())
+    assert {*said["files"]} == names
+    assert json.loads(done.stdout) == {**said, "files": [str(tmp_path / "out" / name) for name in said["files"]]}
     (scene_id,) = Store(store).scene_ids()
     spec = SceneReader(store, scene_id).spec
     start, view = find_start(store, scene_id, 1, None) or pytest.fail("row 1 is planned")
@@ -61,21 +61,22 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
     other = tmp_path / "other"
     shutil.copytree(store, other)
     place[2] = str(other)
-    for words in ("planned as a sample", "planned as a sample before"):
+    for words in ("planned as a sample, row 4", "planned as a sample before, row 4"):
         again = CliRunner().invoke(umbrella, [*place, *asked[:-2], "--store-it"], catch_exceptions=False)
-        assert words in again.stderr.splitlines()
+        assert words in again.stdout.splitlines()
+        assert f"photonfarm work --store {other} --share 0/1 --until-complete" in again.stderr
     assert len(Store(other).scene(scene_id).plans()) == 2
     ((configuration, seen),) = read_configurations(tmp_path / "out/frame.json", spec)
     np.testing.assert_array_equal(configuration.vector, asked_again.vector)
     assert seen is not None
     np.testing.assert_array_equal(seen.vector[:3], np.float32([-1.9, 1.6, 1.7]))
-    (mine := tmp_path / "out/frame-of-mine.png").touch()
+    (mine := tmp_path / "out/path.gif").touch()  # of a name that a call may give, but none has
     for more, left in (
         (["--without", "vase"], names - {"truth.png", "difference.png"}),
-        (["--row", "1"], {"target.png"}),
+        (["--row", "1"], names - {"truth.png"} | {"target.png"}),
     ):
         CliRunner().invoke(umbrella, [*place, *more], catch_exceptions=False)
-        assert {file.name for file in (tmp_path / "out").iterdir()} == {"prediction.png", mine.name, *left}
+        assert {file.name for file in (tmp_path / "out").iterdir()} == {mine.name, *left}
 
 
 def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path, tmp_path: Path) -> None:
@@ -87,10 +88,10 @@ def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path,
     asked = ["--without", "vase", "--camera", "1.9,1.6,1.7", "--fov", "50", "--truth", "4"]
     done = CliRunner().invoke(umbrella, [*place, *asked], catch_exceptions=False)
     assert done.exit_code == 0
-    assert Counter(Path(line).parent.name for line in done.stdout.split()) == {"frame-0000": 6, "frame-0001": 6}
     said = [json.loads((out / f"frame-{i:04}/frame.json").read_text()) for i in range(2)]
-    for each in said:
-        assert f"own squared error is {100 * each['truth_error'] / each['mean_square']:.2g} % of" in done.stderr
+    for i, each in enumerate(said):
+        assert f"own squared error is {100 * each['truth_error'] / each['mean_square']:.2g} % of" in done.stdout
+        assert {*map(str, (out / f"frame-{i:04}").iterdir())} <= {*done.stdout.splitlines()}
     assert [each["without"] for each in said] == [["vase"], ["sofa", "vase"]]
     assert [each["place"] for each in said] == [{"sofa": [0.9, 0, 0.3]}, {}]
     assert [each["camera"] for each in said] == [[-1.9, 1.6, 1.7], [1.9, 1.6, 1.7]]
@@ -102,8 +103,8 @@ def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path,
             np.testing.assert_array_equal(layers["truth"], opened.truth(**shot, spp=4).radiance)
     matrix = [[1, 0, 0, 1.9], [0, 1, 0, 1.6], [0, 0, 1, 1.7], [0, 0, 0, 1]]
     (cameras := tmp_path / "transforms.json").write_text(json.dumps({"frames": 2 * [{"transform_matrix": matrix}]}))
-    done = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras)], catch_exceptions=False)
-    assert len({Path(line).parent.name for line in done.stdout.split()}) == 1 + 2, "the first has its own camera"
+    done = CliRunner().invoke(umbrella, [*place, "--cameras", str(cameras), "--json"], catch_exceptions=False)
+    assert len(json.loads(done.stdout)) == 1 + 2, "the first has its own camera"
     (own := out / "frame.json").write_text(json.dumps(said[0]))
     CliRunner().invoke(umbrella, [*place[:-1], str(own)], catch_exceptions=False)
     assert {file.name for file in out.iterdir()} == {"frame-0000", own.name}, "what it reads stays"

@@ -134,8 +134,8 @@ def test_what_is_shown_is_planned_where_that_is_allowed_and_a_page_of_the_server
             "only a page"
         )
         assert len(scene.plans()) == before
-        assert ask(address, "submit", state, method="POST")["said"] == "planned as a sample"
-        assert ask(address, "submit", state, method="POST")["said"] == "planned as a sample before"
+        assert ask(address, "submit", state, method="POST")["said"] == "planned as a sample, row 4"
+        assert ask(address, "submit", state, method="POST")["said"] == "planned as a sample before, row 4"
     assert len(scene.plans()) == before + 1
 
 

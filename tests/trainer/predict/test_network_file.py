@@ -270,7 +270,14 @@ def test_code_of_one_s_own_is_neither_packed_nor_imported(
     own = Path(__file__).parent / "test_open_run.py"  # which has one
     (tmp_path / "own_share.py").write_text(re.findall(r'OWN = """\n(.*?)"""', own.read_text(), re.DOTALL)[0])
     with pytest.raises(SpecError, match="own_share:Share"):
-        invoke("--store", store, "--run", trained(store, tmp_path / "run", "own_share:Share"), "--out", tmp_path / "it.photonfarm")
+        invoke(
+            "--store",
+            store,
+            "--run",
+            trained(store, tmp_path / "run", "own_share:Share"),
+            "--out",
+            tmp_path / "it.photonfarm",
+        )
 
 
 # ------------------------------------------------------------------------------------------------------------- as ONNX

@@ -308,7 +308,7 @@ def test_a_view_is_shown_and_planned_with_the_field_of_view_that_is_asked_for(zo
     assert [len(frame.doubts) for frame in (near, usual, far, beyond)] == [0, 0, 0, 1]
     place = ["infer", "--store", str(store), "--run", str(run), "--out", str(tmp_path / "out")]
     done = CliRunner().invoke(umbrella, [*place, "--row", "1", "--fov", "45", "--store-it"], catch_exceptions=False)
-    assert "planned as a sample" in done.stderr.splitlines()
+    assert "planned as a sample, row 4" in done.stdout.splitlines()
     assert Store(store).scene(scene_id).plans()[-1].rows.view[0, 6] == 45
     found = CliRunner().invoke(
         umbrella, ["store", "find", "--store", str(store), "--fov", "45"], catch_exceptions=False

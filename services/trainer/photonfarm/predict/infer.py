@@ -6,12 +6,11 @@ buffers` has written them to a file.
 
 from __future__ import annotations
 
-import re
 import statistics
 import subprocess
 import time
-from collections.abc import Collection, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,9 +27,10 @@ from photonfarm.core.records import F32
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.predict.flicker import Flicker
+from photonfarm.predict.infer_result import InferResult
 from photonfarm.predict.opened_run import OpenRun, never_seen
-from photonfarm.renderer.jobs.truth import Amount, write_beside
-from photonfarm.scene.arrangement import Arrangement, Shot, describe_shot, find_doubts, list_shot
+from photonfarm.renderer.jobs.truth import Amount, Truth, write_beside
+from photonfarm.scene.arrangement import Arrangement, describe_shot, find_doubts, list_shot
 from photonfarm.scene.camera_path import Frames
 from photonfarm.scene.groups import names_of_ids
 from photonfarm.scene.modification import Modification
@@ -50,65 +50,32 @@ NOT_JUDGED = "a training sample, so no error is given: the network may have lear
 FFMPEG = "imageio_ffmpeg"
 """The package with ffmpeg, of the extra `video`."""
 
-MADE = re.compile(
-    r"(prediction|truth|difference|target|frame-\d{4})\.png|frame\.(npz|exr|json)|path\.(gif|mp4)", re.ASCII
-)
-"""The names of all files that `infer` may make."""
-
-FOLDERS = "frame-" + 4 * "[0-9]"
-"""The names of the folders that it makes, one for each of several configurations."""
-
-
-@dataclass(frozen=True, slots=True)
-class InferResult:
-    """The files that were written, a sentence on the error or the time, and what the network never saw."""
-
-    files: tuple[Path, ...]
-    sentence: str
-    doubts: tuple[str, ...] = ()
-
-
-def remove_others(out: Path, made: Collection[Path], read: Collection[Path]) -> None:
-    """Remove from a folder what earlier calls have made there and this one has not, as it shows other things.
-
-    What this one has read stays. Raises StoreError if that is refused.
-    """
-    with store_errors("remove the pictures of an earlier call", out):
-        for file in {*out.glob("*"), *out.glob(f"{FOLDERS}/*")} - {*made}:
-            if MADE.fullmatch(file.name) and file.is_file() and not any(map(file.samefile, read)):
-                file.unlink()
-        for folder in out.glob(FOLDERS):
-            if folder.is_dir() and not any(folder.iterdir()):
-                folder.rmdir()
-
-
 # ----------------------------------------------------------------------------------------------- any configuration
 
 
 def show_frame(
     opened: OpenRun,
-    asked: Shot,
-    start: tuple[Modification, View] | None,
+    configuration: Modification,
+    view: View,
     out: Path,
     amount: Amount | None,
-    load_s: float,
     *,
     store_it: bool = False,
 ) -> InferResult:
-    """Write the network's image of what is asked for, and with an `amount` the truth beside it: as `write_beside`.
+    """Write the network's image of a configuration, and with an `amount` the truth beside it: as `write_beside`.
 
     frame.json says what stands where, by names, what the network never saw, seconds, and the error with its interval.
-    `load_s` is what loading took. With `store_it`, the view is planned as a sample, which workers find by themselves.
+    With `store_it`, the view is planned as a sample, which workers find by themselves.
     """
     with torch.no_grad():
-        frame = opened.predict(*(start or (None, None)), **dict(asked))
+        frame = opened.predict(configuration, view)
     waited = time.perf_counter()
     image = frame.radiance.cpu().numpy()
-    seconds = {"load": load_s, **frame.seconds}
+    seconds = dict(frame.seconds)
     seconds["network"] += time.perf_counter() - waited  # a card still works when `predict` returns
     if not np.isfinite(image).all():
         raise IncompleteError("the image came out non-finite; move the camera a little")
-    shot = opened.spec, frame.configuration, frame.view
+    shot = opened.spec, configuration, view
     about: dict[str, Any] = {
         "scene": opened.scene_id,
         **list_shot(*shot),
@@ -119,10 +86,9 @@ def show_frame(
     said = [describe_shot(*shot)]
     truth = None
     if amount is not None:
-        truth = opened.truth(frame.configuration, frame.view, **asdict(amount))
-        error, power, seconds["truth"] = truth.error(image), truth.power(), truth.seconds
-        about |= {"spp": truth.spp, "squared_error": error.mean, "interval": error.interval, "mean_square": power}
-        about["truth_error"] = truth.own_error()
+        truth = opened.truth(configuration, view, **asdict(amount))
+        error, seconds["truth"] = truth.error(image), truth.seconds
+        about |= {"squared_error": error.mean, "interval": error.interval, **_list_figures(truth)}
         low, high = error.interval or (error.mean, error.mean)
         said.append(
             f"squared error {error.mean:.5f}, with probability 0.95 from {low:.5f} to {high:.5f}: "
@@ -131,19 +97,27 @@ def show_frame(
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
     if store_it:
-        said.append(opened.plan_sample(*shot[1:]))
-    groups = opened.find_groups(frame.configuration, frame.view)
-    files = write_beside(out, image, groups, truth, opened.spec.exposure, about)
-    return InferResult(tuple(files), "\n".join(said), tuple(about["doubts"]))
+        planned = opened.plan_sample(configuration, view)
+        said.append(str(planned))
+        about["planned"] = asdict(planned)
+    groups = opened.find_groups(configuration, view)
+    files = write_beside(out, image, groups, truth, opened.spec.exposure)
+    return InferResult.write(out, files, "\n".join(said), **about)
+
+
+def _list_figures(truth: Truth) -> dict[str, float]:
+    """What is known of a truth, for JSON."""
+    return {"spp": truth.spp, "mean_square": truth.power(), "truth_error": truth.own_error()}
 
 
 # ---------------------------------------------------------------------------------------------------- a stored sample
 
 
 def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device: str = "auto") -> InferResult:
-    """Write prediction.png and target.png, the mean of both noisy halves, of one sample.
+    """Write the network's image of one sample, from the inputs that are stored, and the target beside it.
 
-    Raises StoreError for a row that is not planned, IncompleteError for one that is not complete.
+    That is the mean of both noisy halves; files are as `show_frame` writes them, but for the groups, which no store
+    has. Raises StoreError for a row that is not planned, IncompleteError for one that is not complete.
     """
     torch.set_num_threads(run.settings.threads)
     source = run.source(Store(store).root)
@@ -151,22 +125,32 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     with Feed(source, run.settings.model_copy(update={"device": "cpu"})) as feed:
         if row not in dict(feed.arrivals()[0]):
             raise _explain_missing(source, row)
+        predict = run.predictor(feed.spec, feed.base, device)
+        began = time.perf_counter()
         feed.ask([row])
         batch = feed.take()
-        predict = run.predictor(feed.spec, feed.base, device)
-    shown = {"prediction": (image := predict(batch)[0]), "target": batch.target[0].mean(dim=0).numpy()}
-    files = tuple(out / f"{name}.png" for name in shown)
-    with store_errors("make the folder of the pictures", out):
-        out.mkdir(parents=True, exist_ok=True)
-    for file, pixels in zip(files, shown.values(), strict=True):
-        write_png(enlarge(pixels), file)
-    sample = source.read(row)
-    shot = describe_shot(source.spec, sample.modification, sample.view)
+        read = time.perf_counter()
+    image, sample, spec = predict(batch)[0], source.read(row), source.spec
+    seconds = {"inputs": read - began, "network": time.perf_counter() - read}
+    parts, spp = sample.radiance[None].astype(np.float64), 2 * spec.transport.half_spp
+    target = Truth(parts, np.ones(1, np.int64), spp, 0.0, spec.exposure)
+    shot = spec, sample.modification, sample.view
     (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
-    if not is_held_out:
-        return InferResult(files, f"row {row}: {NOT_JUDGED}; {shot}")
-    error = choose_error(batch)(image, *batch.target[0].numpy())
-    return InferResult(files, f"row {row}: held out; squared error {error:.5f}, the noise taken out; {shot}")
+    about: dict[str, Any] = {
+        "scene": run.scene_id,
+        **list_shot(*shot),
+        "row": row,
+        "held_out": is_held_out,
+        "doubts": [*never_seen(find_doubts(*shot))],
+        "seconds": seconds,
+        **_list_figures(target),
+    }
+    said = NOT_JUDGED
+    if is_held_out:
+        about["squared_error"] = error = choose_error(batch)(image, *batch.target[0].numpy())
+        said = f"held out; squared error {error:.5f}, the noise taken out: {target.describe_error(error)}"
+    files = write_beside(out, image / np.float32(spec.exposure), None, target, spec.exposure, "target")
+    return InferResult.write(out, files, f"row {row}: {said}; {describe_shot(*shot)}", **about)
 
 
 def _explain_missing(source: SceneReader, row: int) -> StoreError | IncompleteError:
@@ -193,7 +177,8 @@ def show_frames(
     _check_frames(run, frames, source.spec)
     predict = run.predictor(source.spec, source.base(), device)
     images = (predict(batch)[0] for batch in _read_frames(run, frames, source))
-    return _show_images(_time(images), len(frames), out, fps, "for the network and what it reads")
+    shown = _show_images(_time(images), len(frames), out, fps, "for the network and what it reads")
+    return _describe_path(source.spec, run.scene_id, frames.modification, out, *shown)
 
 
 def _time(images: Iterator[F32]) -> Iterator[tuple[F32, float]]:
@@ -228,9 +213,26 @@ def show_path(
         if changed
         else "no surface stays in view"
     )
-    stands = Arrangement.from_modification(opened.spec, modification).describe() or "at rest"
-    doubts = never_seen(find_doubts(opened.spec, modification))
-    return InferResult(shown.files, f"{stands}: {shown.sentence}\nflicker: {told}", doubts)
+    files, sentence, about = shown
+    said = f"{sentence}\nflicker: {told}", {**about, "flicker": flicker.result()}
+    return _describe_path(opened.spec, opened.scene_id, modification, out, files, *said)
+
+
+def _describe_path(
+    spec: SceneSpec,
+    scene_id: str,
+    modification: Modification,
+    out: Path,
+    files: Sequence[Path],
+    sentence: str,
+    about: Mapping[str, Any],
+) -> InferResult:
+    """What `_show_images` has shown of a configuration, with what stands where, and what the network never saw."""
+    stands = Arrangement.from_modification(spec, modification)
+    said = {"scene": scene_id, **stands.model_dump(mode="json", exclude={"move"})}
+    doubts = [*never_seen(find_doubts(spec, modification))]
+    sentence = f"{stands.describe() or 'at rest'}: {sentence}"
+    return InferResult.write(out, files, sentence, **said, doubts=doubts, **about)
 
 
 def _follow(
@@ -256,10 +258,12 @@ def _follow(
         flicker.add(view, frame.inputs.depth[0].cpu().numpy(), shown)
 
 
-def _show_images(images: Iterator[tuple[F32, float]], count: int, out: Path, fps: float, what: str) -> InferResult:
+def _show_images(
+    images: Iterator[tuple[F32, float]], count: int, out: Path, fps: float, what: str
+) -> tuple[list[Path], str, dict[str, Any]]:
     """Write exposed images as they come, each with the seconds that it took, and the animation of them.
 
-    `what` says what their time was for.
+    `what` says what their time was for. Returns the files, what is said of them, and the same for JSON.
     """
     with store_errors("make the folder of the pictures", out):
         out.mkdir(parents=True, exist_ok=True)
@@ -270,7 +274,8 @@ def _show_images(images: Iterator[tuple[F32, float]], count: int, out: Path, fps
         if not np.isfinite(image).all():
             raise IncompleteError(f"{file.stem} came out non-finite; move the camera a little")
         write_png(enlarge(image), file)
-    sentence = f"{format_count(count, 'frame')}, {1e3 * statistics.median(seconds):.1f} ms each {what}"
+    about = {"frames": count, "seconds": {"frame": (each_s := statistics.median(seconds))}}
+    sentence = f"{format_count(count, 'frame')}, {1e3 * each_s:.1f} ms each {what}"
     films = [out / "path.gif"]
     write_gif(files, films[0], fps)
     if find_spec(FFMPEG) is None:
@@ -278,7 +283,7 @@ def _show_images(images: Iterator[tuple[F32, float]], count: int, out: Path, fps
     else:
         films.append(out / "path.mp4")
         write_mp4(files, films[1], fps)
-    return InferResult((*files, *films), sentence)
+    return [*files, *films], sentence, about
 
 
 def _check_frames(run: TrainedRun, frames: Frames, spec: SceneSpec) -> None:

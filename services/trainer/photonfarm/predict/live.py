@@ -205,7 +205,7 @@ class Live:
         """Plan the configuration and the view as a sample. Raises NotAllowedError where viewers may not."""
         if not self.may_submit:
             raise NotAllowedError("nothing is planned here; `photonfarm live --may-submit` lets viewers do that")
-        return {"said": self.run.plan_sample(*self.run.stage(**_read(asked)))}
+        return {"said": str(self.run.plan_sample(*self.run.stage(**_read(asked))))}
 
 
 def _serve_file(path: Path) -> Callable[[], Answer]:

@@ -30,6 +30,7 @@ from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
 from photonfarm.farm.devices import AUTO, CPU
 from photonfarm.plan.chosen import Chosen
+from photonfarm.plan.request import sample_key
 from photonfarm.scene.arrangement import Shot, find_doubts
 from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces, rest
 from photonfarm.scene.spec import WITHOUT_SHADOWS
@@ -37,6 +38,7 @@ from photonfarm.scene.spec_loading import locate
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import Store
 from photonfarm.store.model.lease import announce_work
+from photonfarm.store.read.find import Query, find_samples
 from photonfarm.trainer.data.batch import choose_kept_pixels
 from photonfarm.trainer.networks.inputs import (
     SURFACE,
@@ -89,6 +91,20 @@ class Frame:
     def doubts(self) -> tuple[str, ...]:
         """What the network never saw, each a sentence, as `photonfarm infer` says it; rays are traced to find some."""
         return (*self.beyond, *self.look_closer())
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedSample:
+    """A sample that a view was planned as."""
+
+    row: int
+    new: bool  # planned now, and not before
+    complete: bool
+
+    def __str__(self) -> str:
+        """The sample in words."""
+        when, then = "" if self.new else " before", ", which is complete" if self.complete else ""
+        return f"planned as a sample{when}, row {self.row}{then}"
 
 
 class OpenRun:
@@ -193,14 +209,17 @@ class OpenRun:
         _, view = self.stage(configuration, view, **asked)
         return render_truth(self._scene, view_key(self._key, view.vector), view, amount)
 
-    def plan_sample(self, configuration: Modification, view: View) -> str:
-        """Plan it in the store as a sample that was chosen by hand, which workers find; says whether that is new."""
+    def plan_sample(self, configuration: Modification, view: View) -> PlannedSample:
+        """Plan it in the store as a sample that was chosen by hand, which workers find."""
         if self.store is None:
             raise SpecError(f"{self._run.folder}: a network on its own has no store to plan a sample in")
         stored = self.store.scene(self.scene_id)
         with announce_work(stored.storage, self.scene_id, "predict", log.warning):
-            planned = stored.plan(Chosen.of(self.spec, configuration, view))
-        return "planned as a sample" if planned.new else "planned as a sample before"
+            planned = stored.plan(chosen := Chosen.of(self.spec, configuration, view))
+        (shot,) = chosen.shots
+        key = sample_key(self.spec.radiance_id, shot.apply(self.spec), shot.view(self.spec).vector, 0)
+        (found,) = find_samples(self.store, [self.scene_id], Query(sample=key)).samples
+        return PlannedSample(found.row, planned.new > 0, found.complete)
 
     def draw_plan(self) -> FloorPlan:
         """The room from above; the scene comes to rest."""

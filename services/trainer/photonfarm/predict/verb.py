@@ -14,18 +14,20 @@ import click
 from photonfarm.cli.options import (
     address_options,
     arrangement_options,
+    json_option,
     shot_file_options,
     start_options,
     store_option,
 )
 from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.waiting import tell_waiting
+from photonfarm.renderer.cli.sample_verbs import parse_amount
 from photonfarm.trainer.cli.evaluation_verbs import device_option
 
 if TYPE_CHECKING:
-    from photonfarm.predict.infer import InferResult
+    from photonfarm.predict.infer_result import InferResult
+    from photonfarm.renderer.jobs.truth import Amount
     from photonfarm.scene.arrangement import Shot
-    from photonfarm.trainer.predictors.trained import TrainedRun
 
 
 LIVE_PORT = 8430
@@ -41,11 +43,11 @@ run_option = click.option(
 )
 
 
-def _refuse_store(run: TrainedRun, **asked: object) -> None:
+def _refuse_store(run: Path, **asked: object) -> None:
     """Refuse options that need a store, for a network on its own."""
-    if run.packed is not None and (given := [name for name, value in asked.items() if value not in (None, False)]):
+    if run.is_file() and (given := [name for name, value in asked.items() if value not in (None, False)]):
         options = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise click.UsageError(f"{options}: {run.folder} is a network on its own, and there is no store to look in")
+        raise click.UsageError(f"{options}: {run} is a network on its own, and there is no store to look in")
 
 
 @click.command()
@@ -55,7 +57,9 @@ def _refuse_store(run: TrainedRun, **asked: object) -> None:
 @arrangement_options()
 @click.option(
     "--truth",
+    "amount",
     metavar="SPP|TIME|ERROR",
+    callback=parse_amount,
     help="Render it by bdpt beside the network's image: with so many samples per pixel (256), for so long (20s), or "
     "until its own squared error is so small a share of its mean square (0.1%).",
 )
@@ -78,13 +82,14 @@ def _refuse_store(run: TrainedRun, **asked: object) -> None:
 @click.option("--fps", type=click.FloatRange(1, 50), default=12.0, show_default=True, help="Frames a second of a path.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
 @device_option
+@json_option
 def infer(
     store: str | Path,
     run: Path,
     row: int | None,
     like: str | None,
     asked: Shot,
-    truth: str | None,
+    amount: Amount | None,
     store_it: bool,
     cameras: Path | None,
     configurations: Path | None,
@@ -94,26 +99,19 @@ def infer(
     fps: float,
     out: Path,
     device: str,
+    as_json: bool,
 ) -> None:
     """Show a trained network's image of any configuration and camera, of a stored sample, or along a camera path.
 
     What stands where is said by names; all others stay at rest, or as --row or --like has them. --row alone shows the
     sample that is stored. Inputs are rendered where the renderer is installed; for a path, a file may have them. PNG,
-    NPZ, JSON and, with the package OpenEXR, EXR; of a path PNG, GIF and, with the extra `video`, MP4.
+    NPZ, JSON and, with the package OpenEXR, EXR; of a path PNG, GIF, JSON and, with the extra `video`, MP4.
 
     --configurations and --cameras show all that files say, each in a folder: a configuration by its own camera, or by
-    all of --cameras, or by that of the other options.
+    all of --cameras, or by that of the other options. --json prints what frame.json holds, and of several a list.
     """
-    from photonfarm.plan.chosen import Chosen
-    from photonfarm.predict import infer as shows
-    from photonfarm.predict.opened_run import OpenRun, require_renderer
-    from photonfarm.renderer.jobs.truth import Amount
     from photonfarm.scene.arrangement import Arrangement, Shot
     from photonfarm.scene.camera_path import CameraPath, Frames
-    from photonfarm.scene.modification import rest
-    from photonfarm.scene.shot_files import read_shots
-    from photonfarm.store.read.find import find_start
-    from photonfarm.trainer.predictors.trained import TrainedRun
 
     began = time.perf_counter()
     files = cameras or configurations
@@ -121,74 +119,77 @@ def infer(
     kinds = {"--camera-path": path, "--orbit": orbit, "--buffers": buffers}
     kinds |= {"--cameras" if cameras else "--configurations": files}
     given = [name for name, value in kinds.items() if value is not None]
-    of_frame: dict[str, object] = {"--store-it": store_it or None, "--truth": truth if buffers else None}
+    of_frame: dict[str, object] = {"--store-it": store_it or None, "--truth": amount if buffers else None}
     if given != ["--configurations"]:
         of_frame |= {"--camera": asked.camera, "--look-at": asked.look_at, "--fov": None if files else asked.fov}
     alone = [name for name, value in of_frame.items() if value is not None]
-    arranged = like is not None or asked != Shot() or truth is not None or store_it
+    arranged = like is not None or asked != Shot() or amount is not None or store_it
     if len(given) > 1 or (given and alone) or (buffers is not None and (arranged or row is not None)):
         others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
         raise click.UsageError(f"{' and '.join(others)} exclude each other")
-    amount = None if truth is None else Amount.parse(truth)
+    _refuse_store(run, row=row, like=like, store_it=store_it)
     along = orbit or (CameraPath.load(path) if path else None)
     if isinstance(along, CameraPath):
         along.sample()  # a faulty one is refused before anything is loaded
-    trained = TrainedRun.load(run)
-    _refuse_store(trained, row=row, like=like, store_it=store_it)
-    say = partial(click.echo, err=True)
-    if along is not None:
+    from photonfarm.plan.chosen import Chosen
+    from photonfarm.predict import infer as shows
+    from photonfarm.predict.infer_result import list_made, remove_made
+    from photonfarm.predict.opened_run import OpenRun, require_renderer
+    from photonfarm.scene.shot_files import read_shots
+    from photonfarm.store.read.find import find_start
+    from photonfarm.trainer.predictors.trained import TrainedRun
+
+    trained, before = TrainedRun.load(run), list_made(out)
+    shown: list[InferResult] = []
+
+    def tell(result: InferResult, where: str = "") -> None:
+        """Keep a result, and say it, unless all are said as JSON in the end."""
+        shown.append(result)
+        for doubt in result.about["doubts"]:
+            click.echo(f"warning: {where}{doubt}", err=True)
+        if not as_json:
+            for line in (*result.files, f"{where}{result.sentence}"):
+                click.echo(line)
+
+    if buffers is not None:
+        tell(shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device))
+    elif row is not None and not arranged and not given:
+        tell(shows.show_sample(store, trained, row, out, device))
+    else:
         require_renderer(trained)
         from photonfarm.renderer.jobs.path_buffers import list_views
 
-        changes = Arrangement.of(**asked.model_dump(include=set(Arrangement.model_fields)))
-        spec = trained.scene(store).spec
-        begin, _ = find_start(store, trained.scene_id, row, like) or (None, None)
-        configuration, views = list_views(spec, changes, along, begin)
-        with tell_waiting(say, f"rendering {format_count(len(views), 'frame')} of {spec.name}"):
-            opened = OpenRun(trained, store, device)
-            result = shows.show_path(opened, configuration, views, out, fps=fps, amount=amount)
-    elif files is not None:
-        require_renderer(trained)
         spec = trained.scene(store).spec
         begin, camera = find_start(store, trained.scene_id, row, like) or (None, None)
-        changed, view = asked.apply(spec, begin), asked.view(spec, camera)
-        shots = read_shots(spec, cameras, configurations, changed, otherwise=view, fov=asked.fov)
-        with tell_waiting(say, f"rendering {format_count(len(shots), 'image')} of {spec.name}"):
+        configuration, view = asked.apply(spec, begin), asked.view(spec, camera)
+        shots = [(configuration, view)]
+        if along is not None:
+            changes = Arrangement.of(**asked.model_dump(include=set(Arrangement.model_fields)))
+            configuration, views = list_views(spec, changes, along, begin)
+            shots = [(configuration, each) for each in views]
+        elif files is not None:
+            shots = read_shots(spec, cameras, configurations, configuration, otherwise=view, fov=asked.fov)
+        elif store_it:
+            Chosen.of(spec, configuration, view)  # a view that no sample can have is refused before anything is loaded
+        count = f"{format_count(len(shots), 'image')} of " if given else ""
+        say = partial(click.echo, err=True)
+        with tell_waiting(say, f"rendering {count}{spec.name}"):
             opened = OpenRun(trained, store, device)
-            load_s = time.perf_counter() - began
-            made: list[Path] = []
-            for number, shot in enumerate(shots):
-                folder = out / f"frame-{number:04}"
-                shown = shows.show_frame(opened, Shot(), shot, folder, amount, load_s)
-                _tell(shown, f"{folder.name}: ")
-                made += shown.files
-        shows.remove_others(out, made, read)
-        return
-    elif buffers is not None:
-        result = shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device)
-    elif row is not None and not arranged:
-        result = shows.show_sample(store, trained, row, out, device)
-    else:
-        require_renderer(trained)
-        start = find_start(store, trained.scene_id, row, like)
-        asked.apply(spec := trained.scene(store).spec)  # a wrong name is refused before anything is loaded
-        if store_it and asked.fov is not None:
-            Chosen.of(spec, rest(spec), asked.view(spec))
-        with tell_waiting(say, f"rendering {spec.name}"):
-            opened = OpenRun(trained, store, device)
-            load_s = time.perf_counter() - began
-            result = shows.show_frame(opened, asked, start, out, amount, load_s, store_it=store_it)
-    _tell(result)
-    shows.remove_others(out, result.files, read)
+            say(f"loaded in {time.perf_counter() - began:.3g} s")
+            if along is not None:
+                tell(shows.show_path(opened, configuration, views, out, fps=fps, amount=amount))
+            for number, shot in enumerate(shots if along is None else []):
+                name = f"frame-{number:04}" if files else ""
+                result = shows.show_frame(opened, *shot, out / name, amount, store_it=store_it)
+                tell(result, f"{name}: " if files else "")
+    remove_made(before - {file for result in shown for file in result.files}, read)
+    if as_json:
+        from photonfarm.cli.show import print_json
 
-
-def _tell(result: InferResult, where: str = "") -> None:
-    """Print the files on standard output, and what is said of them on standard error."""
-    for doubt in result.doubts:
-        click.echo(f"warning: {where}{doubt}", err=True)
-    for file in result.files:
-        click.echo(file)
-    click.echo(f"{where}{result.sentence}", err=True)
+        print_json([result.document() for result in shown] if files else shown[0].document())
+    if store_it and not shown[0].about["planned"]["complete"]:
+        work = shlex.join(["photonfarm", "work", "--store", str(store), "--share", "0/1", "--until-complete"])
+        click.echo(f"workers render it; where none is at work, this does: {work}", err=True)
 
 
 @click.command()
@@ -220,13 +221,13 @@ def live(
     The network's picture follows each move; as soon as nothing moves, `bdpt` renders the truth, and the error between
     both stands below. Nothing is written without --may-submit. Ends on Ctrl-C.
     """
+    _refuse_store(run, may_submit=may_submit)
     from photonfarm.predict.live import Live
     from photonfarm.predict.opened_run import OpenRun
     from photonfarm.trainer.predictors.trained import TrainedRun
     from photonfarm.web.server import listen, serve
 
     trained, say = TrainedRun.load(run), partial(click.echo, err=True)
-    _refuse_store(trained, may_submit=may_submit)
     server = listen(host, port, names, usual=LIVE_PORT, warn=say)
     stored = "" if trained.packed else f"--store {shlex.quote(str(store))} "
     begins = f"photonfarm infer {stored}--run {shlex.quote(str(run))} --truth 256"

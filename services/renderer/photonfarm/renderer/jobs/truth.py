@@ -111,7 +111,8 @@ class Truth:
         """The mean squared error of an image against the clean one, radiance × exposure, the noise taken out.
 
         The image is an array or a tensor, (H, W, 3), linear radiance, and must not have seen the truth. The standard
-        error is that of the truth's noise, by the jackknife over its parts. Raises SpecError for another shape.
+        error is that of the truth's noise, by the jackknife over its parts; of one part it is not known. Raises
+        SpecError for another shape.
         """
         given = np.asarray(radiance.detach().cpu() if hasattr(radiance, "detach") else radiance)
         if given.shape != self.parts.shape[2:]:
@@ -123,6 +124,8 @@ class Truth:
             return clean_error(image, *(left / passes).astype(np.float32))
 
         count = int(self.passes.sum())
+        if len(self.passes) == 1:
+            return Estimate(measure(total, count), None, 1)
         without = [
             measure(total - own * part, count - own) for own, part in zip(self.passes.tolist(), parts, strict=True)
         ]
@@ -297,12 +300,6 @@ def load_named(store: str | Path, named: str) -> SceneSpec:
     return spec.model_copy(update={"scene": spec.scene.model_copy(update={"file": str(folder / str(spec.scene.file))})})
 
 
-def check_suffix(file: Path) -> None:
-    """Raise SpecError for a name that is of no kind of file that an image is written as."""
-    if file.suffix not in SUFFIXES:
-        raise SpecError(f"--out {file}: names of {', '.join(SUFFIXES)} files are allowed")
-
-
 def write_halves(
     file: Path, halves: F32, exposure: float, about: dict[str, Any], groups: NDArray[np.int16] | None = None
 ) -> None:
@@ -329,23 +326,23 @@ def write_halves(
 def write_beside(
     out: Path,
     prediction: F32,
-    groups: NDArray[np.int16],
+    groups: NDArray[np.int16] | None,
     truth: Truth | None,
     exposure: float,
-    about: dict[str, Any],
+    name: str = "truth",
 ) -> list[Path]:
     """Write a network's image, (H, W, 3), linear radiance, and the truth beside it, into a folder; returns the files.
 
     Pictures are as a display shows them, and of the difference red where the network is too bright, blue where it is
-    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance, and the `groups`,
-    (H, W), as `LoadedScene.find_groups` has them; frame.json is `about`.
+    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance, and the `groups`, (H, W), as
+    `LoadedScene.find_groups` has them. The truth goes by a `name`.
     """
-    layers: dict[str, NDArray[Any]] = {"prediction": prediction, "group": groups}
+    layers: dict[str, NDArray[Any]] = {"prediction": prediction} | ({} if groups is None else {"group": groups})
     shown = {"prediction": pictures.enlarge(prediction * np.float32(exposure))}
     if truth is not None:
         clean = truth.radiance
-        layers |= {"truth": clean, "A": truth.halves[0], "B": truth.halves[1], "difference": prediction - clean}
-        shown["truth"] = pictures.enlarge(clean * np.float32(exposure))
+        layers |= {name: clean, "A": truth.halves[0], "B": truth.halves[1], "difference": prediction - clean}
+        shown[name] = pictures.enlarge(clean * np.float32(exposure))
         shown["difference"] = pictures.draw_difference(*(image * np.float32(exposure) for image in (prediction, clean)))
     with store_errors("make the folder of the pictures", out):
         out.mkdir(parents=True, exist_ok=True)
@@ -356,6 +353,4 @@ def write_beside(
     if importlib.util.find_spec("OpenEXR") is not None:
         write_layers(out / "frame.exr", {"": prediction, **layers}, {})
         files.append(out / "frame.exr")
-    with store_errors("write the figures", out / "frame.json"), whole_file(out / "frame.json") as part:
-        part.write_text(json.dumps(about, indent=1) + "\n")
-    return [*files, out / "frame.npz", out / "frame.json"]
+    return [*files, out / "frame.npz"]

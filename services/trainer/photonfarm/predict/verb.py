@@ -128,6 +128,7 @@ def infer(
         others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
         raise click.UsageError(f"{' and '.join(others)} exclude each other")
     _refuse_store(run, row=row, like=like, store_it=store_it)
+    frames = Frames.read(buffers) if buffers else None
     along = orbit or (CameraPath.load(path) if path else None)
     if isinstance(along, CameraPath):
         along.sample()  # a faulty one is refused before anything is loaded
@@ -151,8 +152,8 @@ def infer(
             for line in (*result.files, f"{where}{result.sentence}"):
                 click.echo(line)
 
-    if buffers is not None:
-        tell(shows.show_frames(store, trained, Frames.read(buffers), out, fps=fps, device=device))
+    if frames is not None:
+        tell(shows.show_frames(store, trained, frames, out, fps=fps, device=device))
     elif row is not None and not arranged and not given:
         tell(shows.show_sample(store, trained, row, out, device))
     else:

@@ -74,7 +74,7 @@ if TYPE_CHECKING:
     metavar="OPTION",
     help="As --sbatch, for the trainer's job alone: --train-sbatch=--partition=gpu.",
 )
-@click.option("--dry-run", is_flag=True, help="Print the scripts, and write and submit nothing.")
+@click.option("--dry-run", is_flag=True, help="Print the scripts, with a rough cost, and write and submit nothing.")
 @json_option
 def slurm(
     specs: tuple[str, ...],
@@ -106,7 +106,10 @@ def slurm(
     named = [NamedSpec.load(spec) for spec in specs]
     scripts = make_scripts(named, store, queue_url, asked)
     if dry_run:
-        click.echo("\n".join(scripts.values()), nl=False)
+        from photonfarm.farm.dry_run import describe_roughly
+
+        costs = [f"# {describe_roughly(each.spec, request, asked.workers, on_cards=asked.gpus)}" for each in named]
+        click.echo("\n".join(scripts.values()).replace("\n", "\n".join(["", *costs, ""]), 1), nl=False)
         return
     check_slurm()
     from photonfarm.farm.hold_out_checks import find_hold_out_warning

@@ -7,12 +7,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from photonfarm.core.errors import BackendError
+from photonfarm.core.formatting import format_bytes, format_count
 from photonfarm.core.processes import usable_cores
+from photonfarm.core.waiting import format_span
 from photonfarm.farm.renderer_verbs import measure_costs
 from photonfarm.farm.submission import Submission, estimate_sample_seconds
 from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import SHARD_ROWS, Extent, Request
 from photonfarm.plan.sample_costs import Allocation, CostModel, SampleCosts
+from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.store import Store
 from photonfarm.store.format.schema import bytes_of_rows
@@ -53,6 +56,22 @@ class DryRun(Submission):
     suggestion: Suggestion | None = field(default=None, kw_only=True)  # that allocation, if it is worth a change
 
 
+def describe_roughly(spec: SceneSpec, request: Request, workers: int, *, on_cards: bool) -> str:
+    """The samples of a request, their size and their time, in a line; nothing is measured, nor looked up in a store."""
+    samples, seconds = request.samples, estimate_sample_seconds(spec, on_card=on_cards) * request.samples / workers
+    return (
+        f"{spec.name}: {format_count(samples, 'sample')}, those planned before among them; at most "
+        f"{format_bytes(_size(spec, samples, request.extent(spec)))} before compression; about {format_span(seconds)} "
+        f"on {format_count(workers, 'worker')}, or up to three times more or less"
+    )
+
+
+def _size(spec: SceneSpec, samples: int, extent: Extent) -> int:
+    """The bytes of samples with their views and configurations, before compression."""
+    of = bytes_of_rows(spec)
+    return of["sample"] * samples + of["view"] * extent.views + of["modification"] * extent.modifications
+
+
 def rehearse(
     named: NamedSpec,
     store: str | Path,
@@ -80,8 +99,7 @@ def rehearse(
         new, known, extent = chosen.new, chosen.known, chosen.extent
     else:
         new, known, extent = request.samples, 0, request.extent(spec)
-    of, cores = bytes_of_rows(spec), workers or usable_cores()
-    size = of["sample"] * new + of["view"] * extent.views + of["modification"] * extent.modifications
+    size, cores = _size(spec, new, extent), workers or usable_cores()
     counted = replace(
         DryRun(spec.scene_id, None, new, known, None, True, extent=extent, size_bytes=size, cores=cores),
         workers=workers,

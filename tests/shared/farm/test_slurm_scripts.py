@@ -38,6 +38,8 @@ def test_a_dry_run_prints_an_array_of_shares_and_writes_nothing(slurm: Launcher,
     assert not [option for option in asked if option.startswith("--gres")]
     assert '--share "$SLURM_ARRAY_TASK_ID/6" cornell room &' in done.stdout
     assert f"export PHOTONFARM_STORE={tmp_path}/store" in done.stdout
+    for spec, comment in zip(("cornell", "room"), done.stdout.splitlines()[1:], strict=False):
+        assert re.fullmatch(rf"# {spec}: 256 samples, .* at most [0-9.]+ MB .* about .* on 6 workers, .*", comment)
     assert list(tmp_path.iterdir()) == []
     assert subprocess.run(["bash", "-n"], input=done.stdout, text=True, check=False).returncode == 0
 

@@ -188,6 +188,7 @@ class Live {
       if (group.turn) slide("turn", group.turn, () => this.turn, group.name);
       if (group.power) slide("power", group.power, () => this.power, group.name);
       for (const show of group.show) show();
+      row.hidden = !group.show.length; // what is only dragged
       row.append(name, there, more);
       return row;
     }));

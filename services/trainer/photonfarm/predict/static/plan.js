@@ -1,6 +1,7 @@
 // The room from above: points of its surfaces, and what can be dragged.
 
 const GRAB = 16; // px
+const CAMERA = "#5fd39a";
 
 export class Plan {
   constructor(canvas, live) {
@@ -63,11 +64,13 @@ export class Plan {
       if (this.pictures) this.lay(context, this.pictures.groups[i], group.at, live.place[group.name], live.turn[group.name]);
       context.globalAlpha = 1;
     });
-    for (const group of live.room.groups) {
-      if (this.held?.group === group) this.frame(context, group.box);
-      this.mark(context, this.to(live.place[group.name]), group.light ? "#ffc35c" : "#7cb0ff", live.without.has(group.name), group.name);
-    }
+    if (this.held?.group) this.frame(context, this.held.group.box);
     this.paintCamera(context);
+    const marks = live.room.groups.map(({ name, light }) => [this.to(live.place[name]), light ? "#ffc35c" : "#7cb0ff", live.without.has(name), name]);
+    marks.push([this.to(live.camera), CAMERA, false, "camera"], [this.to(live.target), CAMERA, true, ""]);
+    for (const mark of marks) this.mark(context, ...mark);
+    const taken = marks.map(([[x, y]]) => [x - 6 * this.ratio, y + 4 * this.ratio, 12 * this.ratio]);
+    for (const [at, , , text] of marks) this.write(context, at, text, taken);
   }
 
   // A picture of the plan's extent, so that the place `from` of it comes to `to`, turned about that.
@@ -90,7 +93,7 @@ export class Plan {
     context.setLineDash([]);
   }
 
-  mark(context, [x, y], colour, hollow, text) {
+  mark(context, [x, y], colour, hollow) {
     context.beginPath();
     context.arc(x, y, 6 * this.ratio, 0, 7);
     context.lineWidth = 2 * this.ratio;
@@ -98,12 +101,22 @@ export class Plan {
     context.fillStyle = colour;
     if (!hollow) context.fill();
     context.stroke();
+  }
+
+  // A name beside its mark, on the first side where it covers nothing that is `taken`: [left, base line, width] of each.
+  write(context, [x, y], text, taken) {
     context.font = `${12 * this.ratio}px system-ui, sans-serif`;
     context.strokeStyle = "#0b0e13";
     context.fillStyle = "#ffffff";
     context.lineWidth = 3 * this.ratio;
-    context.strokeText(text, x + 10 * this.ratio, y + 4 * this.ratio);
-    context.fillText(text, x + 10 * this.ratio, y + 4 * this.ratio);
+    const wide = context.measureText(text).width, side = 10 * this.ratio, base = y + 4 * this.ratio;
+    const sides = [[x + side, base], [x - side - wide, base], [x - wide / 2, base - 15 * this.ratio], [x - wide / 2, base + 15 * this.ratio]];
+    const isFree = ([left, line]) => left >= 0 && left + wide <= this.canvas.width
+      && taken.every(([other, its, width]) => left + wide < other || other + width < left || Math.abs(line - its) >= 14 * this.ratio);
+    const [left, line] = sides.find(isFree) ?? sides[0];
+    taken.push([left, line, wide]);
+    context.strokeText(text, left, line);
+    context.fillText(text, left, line);
   }
 
   paintCamera(context) {
@@ -113,16 +126,14 @@ export class Plan {
     context.moveTo(...from);
     for (const side of [-half, half]) context.lineTo(from[0] + long * Math.cos(angle + side), from[1] + long * Math.sin(angle + side));
     context.closePath();
-    context.fillStyle = "#5fd39a50";
+    context.fillStyle = `${CAMERA}50`;
     context.fill();
     context.beginPath();
     context.moveTo(...from);
     context.lineTo(...to);
-    context.strokeStyle = "#5fd39a80";
+    context.strokeStyle = `${CAMERA}80`;
     context.lineWidth = this.ratio;
     context.stroke();
-    this.mark(context, from, "#5fd39a", false, "camera");
-    this.mark(context, to, "#5fd39a", true, "");
   }
 
   // What lies under a pointer, the nearest first: groups before the camera, as these are smaller.

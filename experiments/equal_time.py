@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
 """Error against the time of a frame, everything charged: ours beside denoisers that take as long.
 
-    python experiments/equal_time.py NAME [--size small] [--work build/experiments]
+    python experiments/equal_time.py NAME … [--size small] [--work build/experiments] [--picture FILE.png]
 
-prints every row of an experiment that has run, or of a look at it (run.py, `--networks`).
+prints of experiments that have run, or of looks at them (run.py, `--networks`), ours beside the best denoiser of each
+moment, and most rows; the picture has all.
 
 Time is that of editing the scene, buffers, guides, photons, what is rendered, and the network. A family is one way to
 make an image of more or fewer samples, such as a denoiser in its qualities: of it count those that nothing quicker has
@@ -34,7 +35,7 @@ from experiments.experiment import Experiment, SizeName
 from experiments.rooms import Room
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.metrics.image_metrics import format_with_interval
+from photonfarm.trainer.metrics.image_metrics import confidence_interval
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -54,6 +55,11 @@ FAMILIES = {
     r"path .*": "path",
 }
 """The names of a family's rows, as a regular expression, and what it is called."""
+
+DENOISERS = tuple(FAMILIES)[:3]
+
+LEFT_OUT = re.compile(r".* (2/1|8/1|1/\d\d?)(?<! 1/1)")
+"""The names of rows that tables of all rows leave out, so that they can be read."""
 
 LOOKS = {"s": "-", "o": "--", "^": "-", "x": ":", "+": "-."}
 """How each family is drawn: its markers and its line."""
@@ -155,13 +161,52 @@ def measure_ratio(ours: Placed, theirs: AtTime) -> tuple[float, float, float]:
     return float(ratios[0]), float(low), float(high)
 
 
-def format_rows(room: Room) -> str:
-    """Every row of a room that was timed and has errors: its time and its error with the 95 % interval."""
+def format_rows(rooms: Sequence[Room]) -> str:
+    """Rows that were timed and have errors: in each room the error, half its 95 % interval, and (ms a frame)."""
+    shown = [[name for name in room.rows if not LEFT_OUT.fullmatch(name)] for room in rooms]
+    placed = [{each.name: each for each in place_rows(*each)} for each in zip(rooms, shown, strict=True)]
     lines = [
-        [each.name, f"{each.milliseconds:.0f}", format_with_interval(Estimate.of(each.errors), 5)]
-        for each in place_rows(room, list(room.rows))
+        [name, *(_format_error(of_room.get(name)) for of_room in placed)]
+        for name in dict.fromkeys(name for room in rooms for name in room.rows)
+        if any(name in of_room for of_room in placed)
     ]
-    return format_markdown_table(["row", "ms a frame", "MSE (95 %)"], lines)
+    return format_markdown_table(["MSE ± 95 % (ms)", *(room.name for room in rooms)], lines)
+
+
+def _format_error(placed: Placed | None) -> str:
+    if placed is None:
+        return ""
+    interval = confidence_interval(Estimate.of(placed.errors))
+    reach = f" ± {interval[1] - placed.mse:.5f}" if interval else ""
+    return f"{placed.mse:.5f}{reach} ({placed.milliseconds:.0f})"
+
+
+def format_best(rooms: Sequence[Room], networks: Sequence[str]) -> str:
+    """Rows of ours in each room: error, time, and that error over the least of any denoiser after the same time."""
+    lines = []
+    for room in rooms:
+        placed = {each.name: each for each in place_rows(room, networks)}
+        lines.append([room.name, *(_format_best(room, placed[name]) if name in placed else "" for name in networks)])
+    return format_markdown_table(["room", *networks], lines)
+
+
+def _format_best(room: Room, ours: Placed) -> str:
+    families = [order_family(room, names) for names in DENOISERS]
+    reached = [
+        (measure_ratio(ours, theirs)[0], members)
+        for members in families
+        if (theirs := interpolate(members, ours.milliseconds))
+    ]
+    if reached:
+        share = _format_ratio(ours, max(reached, key=lambda each: each[0])[1])
+    else:
+        first = min((members[0] for members in families if members), key=lambda each: each.milliseconds)
+        later, (ratio, low, high) = (
+            first.milliseconds - ours.milliseconds,
+            measure_ratio(ours, AtTime(first, first, 0.0)),
+        )
+        share = f"first, {first.name} comes {later:.0f} ms later: {ratio:.2f} ({low:.2f} … {high:.2f})"
+    return f"{ours.mse:.5f}, {ours.milliseconds:.0f} ms: {share}"
 
 
 def format_table(rooms: Sequence[Room]) -> str:
@@ -224,24 +269,31 @@ def _draw(axes: Axes, room: Room) -> None:
     for run, of_run in group_networks(room, NETWORKS).items():
         if members := place_rows(room, of_run):
             places = [each.milliseconds for each in members], [each.mse for each in members]
-            look = "D-" if run == (network := find_network(run)) else "D:"
-            axes.plot(*places, look, markersize=5, color=colours[NETWORKS.index(network)], label=run)
+            look, fill = ("D:", "none") if run == (network := find_network(run)) else ("D-", "full")  # longer: whole
+            axes.plot(*places, look, fillstyle=fill, markersize=5, color=colours[NETWORKS.index(network)], label=run)
     axes.margins(0.09, 0.1)
     axes.set(title=room.name, xlabel="ms a frame, all charged", ylabel="MSE", xscale="log", yscale="log")
     set_plain_ticks(axes)
 
 
 def main() -> int:
-    """Print the rows of an experiment; returns the exit code."""
+    """Print what is known of some experiments; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name")
+    parser.add_argument("names", nargs="+", metavar="NAME")
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
     parser.add_argument("--work", type=Path, default=results.ROOT / "build/experiments", help="(build/experiments)")
+    parser.add_argument("--ours", nargs="+", metavar="ROW", help="which rows of ours (all)")
+    parser.add_argument("--picture", type=Path, metavar="FILE", help="where to draw all of it, as PNG")
     told = parser.parse_args()
-    report = told.work / told.size / told.name / "report/report.json"
-    runs = [run["name"] for run in json.loads(report.read_text(encoding="utf-8"))["runs"]]
-    room = Room.read(Experiment.load(told.name, told.size).only(runs), report, results.commit())
-    print(f"{format_rows(room)}\n\n{format_table([room])}")
+    rooms = []
+    for name in told.names:
+        report = told.work / told.size / name / "report/report.json"
+        runs = [run["name"] for run in json.loads(report.read_text(encoding="utf-8"))["runs"]]
+        rooms.append(Room.read(Experiment.load(name, told.size).only(runs), report, results.commit()))
+    known = (name for room in rooms for of_run in group_networks(room, OURS).values() for name in of_run)
+    print(f"{format_best(rooms, told.ours or [*dict.fromkeys(known)])}\n\n{format_rows(rooms)}")
+    if told.picture:
+        told.picture.write_bytes(draw_picture(rooms))
     return 0
 
 

@@ -82,7 +82,28 @@ def test_a_family_is_all_ways_to_feed_it_less_those_that_something_quicker_is_be
         "bdpt": [],
         "path": [],
     }
-    assert equal_time.format_rows(room).splitlines()[2].startswith("| oidn-fast 1/1 | 1500 | 0.06")
+    rows = equal_time.format_rows([room, make_room({"denoise_1": (1, 2)})]).splitlines()[2:]
+    assert rows[0].startswith("| oidn 1/1 | 0.03000 ± 0.127")
+    assert rows[0].endswith(" (3500) |  |")
+    assert [row.split(" | ")[0][2:] for row in rows] == [name for name in times if " 2" not in name]
+
+
+def test_ours_stands_beside_the_best_of_all_denoisers_or_beside_the_first_of_them() -> None:
+    times = {
+        "guided_transport": (1.5, 1),
+        "oidn-fast 1/1": (1.4, 4),
+        "oidn-fast-reflectance 1/1": (1.5, 2),
+        "denoise_1": (2, 1),
+    }
+    (line,) = equal_time.format_best([make_room(times)], ["guided_transport"]).splitlines()[2:]
+    assert line == "| night-living-room | 0.03000, 2000 ms: 0.50 (0.50 … 0.50) |"
+    (line,) = equal_time.format_best(
+        [make_room({**times, "guided_transport": (1, 1)})], ["guided_transport", "guided"]
+    ).splitlines()[2:]
+    assert (
+        line
+        == "| night-living-room | 0.03000, 1500 ms: first, oidn-fast 1/1 comes 400 ms later: 0.25 (0.25 … 0.25) |  |"
+    )
 
 
 def test_rows_of_ours_are_grouped_by_run_whatever_the_steps_and_the_halves() -> None:

@@ -9,6 +9,7 @@ import torch
 
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError
 from photonfarm.trainer import service
+from photonfarm.trainer.predictors.trained import TrainedRun
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import CHECKPOINT, INITIAL, METRICS, read_log, read_settings
 from photonfarm.trainer.training.loop import Hooks, train
@@ -51,13 +52,21 @@ def test_a_run_begins_with_the_weights_that_another_predicts_by(begin: Callable[
 def test_a_start_that_was_trained_on_what_is_held_out_now_is_said(
     begin: Callable[..., Path], make_source: Callable[..., Any], tiny: Callable[..., Any], tmp_path: Path
 ) -> None:
-    first = begin("first", hold_out=0.25)
-    for name, photons, share, knows in (("same", 0, 0.25, False), ("more", 0, 0.5, True), ("other", 8, 0.5, False)):
-        settings = tiny(network=NETWORK, max_steps=1, average=0.9, hold_out=share, start_from=str(first))
+    begin("first", hold_out=0.25)
+    for name, before, photons, share, knows in (
+        ("same", "first", 0, 0.25, False),
+        ("more", "first", 0, 0.5, True),
+        ("still", "more", 0, 0.5, True),
+        ("other", "first", 8, 0.5, False),
+        ("back", "other", 0, 0.5, True),
+    ):
+        start = str(tmp_path / before)
+        settings = tiny(network=NETWORK, max_steps=1, average=0.9, hold_out=share, start_from=start)
         said: list[str] = []
         train(make_source(24, photons=photons), settings, tmp_path / name, Hooks(on_wait=said.append))
         assert read_log(tmp_path / name / METRICS)[0]["knows_held_out"] == knows
-        assert any("held out 0.25" in sentence for sentence in said) == knows
+        assert any("hold_out = 0.25" in sentence for sentence in said) == knows
+        assert TrainedRun.load(tmp_path / name).hold_out == (0.25 if knows else share)
 
 
 def test_descriptors_of_another_scenes_points_begin_anew(begin: Callable[..., Path]) -> None:

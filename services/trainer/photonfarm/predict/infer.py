@@ -135,7 +135,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     parts, spp = sample.radiance[None].astype(np.float64), 2 * spec.transport.half_spp
     target = Truth(parts, np.ones(1, np.int64), spp, 0.0, spec.exposure)
     shot = spec, sample.modification, sample.view
-    (is_held_out,) = rows_held_out(source, [row], run.settings.hold_out)
+    (is_held_out,) = rows_held_out(source, [row], run.hold_out)
     about: dict[str, Any] = {
         "scene": run.scene_id,
         **list_shot(*shot),

@@ -169,7 +169,7 @@ def compare(
     choose: Choose | None = None,
     beside: Callable[[SceneReader], Sequence[Predictor]] | None = None,
 ) -> Evaluation:
-    """Compare runs, and ready denoisers, on the first `most` views that no run was trained on.
+    """Compare runs, and ready denoisers, on the first `most` views that none of their weights was trained on.
 
     Each view is measured once, by its first sample, however many passes of it there are. Denoisers and networks of
     halves are also given the mean of so many `halves`, of views that have so many passes, in errors alone. References
@@ -182,7 +182,7 @@ def compare(
     first, place = runs[0], usable_device(device)
     _check_same_scene(runs)
     torch.set_num_threads(first.settings.threads)
-    samples = HeldOutSamples.of(first.source(store), min(run.settings.hold_out for run in runs), most)
+    samples = HeldOutSamples.of(first.source(store), min(run.hold_out for run in runs), most)
     spec = samples.source.spec
     for _, kept in denoisers:
         count_kept(spec, kept)

@@ -24,7 +24,7 @@ from photonfarm.trainer.predictors.half_filter import HalfFilter, uses_denoiser
 from photonfarm.trainer.predictors.network_file import PackedScene, note_training, read_network
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.devices import usable_device
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings, read_shares
 from photonfarm.trainer.runs.settings import ReadyDenoiser, TrainSettings
 from photonfarm.trainer.runs.user_code import is_own, name_in_errors
 
@@ -63,6 +63,11 @@ class TrainedRun:
         weights = average["weights"] if (average := state.get("average")) else state["network"]
         of_scene = str(state["scene_id"]), float(state["exposure"])
         return cls(folder, settings, *of_scene, weights, trained=note_training(state))
+
+    @property
+    def hold_out(self) -> float:
+        """The share of its scene that neither it was trained on, nor the runs that its weights began with."""
+        return min(self.settings.hold_out, read_shares(self.folder).get(self.scene_id, 1))
 
     def source(self, store: str | Path) -> SceneReader:
         """The samples of its scene in a store, exposed as they were when the run began."""

@@ -188,6 +188,12 @@ def read_log(path: Path) -> list[dict[str, Any]]:
         return [_parse_record(line, path) for line in _read_lines(path) if line.endswith(b"\n")]
 
 
+def read_shares(run: Path) -> dict[str, float]:
+    """What the runs that a run's weights began with held out of each scene at the least; {} if they began at random."""
+    first = [_parse_record(line, run / METRICS) for line in _read_lines(run / METRICS)[:1]]
+    return first[0].get("hold_out", {}) if first and first[0]["kind"] == "start" else {}
+
+
 SHOWN = 4  # the most views
 MOST = 24  # the most pictures kept; beyond, every second one goes, so that early ones become rare
 _NAME = re.compile(r"step-(\d{8})\.png")

@@ -9,7 +9,7 @@ from typing import Any
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import differing
 from photonfarm.trainer.runs import checkpoint
-from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings
+from photonfarm.trainer.runs.run_folder import CHECKPOINT, read_settings, read_shares
 from photonfarm.trainer.runs.settings import TrainSettings
 from photonfarm.trainer.training.learner import Learner
 
@@ -62,8 +62,8 @@ def start_from(
 ) -> dict[str, Any]:
     """Give an untrained learner the weights by which the run `settings.start_from` predicts; all else begins anew.
 
-    Descriptors of points begin anew too, unless the run is of this scene and has as many points. `warn` is told if the
-    run was trained on what is held out now. Returns what the log says of it. Raises StoreError if there is no such run;
+    Descriptors of points begin anew too, unless the run is of this scene and has as many points. `warn` is told if they
+    were trained on what is held out now. Returns what the log says of it. Raises StoreError if there is no such run;
     SpecError, with each setting that differs, if its weights are of another network.
     """
     run = Path(str(settings.start_from))
@@ -79,11 +79,13 @@ def start_from(
         _name_differences(run, state, settings, changed)
         raise SpecError(f"start_from = {str(run)!r}: its weights do not fit the network as its code is now")
     learner.begin_with(weights)
-    share = state["settings"]["hold_out"]
-    if knows := state["scene_id"] == scene_id and share < settings.hold_out:
+    before, of_scene = read_shares(run), state["scene_id"]
+    shares = {**before, of_scene: min(state["settings"]["hold_out"], before.get(of_scene, 1))}
+    if knows := (share := shares.get(scene_id, 1)) < settings.hold_out:
         warn(
-            f"warning: run {run} held out {share:g}, and so was trained on a part of the {settings.hold_out:g} that is "
-            "held out now: the held-out error is not one of unseen views; with the same hold_out it is"
+            f"warning: the weights of run {run} were trained with hold_out = {share:g}, and so on a part of the "
+            f"{settings.hold_out:g} that is held out now: the held-out error is not one of unseen views; with "
+            f"hold_out = {share:g} it is"
         )
-    about = {"run": str(run), "of_step": state["step"], "of_scene": state["scene_id"], "anew": anew}
-    return {**about, "knows_held_out": knows}
+    about = {"run": str(run), "of_step": state["step"], "of_scene": of_scene, "anew": anew}
+    return {**about, "hold_out": shares, "knows_held_out": knows}

@@ -1,5 +1,6 @@
 """The frame call: a network's image of a configuration and a view, inputs rendered in the same process."""
 
+import pickle
 import re
 import shutil
 from collections.abc import Sequence
@@ -255,8 +256,12 @@ def test_a_frame_is_asked_for_by_names_and_says_what_the_network_never_saw(store
     assert beyond.startswith("sofa stands at 0.9,0,3, outside its box")
     assert closer.startswith("sofa reaches beyond all that never moves")
     assert opened.look_closer(**asked | {"place": {"sofa": (0.9, 0, 3)}}) == (closer,)
+    assert pickle.loads(pickle.dumps(other)).doubts == other.doubts
     with pytest.raises(SpecError, match="one of spp, seconds and error"):
         opened.truth(**asked)
+    for wrong in ({"sofa": (0.9, 0, 3)}, None), (None, (0, 1, 0)):
+        with pytest.raises(SpecError, match=r"is no (Modification|View); names"):
+            opened.predict(*wrong)  # type: ignore[arg-type]
 
 
 def test_a_truth_is_unbiased_and_the_error_of_an_image_has_an_interval_that_holds_the_true_one(

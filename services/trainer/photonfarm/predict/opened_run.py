@@ -13,7 +13,7 @@ import logging
 import os
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,6 +25,7 @@ from torch import Tensor
 
 from photonfarm.core.errors import SpecError
 from photonfarm.core.keys import make_key, view_key
+from photonfarm.core.models import show_value
 from photonfarm.core.processes import can_render
 from photonfarm.core.records import arrays_of
 from photonfarm.data.torch_dataset import OF_LIGHT
@@ -91,6 +92,11 @@ class Frame:
     def doubts(self) -> tuple[str, ...]:
         """What the network never saw, each a sentence, as `photonfarm infer` says it; rays are traced to find some."""
         return (*self.beyond, *self.look_closer())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The frame as a file or another process gets it: without the scene, but with what rays find in it."""
+        *others, _ = (getattr(self, each.name) for each in fields(self))
+        return Frame, (*others, partial(tuple, self.look_closer()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,6 +262,9 @@ class OpenRun:
         self, configuration: Modification | None = None, view: View | None = None, **asked: Any
     ) -> tuple[Modification, View]:
         """Bring the scene into the configuration that is asked for, as `predict`; returns that and the view."""
+        for given, kind in ((configuration, Modification), (view, View)):
+            if not isinstance(given, kind | None):
+                raise SpecError(f"{show_value(given)}: is no {kind.__name__}; names go with place = … or without = …")
         shot = Shot.of(**asked)
         if shot.fov is None:
             shot = shot.model_copy(update={"fov": self._fov})

@@ -20,6 +20,7 @@ from photonfarm.cli.options import (
     store_option,
 )
 from photonfarm.core.formatting import format_bytes, format_count
+from photonfarm.core.processes import end_on_ctrl_c
 from photonfarm.core.waiting import tell_waiting
 from photonfarm.renderer.cli.sample_verbs import parse_amount
 from photonfarm.trainer.cli.evaluation_verbs import device_option
@@ -141,6 +142,8 @@ def infer(
     from photonfarm.trainer.predictors.trained import TrainedRun
 
     trained, before = TrainedRun.load(run), list_made(out)
+    if not trained.packed:  # else a folder of it must be removed in the end
+        click.get_current_context().with_resource(end_on_ctrl_c())
     shown: list[InferResult] = []
 
     def tell(result: InferResult, where: str = "") -> None:

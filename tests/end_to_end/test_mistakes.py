@@ -161,7 +161,7 @@ def test_a_wrong_redis(here: Path, url: str) -> None:
         5,
         "256 samples planned, ",
         f"no Redis at {url}",
-        "The plan is stored, and workers",
+        "The plan is stored; `photonfarm work --share 0/1` renders it",
     )
     assert json.loads(said("submit room --no-queue --json")[1])["planned_before"] == 256
 

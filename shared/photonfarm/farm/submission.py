@@ -217,8 +217,5 @@ def queue_missing(store: Store, redis_url: str, *, retry: bool | str = False) ->
     except OtherStoreError as error:
         raise QueueError(f"{error}. The plan is stored in {store.storage.where}") from error
     except QueueError as error:
-        how = (
-            "The plan is stored, and workers find it by themselves: as soon as there is a Redis, or without any by "
-            "`photonfarm work --share 0/1`; with --no-queue none is asked for"
-        )
+        how = "The plan is stored; `photonfarm work --share 0/1` renders it without a Redis"
         raise QueueError(f"{str(error).rstrip('.')}. {how}") from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,12 @@ FOV_SLACK_DEG, ROLL_SLACK_DEG = 0.05, 0.5
 """How far a camera may be from the spec's field of view, and from one that stands upright."""
 
 COLOURS = ("red", "green", "blue")
+
+OF_GROUPS = ("x", "y", "z", "present", "turn", "power", *COLOURS)
+"""What columns say of a group, as NAME.x."""
+
+COLUMN = re.compile(rf"[^;]+\.({'|'.join(OF_GROUPS)})|fov")
+"""The names of columns."""
 
 DISTORTED = ("k1", "k2", "k3", "k4", "p1", "p2")
 """The coefficients of lenses, which must be 0."""
@@ -177,7 +184,9 @@ def _read_table(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """The rows of a CSV file, by names and coordinates, each with its line; the first line has the names."""
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
-            for row in (rows := csv.DictReader(lines, restval="")):
+            for name in (rows := csv.DictReader(lines, restval="")).fieldnames or ():
+                _check_column(file, name.strip())
+            for row in rows:
                 where = f"line {rows.line_num}"
                 if None in row:
                     raise SpecError(f"{file}: {where}: has more cells than the first line has names")
@@ -189,6 +198,15 @@ def _read_table(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
         raise SpecError(f"{file}: cannot be read: {error}") from error
 
 
+def _check_column(file: Path, name: str) -> None:
+    """Raise SpecError for a column that means nothing; those without a name are not read."""
+    if ";" in name:
+        raise SpecError(f"{file}: line 1: semicolons are between the columns; commas are required, and decimal points")
+    if name and not COLUMN.fullmatch(name):
+        known = ", ".join(f"NAME.{what}" for what in OF_GROUPS)
+        raise SpecError(f"{file}: line 1: column {name!r}: is none of {known}, camera.x … look_at.z, fov")
+
+
 def _fill_places(cells: Mapping[str, str], spec: SceneSpec, start: Modification | None) -> dict[str, Any]:
     """The cells of a row as a `Shot` has them; what they do not say of a group that they name is as at the start."""
     before = Arrangement.from_modification(spec, rest(spec) if start is None else start)
@@ -197,7 +215,7 @@ def _fill_places(cells: Mapping[str, str], spec: SceneSpec, start: Modification 
     for key, cell in cells.items():
         name, _, what = key.rpartition(".")
         number = _read_number(key, cell)
-        if name in ("camera", "look_at") and what in "xyz":
+        if name in ("camera", "look_at") and what in ("x", "y", "z"):
             entry.setdefault(name, [None, None, None])["xyz".index(what)] = number
         elif name and what == "present" and number == 0:
             entry["without"] += [name]
@@ -209,11 +227,8 @@ def _fill_places(cells: Mapping[str, str], spec: SceneSpec, start: Modification 
             entry["colour"].setdefault(name, [*before.colour.get(name, (1.0, 1.0, 1.0))])[COLOURS.index(what)] = number
         elif name and what in ("turn", "power"):
             entry[what][name] = number
-        elif key == "fov":
-            entry[key] = number
         else:
-            known = ", ".join(f"NAME.{what}" for what in ("x", "y", "z", "present", "turn", "power", *COLOURS))
-            raise SpecError(f"column {key!r}: is none of {known}, camera.x … look_at.z, fov")
+            entry["fov"] = number
     for changes in ("place", "colour", "turn", "power"):
         entry[changes] = {name: value for name, value in entry[changes].items() if name not in entry["without"]}
     return entry

@@ -186,7 +186,8 @@ def test_the_table_of_the_page_is_of_the_room(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("object.x\nfar", "line 2: column 'object.x': 'far'"),
-        ("object\n1", "NAME.x"),
+        ("object.x,object\n0,1", r"line 1: column 'object': is none of NAME\.x"),
+        ("object.x;object.z\n0,5;1", "line 1: semicolons .* commas are required"),
         ("", "no conf"),
         ("object.x,object.z\n\n0,0\n0,5,0,5", "line 4: has more cells"),
         ("lamp.present\n1", "'lamp' is no"),

@@ -150,6 +150,7 @@ def test_what_needs_a_store_is_refused_and_the_page_s_command_makes_such_a_file(
         refused = run(umbrella, ["infer", "--run", "room.photonfarm", *option])
         assert refused.exit_code == 2
         assert option[0] in refused.output
+        assert f"no store to {'plan' if option == ['--store-it'] else 'look'} in" in " ".join(refused.output.split())
     assert run(live, ["--run", "room.photonfarm", "--may-submit"]).exit_code == 2
     shown = run(umbrella, ["infer", "--run", "room.photonfarm", "--place", "ball=1,0.5,0", "--orbit", "2"])
     assert shown.exit_code == 0, shown.output

@@ -48,7 +48,8 @@ def _refuse_store(run: Path, **asked: object) -> None:
     """Refuse options that need a store, for a network on its own."""
     if run.is_file() and (given := [name for name, value in asked.items() if value not in (None, False)]):
         options = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise click.UsageError(f"{options}: {run} is a network on its own, and there is no store to look in")
+        verb = "look" if {"row", "like"} & {*given} else "plan"
+        raise click.UsageError(f"{options}: {run} is a network on its own, and there is no store to {verb} in")
 
 
 @click.command()

@@ -196,10 +196,14 @@ def test_up_finds_a_place_that_it_cannot_write_before_it_renders(here: Path) -> 
         (
             "torch",
             ["up", "room"],
-            "`photonfarm train` needs the package torch: pip install 'photonfarm[train]'; --train",
+            "the package torch: pip install -c constraints.txt '.[train]' in the checkout; --train",
         ),
-        ("mitsuba", ["up", "room"], "`photonfarm work` needs the package mitsuba: pip install 'photonfarm[render]'"),
-        ("torch", ["evaluate"], "pip install 'photonfarm[train]'"),
+        (
+            "mitsuba",
+            ["up", "room"],
+            "`photonfarm work` needs the package mitsuba: pip install -c constraints.txt '.[render]'",
+        ),
+        ("torch", ["evaluate"], "pip install -c constraints.txt '.[train]'"),
     ],
 )
 def test_a_verb_that_lacks_a_package_names_the_extra_that_brings_it(

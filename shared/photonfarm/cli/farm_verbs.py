@@ -27,6 +27,7 @@ from photonfarm.cli.options import (
     start_options,
     store_option,
 )
+from photonfarm.core.errors import say_install
 from photonfarm.plan.hold_out import HOLD_OUT
 
 if TYPE_CHECKING:
@@ -389,7 +390,7 @@ def up(spec: str, store: str | Path, request: Request, **options: Any) -> None:
 def _check_arguments(arguments: list[str], package: str, extra: str, *remedies: str) -> None:
     """Raise UsageError if a verb lacks a package, or would refuse its arguments or its table of the configuration."""
     if find_spec(package) is None:
-        missing = f"`photonfarm {arguments[0]}` needs the package {package}: pip install 'photonfarm[{extra}]'"
+        missing = f"`photonfarm {arguments[0]}` needs the package {package}: {say_install(extra)}"
         raise click.UsageError("; ".join([missing, *remedies]))
     root = click.get_current_context().find_root()
     verb = cast(click.Command, cast(click.Group, root.command).get_command(root, arguments[0]))

@@ -24,7 +24,7 @@ from click.core import ParameterSource
 from rich import markup
 from rich.console import Console
 
-from photonfarm.core.errors import PhotonfarmError, QueueError, SpecError, StoreError
+from photonfarm.core.errors import PhotonfarmError, QueueError, SpecError, StoreError, say_install
 from photonfarm.core.processes import GROUP
 
 Options = Mapping[str, Mapping[str, str]]
@@ -226,7 +226,7 @@ def main(args: list[str] | None = None) -> None:
     except ModuleNotFoundError as error:
         if (extra := _extra_of(error.name or "")) is None:
             raise
-        _fail(f"this needs the package {error.name}: pip install 'photonfarm[{extra}]'", click.UsageError.exit_code)
+        _fail(f"this needs the package {error.name}: {say_install(extra)}", click.UsageError.exit_code)
     except Exception as error:
         if not _is_of_redis(error):
             raise

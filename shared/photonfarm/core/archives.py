@@ -19,7 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.errors import StoreError, say_install, store_errors
 from photonfarm.core.files import whole_file
 
 _DAMAGED = (ValueError, TypeError, KeyError, IndexError, EOFError, zipfile.BadZipFile, RuntimeError)
@@ -133,7 +133,7 @@ def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Map
     try:
         import OpenEXR
     except ModuleNotFoundError as error:
-        raise StoreError(f"{file}: needs the package OpenEXR; pip install 'photonfarm[export]'") from error
+        raise StoreError(f"{file}: needs the package OpenEXR; {say_install('export')}") from error
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
     with store_errors("write an image", file), whole_file(file) as part:
         try:

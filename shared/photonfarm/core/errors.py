@@ -71,6 +71,11 @@ class IncompleteError(PhotonfarmError):
     exit_code = 7
 
 
+def say_install(extra: str) -> str:
+    """The command that installs an extra, as docs/configuration.md has it."""
+    return f"pip install -c constraints.txt '.[{extra}]' in the checkout"
+
+
 @contextlib.contextmanager
 def store_errors(doing: str, where: str | Path) -> Iterator[None]:
     """Turn an OSError into a StoreError that names what failed, where and why."""

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from photonfarm.core.archives import write_arrays, write_layers
-from photonfarm.core.errors import StoreError, store_errors
+from photonfarm.core.errors import StoreError, say_install, store_errors
 from photonfarm.core.files import whole_file, write_whole
 from photonfarm.export.card import Exported, write_croissant
 from photonfarm.export.folder import SAMPLES, FormatName
@@ -63,7 +63,7 @@ def load_format(name: FormatName) -> type[Format]:
         try:
             import_module(package)
         except ModuleNotFoundError as error:
-            raise StoreError(f"--to {name}: needs the package {package}; pip install 'photonfarm[export]'") from error
+            raise StoreError(f"--to {name}: needs the package {package}; {say_install('export')}") from error
     return FORMATS[name]
 
 

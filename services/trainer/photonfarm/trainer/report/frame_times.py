@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from photonfarm.core.archives import FrameCosts, Seconds
-from photonfarm.core.errors import BackendError
+from photonfarm.core.errors import BackendError, say_install
 from photonfarm.core.processes import can_render, command
 from photonfarm.trainer.networks.inputs import Needs
 from photonfarm.trainer.predictors.trained import ReadyPredictor, TrainedRun
@@ -89,7 +89,7 @@ def measure_frame_costs(
     """
     if not can_render():
         raise BackendError(
-            "the renderer, which makes buffers and photons, is not installed here: pip install 'photonfarm[render]'"
+            f"the renderer, which makes buffers and photons, is not installed here: {say_install('render')}"
         )
     with tempfile.TemporaryDirectory(prefix="photonfarm-") as folder:
         file = Path(folder) / "frames.npz"

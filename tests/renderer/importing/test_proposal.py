@@ -121,6 +121,33 @@ def test_of_a_scene_the_room_with_most_in_it_is_shown(put: Put, gltf: Any, tmp_p
     assert found.stays == ({"outside the room": ["Globe"]} if "Globe" in scene else {})
 
 
+def test_the_back_of_an_armchair_before_a_bay_is_part_of_it_and_a_picture_on_a_wall_is_not(
+    put: Put, gltf: Any, tmp_path: Path
+) -> None:
+    for number, (low, high) in enumerate(
+        [
+            ((0, -0.1, -0.9), (5, 0, 4)),
+            ((0, 2.6, -0.9), (5, 2.7, 4)),
+            ((-0.1, 0, 0), (0, 2.6, 4)),
+            ((5, 0, 0), (5.1, 2.6, 4)),
+            ((0, 0, 4), (5, 2.6, 4.1)),
+            ((0, 0, -0.1), (2.05, 2.6, 0)),
+            ((2.95, 0, -0.1), (5, 2.6, 0)),
+            ((1.95, 0, -0.9), (2.05, 2.6, -0.1)),
+            ((2.95, 0, -0.9), (3.05, 2.6, -0.1)),
+            ((1.95, 0, -1), (3.05, 2.6, -0.9)),
+        ]
+    ):
+        put(f"Part_{number}", low, high)
+    put("Seat", (2, 0, 0.05), (3, 0.45, 0.9))
+    put("Rest", (2.1, 0.4, -0.02), (2.9, 0.9, 0.12))
+    put("Picture", (4, 0, 0), (4.6, 0.7, 0.1))
+    found, _ = proposed(gltf.write(), tmp_path)
+    assert found.room.low[1] == pytest.approx(0, abs=0.05)
+    (moves,) = found.movables
+    assert [moves.thing.low, moves.thing.high] == pytest.approx(np.array([[2, -0.02, 0], [3, 0.9, 0.9]]), abs=1e-3)
+
+
 def test_lights_and_strays_far_above_a_room_without_a_ceiling_do_not_make_it_high(
     put: Put, gltf: Any, tmp_path: Path
 ) -> None:

@@ -185,7 +185,20 @@ class _Search:
         wide = size[:, :2] > 0.8 * room.size[:2]
         large = (wide.any(axis=1) & (size[:, 2] > 0.6 * room.height)) | wide.all(axis=1)
         walls = self._in_walls(CELL * room.height)
-        return named | ((walls | above | flat | large) & ~self._compact())
+        shell = named | ((walls | above | flat | large) & ~self._compact())
+        return self._without_backs(shell, np.flatnonzero(shell & walls & ~(named | above | flat | large)))
+
+    def _without_backs(self, shell: NDArray[np.bool_], near: Labels) -> NDArray[np.bool_]:
+        """The shell (N,) less those of the pieces `near` walls that touch more of what is loose than of the shell.
+
+        Such is the back of an armchair before a bay window, where the wall's plane is not the wall.
+        """
+        group = np.where(shell, -1, 0)
+        group[near] = 1 + np.arange(len(near))
+        cells = self.pieces.contacts(CELL * self.room.height, group)[1:-1]
+        mended = shell.copy()
+        mended[near] = cells[:, [0]].toarray().ravel() <= cells[:, [-1]].toarray().ravel()
+        return mended
 
     def _compact(self) -> NDArray[np.bool_]:
         """Which pieces are of a named object that is within the room and no part of it as a whole, (N,)."""

@@ -20,6 +20,10 @@ if TYPE_CHECKING:
     from photonfarm.scene.arrangement import Shot
 
 
+OF_A_SCENE = "[--scene ID] [OPTIONS]"
+"""Options in a usage line, so that it says how one scene is named: as an option, and not as an argument."""
+
+
 def _scene_option(which: str = "This scene alone", *, required: bool = False) -> Callable[[FC], FC]:
     """`--scene ID`, one scene of the store."""
     text = f"{which}: its id, how it begins, or its name."
@@ -30,7 +34,7 @@ tell = partial(click.echo, err=True)
 """Says whom a verb waits for."""
 
 
-@click.command()
+@click.command(options_metavar=OF_A_SCENE)
 @store_option
 @_scene_option()
 @click.option("--repair", is_flag=True, help="Set what is damaged aside, to be written again.")
@@ -78,7 +82,7 @@ def check(store: str | Path, scene: str | None, repair: bool, joined_from: str |
     sys.exit(report.exit_code)
 
 
-@click.command()
+@click.command(options_metavar=OF_A_SCENE)
 @store_option
 @_scene_option()
 @arrangement_options()
@@ -120,7 +124,7 @@ def find(
     show_store.print_matches(find_samples(opened, ids, query, limit=limit), store, as_json)
 
 
-@click.command()
+@click.command(options_metavar=OF_A_SCENE)
 @store_option
 @_scene_option()
 @like_option

@@ -6,7 +6,7 @@ This module alone turns names into modification vectors, and back. The command l
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Self
 
 import numpy as np
@@ -45,6 +45,9 @@ COLUMNS_OF = {
     "colour": slice(6, 9),
 }
 """The columns of the modification vector that each field of an arrangement is about; column 3 says what is there."""
+
+MOST_NAMES = 12
+"""The most groups that are named where none is called nearly so."""
 
 BESIDE_PLACE = ("turn", "power", "colour")
 """The fields beside where a group stands."""
@@ -104,7 +107,7 @@ class Arrangement(Frozen):
         number = {group.name: g for g, group in enumerate(spec.groups)}
         for name, key in self._list_named():
             if name not in number:
-                raise SpecError(f"{name!r} is no movable group of {spec.name}; nearest: {nearest(name, number)}")
+                raise SpecError(f"{name!r} is no movable group of {spec.name}; {_suggest(name, number)}")
             keys = dict.fromkeys(other for named, other in self._list_named() if named == name)
             if (len(keys) > 1 and "without" in keys) or {"place", "move"} <= {*keys}:
                 raise SpecError(f"{name!r}: {' and '.join(keys)} contradict each other; give one of them")
@@ -197,6 +200,15 @@ def _describe_fault(fault: ErrorDetails, values: Mapping[str, Any], known: Itera
     return f"{key}{of} = {show_value(_as_list(value))}: {rule}"
 
 
+def _suggest(name: str, known: Collection[str]) -> str:
+    """What to write instead of a name that no group has: those close to it, or else the first groups of all."""
+    if (near := nearest(name, known, least=0.6)) != "none":
+        return f"nearest: {near}"
+    few = [*known][:MOST_NAMES]
+    more = f" and {len(known) - len(few)} more" if len(known) > len(few) else ""
+    return f"its groups: {', '.join(few) or 'none'}{more}"
+
+
 def _check_changes(spec: SceneSpec, name: str, key: str) -> None:
     """Raise SpecError, with what to add, if this cannot change of a group by its spec."""
     able = [each.name for each in spec.groups if (not each.stays if key == "place" else getattr(each, key, None))]
@@ -248,12 +260,12 @@ def find_doubts(spec: SceneSpec, modification: Modification, view: View | None =
     Each is a sentence. The renderer's `look_closer` finds what needs the scene's surfaces.
     """
     doubts = []
-    for group, now, before in zip(spec.groups, modification.vector, rest(spec).vector, strict=True):
+    for group, now in zip(spec.groups, modification.vector, strict=True):
         if not now[3] and group.removal_probability == 0:
             doubts.append(f"{group.name} is removed, and in the spec it never is")
         elif now[3] and group.removal_probability == 1:
             doubts.append(f"{group.name} is there, and in the spec it never is")
-        elif now[3] and not np.array_equal(now, before):
+        elif now[3]:  # also where it was modelled: that may be outside its box
             doubts += _find_beyond(group, now)
     if view is None:
         return doubts
@@ -275,7 +287,7 @@ def find_doubts(spec: SceneSpec, modification: Modification, view: View | None =
 def _find_beyond(group: Movable, now: NDArray[np.float32]) -> Iterator[str]:
     """What of a group that is there is beyond its spec."""
     position = tuple(map(_round_position, group.at, now[:3]))
-    if now[:3].any() and not _holds(group.box, position):
+    if not _holds(group.box, position):
         yield f"{group.name} stands at {_text(position)}, outside its box {_span(group.box)}"
     if len(now) > COLUMNS_OF["turn"].start:
         power, colours = (group.power, group.colour) if isinstance(group, Light) else (None, ())

@@ -174,7 +174,7 @@ def _folder_of(file: str, where: str, beside: Path | None) -> Path:
     for folder in folders:
         if (folder / file).is_file():
             return folder
-    looked = ", ".join(map(str, folders))
+    looked = ", ".join(dict.fromkeys(str(folder.absolute()) for folder in folders))
     raise SpecError(
         f"{where}: scene.file = {file!r} is not there (looked in: {looked}); "
         f"set {SCENES_VARIABLE} to the folder that holds it"

@@ -175,7 +175,7 @@ def test_a_spec_that_cannot_be_used_has_the_exit_code_of_a_wrong_spec(write: Wri
 def test_what_files_say_is_looked_at_alone_and_submit_says_the_same_before_it_plans(
     write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    spec, wall = str(write()), "block reaches beyond all that never moves"
+    spec, wall = str(write()), "block reaches outside the room (all that never moves)"
     (rooms := tmp_path / "rooms.csv").write_text("block.x,camera.x,camera.y,camera.z\n2,1.5,1.5,0\n,0,0.4,0\n")
     from_file = ["--configurations", str(rooms)]
     told = CliRunner().invoke(umbrella, ["scene", "check", spec, *from_file, "--json"])

@@ -121,6 +121,7 @@ def test_what_a_group_lacks_in_the_spec_cannot_change(turning: SceneSpec, asked:
     ("asked", "said"),
     [
         ({"place": {"soffa": (0, 0, 0)}}, "'soffa' is no movable group of room; nearest: sofa"),
+        ({"without": ["divan"]}, "'divan' is no movable group of room; its groups: table, .*, ceiling-light-1"),
         ({"place": {"sofa": (0, 0, 0)}, "without": ["sofa"]}, "'sofa': place and without contradict"),
         ({"turn": {"sofa": 30}}, "the spec of room gives one to no group; turn = "),
         ({"place": {"sofa": (0, 0)}}, r"^place of 'sofa' = \(0, 0\): three numbers are required$"),
@@ -163,6 +164,11 @@ def test_what_no_sample_shows_is_doubted_and_what_any_sample_may_show_is_not(spe
     ]
     assert len(doubts) == len(beginnings)
     assert all(any(doubt.startswith(words) for doubt in doubts) for words in beginnings)
+    modelled = [each.model_copy(update={"at": (0, 1, 0)}) if each.name == "sofa" else each for each in spec.objects]
+    outside = spec.model_copy(update={"objects": tuple(modelled)})
+    (doubt,) = find_doubts(outside, rest(outside))
+    assert doubt.startswith(beginnings[0]), "also where it was modelled"
+    assert not find_doubts(outside, Arrangement.of(place={"sofa": (0.9, 0, -0.5)}).apply(outside))
     corner = View(np.float32([9, 1, 1]), np.float32([0, 1, 0]))
     assert len(find_doubts(spec, rest(spec), corner)) == 1
 

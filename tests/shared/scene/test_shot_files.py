@@ -155,7 +155,7 @@ def test_a_row_that_says_where_to_look_alone_is_seen_from_the_first_camera(tmp_p
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('[{"place": {"sofa": [0, 0, 0]}}]', "configuration 1 of 1: 'sofa' is no movable group of small; nearest"),
+        ('[{"place": {"sofa": [0, 0, 0]}}]', "configuration 1 of 1: 'sofa' is no movable group of small; its groups"),
         ('[{"fov": 0}]', "fov = 0"),
         ('[{"plaice": {}}]', "plaice"),
         ("[1]", "list of tables"),

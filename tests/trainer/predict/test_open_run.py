@@ -254,7 +254,7 @@ def test_a_frame_is_asked_for_by_names_and_says_what_the_network_never_saw(store
     assert not frame.doubts
     beyond, closer = other.doubts
     assert beyond.startswith("sofa stands at 0.9,0,3, outside its box")
-    assert closer.startswith("sofa reaches beyond all that never moves")
+    assert closer.startswith("sofa reaches outside the room (all that never moves)")
     assert opened.look_closer(**asked | {"place": {"sofa": (0.9, 0, 3)}}) == (closer,)
     assert pickle.loads(pickle.dumps(other)).doubts == other.doubts
     with pytest.raises(SpecError, match="one of spp, seconds and error"):

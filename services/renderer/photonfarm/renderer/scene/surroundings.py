@@ -124,7 +124,7 @@ def look_closer(loaded: LoadedScene, modification: Modification, view: View) -> 
             continue
         corners = own[:, 0].min(axis=0), own[:, 1].max(axis=0)
         if (corners[0] < low - slack).any() or (corners[1] > high + slack).any():
-            found.append(f"{group.name} reaches beyond all that never moves")
+            found.append(f"{group.name} reaches outside the room (all that never moves)")
             continue
         grid = np.stack(np.meshgrid(*[[1 / 6, 1 / 2, 5 / 6]] * 3), axis=-1).reshape(-1, 3)
         solid = loaded.surroundings((corners[0] + grid * (corners[1] - corners[0])).astype(np.float32)).solid
@@ -133,9 +133,11 @@ def look_closer(loaded: LoadedScene, modification: Modification, view: View) -> 
             found.append(f"{group.name} stands in {shapes[max(within, key=within.count)].id()!r}")
     number = int(loaded.surroundings(view.origin[None]).solid[0])
     if number != NONE:
-        found.append(f"the camera is inside {shapes[number].id()!r}")
+        shape = shapes[number].id()
+        owner = next((group.name for group in spec.groups if shape in shape_ids(group)), shape)
+        found.append(f"the camera is inside {owner!r}")
     elif (view.origin < low - slack).any() or (view.origin > high + slack).any():
-        found.append("the camera is beyond all that never moves")
+        found.append("the camera is outside the room (all that never moves)")
     elif not have_sight(loaded, view.origin[None])[0]:
         found.append("the camera sees hardly anything of what cameras look at: it is inside of something, or behind it")
     return found

@@ -189,6 +189,10 @@ def _name_faults(file: Path, folder: Path) -> Iterator[None]:
     except PhotonfarmError as error:
         raise type(error)(str(error).replace(str(folder), str(file))) from error
     except FAULTS as error:
+        if isinstance(error, zipfile.BadZipFile) and not zipfile.is_zipfile(file):
+            raise StoreError(
+                f"{file}: is neither a run's folder nor a whole network that `photonfarm pack` wrote"
+            ) from error
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise StoreError(f"{file}: is not a network that `photonfarm pack` wrote, or damaged: {reason}") from error
 

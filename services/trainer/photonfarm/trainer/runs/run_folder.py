@@ -100,7 +100,7 @@ def read_settings(run: Path) -> TrainSettings:
         if not run.is_dir():
             raise StoreError(f"{run}: there is no such run; `photonfarm train` makes one") from error
         raise StoreError(
-            f"{run}: is not a training run, or one that still waits for samples: it holds no {SETTINGS}"
+            f"{run}: is not a training run (it holds no {SETTINGS}), or one that still waits for samples"
         ) from error
     except NotADirectoryError as error:
         raise StoreError(f"{run}: {NO_FOLDER}") from error

@@ -15,7 +15,7 @@ from photonfarm.core.statistics import block_z_test
 from photonfarm.plan.request import Request
 from photonfarm.renderer.jobs import truth
 from photonfarm.renderer.jobs.render import ShardRenderer
-from photonfarm.renderer.jobs.truth import Amount, render_asked, render_truth
+from photonfarm.renderer.jobs.truth import Amount, Truth, render_asked, render_truth
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.renderer.scene.surroundings import look_closer
 from photonfarm.scene.arrangement import Shot
@@ -55,6 +55,19 @@ def test_a_truth_ends_where_its_own_error_is_small_enough_or_its_samples_are_man
     monkeypatch.setattr(truth, "MOST_SPP", 128)
     assert render_truth(room, key, somewhere, Amount(error=1e-9)).spp == 128
     assert [render_truth(room, key, somewhere, Amount(spp=spp)).spp for spp in (1, 2, 5)] == [4, 4, 6], "two passes"
+
+
+def test_an_error_is_a_sentence_also_in_the_dark_and_where_noise_hides_it() -> None:
+    rng = np.random.default_rng(3)
+    passes = np.ones(16, np.int64)
+    dark = Truth(np.zeros((16, 2, 4, 4, 3)), passes, 32, 0.0, 2.0)
+    said = dark.describe_estimate(dark.error(np.full((4, 4, 3), 0.1)))
+    assert said == "squared error 0.04000, 95 % interval 0.04000 … 0.04000: 0.04 on a black image"
+    assert dark.describe_error(dark.own_error()) == "0 on a black image"
+    noisy = Truth(1 + rng.normal(size=(16, 2, 4, 4, 3)), passes, 32, 0.0, 1.0)
+    near, far = (noisy.describe_estimate(noisy.error(np.full((4, 4, 3), value))) for value in (1.0, 3.0))
+    assert near.endswith(" % of the image's mean square; not told apart from 0: more samples would")
+    assert far.endswith(" % of the image's mean square")
 
 
 def test_what_stands_in_a_wall_or_beyond_and_a_camera_inside_of_something_are_said(

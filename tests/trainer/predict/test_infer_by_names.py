@@ -9,9 +9,11 @@ import OpenEXR
 import pytest
 import torch
 from click.testing import CliRunner
+from PIL import Image
 from small_room import rendered, trained
 
 from photonfarm.cli.main import umbrella
+from photonfarm.core.pictures import GAP
 from photonfarm.predict import open_run
 from photonfarm.scene.arrangement import Shot
 from photonfarm.scene.shot_files import read_configurations
@@ -19,6 +21,9 @@ from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, Store
 from photonfarm.store.read.find import find_start
+
+SHEET = ("prediction.png", "truth.png", "difference.png")
+"""The pictures of comparison.png."""
 
 
 @pytest.fixture(scope="module")
@@ -32,7 +37,8 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
     asked = ["--row", "1", "--without", "vase", "--camera", "-1.9,1.6,1.7", "--truth", "8"]
     done = CliRunner().invoke(umbrella, [*place, *asked, "--json"], catch_exceptions=False)
     assert done.exit_code == 0
-    names = {"prediction.png", "truth.png", "difference.png", "frame.exr", "frame.npz", "frame.json"}
+    compared = {"truth.png", "difference.png", "comparison.png"}
+    names = compared | {"prediction.png", "frame.exr", "frame.npz", "frame.json"}
     said = json.loads((tmp_path / "out/frame.json").read_text())
     assert {*said["files"]} == names
     assert json.loads(done.stdout) == {**said, "files": [str(tmp_path / "out" / name) for name in said["files"]]}
@@ -61,18 +67,26 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
     other = tmp_path / "other"
     shutil.copytree(store, other)
     place[2] = str(other)
+    assert said["exposure"] == spec.exposure
+    sheet, *single = (np.asarray(Image.open(tmp_path / "out" / name)) for name in ("comparison.png", *SHEET))
+    height, width = single[0].shape[:2]
+    for column, picture in enumerate(single):
+        np.testing.assert_array_equal(sheet[-height:][:, column * (width + GAP) :][:, :width], picture)
+    removed = f"removed from {tmp_path / 'out'}, as they showed something else: {', '.join(sorted(compared))}"
     for words in ("planned as a sample, row 4", "planned as a sample before, row 4"):
         again = CliRunner().invoke(umbrella, [*place, *asked[:-2], "--store-it"], catch_exceptions=False)
         assert words in again.stdout.splitlines()
         assert f"photonfarm work --store {other} --share 0/1 --until-complete" in again.stderr
+        assert (removed in again.stderr.splitlines()) == ("before" not in words)
     assert len(Store(other).scene(scene_id).plans()) == 2
     ((configuration, seen),) = read_configurations(tmp_path / "out/frame.json", spec)
     np.testing.assert_array_equal(configuration.vector, asked_again.vector)
     assert seen is not None
     np.testing.assert_array_equal(seen.vector[:3], np.float32([-1.9, 1.6, 1.7]))
     (mine := tmp_path / "out/path.gif").touch()  # of a name that a call may give, but none has
+    assert said["exposure"] == spec.exposure
     for more, left in (
-        (["--without", "vase"], names - {"truth.png", "difference.png"}),
+        (["--without", "vase"], names - compared),
         (["--row", "1"], names - {"truth.png"} | {"target.png"}),
     ):
         CliRunner().invoke(umbrella, [*place, *more], catch_exceptions=False)

@@ -78,6 +78,7 @@ def show_frame(
     shot = opened.spec, configuration, view
     about: dict[str, Any] = {
         "scene": opened.scene_id,
+        "exposure": opened.spec.exposure,
         **list_shot(*shot),
         "doubts": frame.doubts,
         "groups": names_of_ids(opened.spec.groups),
@@ -89,10 +90,8 @@ def show_frame(
         truth = opened.truth(configuration, view, **asdict(amount))
         error, seconds["truth"] = truth.error(image), truth.seconds
         about |= {"squared_error": error.mean, "interval": error.interval, **_list_figures(truth)}
-        low, high = error.interval or (error.mean, error.mean)
         said.append(
-            f"squared error {error.mean:.5f}, with probability 0.95 from {low:.5f} to {high:.5f}: "
-            f"{truth.describe_error(error.mean)}; truth of {truth.spp} samples per pixel, whose own squared error is "
+            f"{truth.describe_estimate(error)}; truth of {truth.spp} samples per pixel, whose own squared error is "
             f"{truth.describe_error(truth.own_error())}"
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
@@ -138,6 +137,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
     (is_held_out,) = rows_held_out(source, [row], run.hold_out)
     about: dict[str, Any] = {
         "scene": run.scene_id,
+        "exposure": spec.exposure,
         **list_shot(*shot),
         "row": row,
         "held_out": is_held_out,

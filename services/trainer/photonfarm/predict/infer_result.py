@@ -15,7 +15,7 @@ from photonfarm.core.errors import store_errors
 from photonfarm.core.files import whole_file
 
 MADE = re.compile(
-    r"(prediction|truth|difference|target|frame-\d{4})\.png|frame\.(npz|exr|json)|path\.(gif|mp4)", re.ASCII
+    r"(prediction|truth|difference|comparison|target|frame-\d{4})\.png|frame\.(npz|exr|json)|path\.(gif|mp4)", re.ASCII
 )
 """The names of all files that `infer` may make."""
 
@@ -57,14 +57,17 @@ def list_made(out: Path) -> set[Path]:
     return found
 
 
-def remove_made(files: Iterable[Path], read: Collection[Path]) -> None:
+def remove_made(files: Iterable[Path], read: Collection[Path]) -> list[Path]:
     """Remove files of an earlier call, as they show other things, and their folders if they were all that is there.
 
-    What this call has read stays. Raises StoreError if that is refused.
+    What this call has read stays. Returns what was removed. Raises StoreError if that is refused.
     """
-    for file in files:
+    removed = []
+    for file in sorted(files):
         with store_errors("remove a file of an earlier call", file):
             if file.is_file() and not any(map(file.samefile, read)):
                 file.unlink()
+                removed.append(file)
                 if fnmatch(file.parent.name, FOLDERS) and not any(file.parent.iterdir()):
                     file.parent.rmdir()
+    return removed

@@ -187,7 +187,9 @@ def infer(
                 name = f"frame-{number:04}" if files else ""
                 result = shows.show_frame(opened, *shot, out / name, amount, store_it=store_it)
                 tell(result, f"{name}: " if files else "")
-    remove_made(before - {file for result in shown for file in result.files}, read)
+    if removed := remove_made(before - {file for result in shown for file in result.files}, read):
+        names = ", ".join(str(file.relative_to(out)) for file in removed)
+        click.echo(f"removed from {out}, as they showed something else: {names}", err=True)
     if as_json:
         from photonfarm.cli.show import print_json
 

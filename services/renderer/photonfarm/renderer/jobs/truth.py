@@ -143,7 +143,16 @@ class Truth:
     def describe_error(self, error: float) -> str:
         """A squared error in words, as a share of the mean square."""
         power = self.power()
-        return f"{100 * error / power:.2g} % of the image's mean square" if power > 0 else "of a black image"
+        return (
+            f"{100 * error / power:.2g} % of the image's mean square" if power > 0 else f"{error:.2g} on a black image"
+        )
+
+    def describe_estimate(self, error: Estimate) -> str:
+        """What `error` returned, in words, with its interval."""
+        low, high = error.interval or (error.mean, error.mean)
+        reach = f"95 % interval {low:.5f} … {high:.5f}: {self.describe_error(error.mean)}"
+        unsure = "; not told apart from 0: more samples would" if low < 0 else ""
+        return f"squared error {error.mean:.5f}, {reach}{unsure}"
 
 
 class RefinedTruth:
@@ -334,8 +343,8 @@ def write_beside(
     """Write a network's image, (H, W, 3), linear radiance, and the truth beside it, into a folder; returns the files.
 
     Pictures are as a display shows them, and of the difference red where the network is too bright, blue where it is
-    too dark. frame.npz and, where OpenEXR is installed, frame.exr hold linear radiance, and the `groups`, (H, W), as
-    `LoadedScene.find_groups` has them. The truth goes by a `name`.
+    too dark; comparison.png has all three in a row. frame.npz and, where OpenEXR is installed, frame.exr hold linear
+    radiance, and the `groups`, (H, W), as `LoadedScene.find_groups` has them. The truth goes by a `name`.
     """
     layers: dict[str, NDArray[Any]] = {"prediction": prediction} | ({} if groups is None else {"group": groups})
     shown = {"prediction": pictures.enlarge(prediction * np.float32(exposure))}
@@ -344,6 +353,7 @@ def write_beside(
         layers |= {name: clean, "A": truth.halves[0], "B": truth.halves[1], "difference": prediction - clean}
         shown[name] = pictures.enlarge(clean * np.float32(exposure))
         shown["difference"] = pictures.draw_difference(*(image * np.float32(exposure) for image in (prediction, clean)))
+        shown["comparison"] = pictures.draw_sheet(["network", name, "difference"], [[*shown.values()]], [""])
     with store_errors("make the folder of the pictures", out):
         out.mkdir(parents=True, exist_ok=True)
     files = [out / f"{name}.png" for name in shown]

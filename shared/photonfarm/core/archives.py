@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 from enum import IntEnum
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Self
 
@@ -122,6 +123,14 @@ class FrameCosts:
             return cls(**{**arrays, "scene_id": str(arrays["scene_id"])})
 
 
+def require_openexr(file: Path) -> Any:
+    """The module OpenEXR, by which `write_layers` writes; raises StoreError without it."""
+    try:
+        return import_module("OpenEXR")
+    except ModuleNotFoundError as error:
+        raise StoreError(f"{file}: needs the package OpenEXR; {say_install('export')}") from error
+
+
 def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]) -> None:
     """Write an image with layers by name, (H, W, 3) or (H, W), float16 or float32; "" is the one shown first.
 
@@ -130,10 +139,7 @@ def write_layers(file: Path, layers: Mapping[str, NDArray[Any]], attributes: Map
     Channels are R, G, B of colours, X, Y, Z of normals, Z of depths, and V of other single values. Raises StoreError
     if OpenEXR is not installed, or the disk refuses.
     """
-    try:
-        import OpenEXR
-    except ModuleNotFoundError as error:
-        raise StoreError(f"{file}: needs the package OpenEXR; {say_install('export')}") from error
+    OpenEXR = require_openexr(file)  # noqa: N806 - the module's own name
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
     with store_errors("write an image", file), whole_file(file) as part:
         try:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+from photonfarm.core.errors import store_errors
 
 
 @contextmanager
@@ -22,6 +25,16 @@ def whole_file(file: Path) -> Iterator[Path]:
         part.replace(file)
     finally:
         part.unlink(missing_ok=True)
+
+
+def make_folder(folder: Path, doing: str) -> None:
+    """Make a folder, and see that it can be written to, before long work whose result goes there.
+
+    Raises StoreError, which names what one was `doing`, if the disk refuses.
+    """
+    with store_errors(doing, folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
 
 
 def write_whole(file: Path, text: str) -> None:

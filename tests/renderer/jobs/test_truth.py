@@ -1,6 +1,7 @@
 """`photonfarm render` of what is asked for by names, and what it warns of."""
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -164,5 +165,12 @@ def test_an_image_is_rendered_of_a_spec_without_a_store_and_of_a_scene_of_a_stor
         (("room", "--without", "piano"), SpecError),
     ):
         assert isinstance(run(*arguments, code=1).exception, kind)
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    for out, said in (
+        ("b.png/c/a.png", "cannot write an image: "),
+        ("a.exr", "needs the package OpenEXR; pip install"),
+    ):
+        refused = run("no-such-spec", "--spp", "8", "--out", out, code=1)  # which would be known next
+        assert said in str(refused.exception)
     for wrong in (("--pass", "1"), ("--spp", "soon"), ("--out", "a.jpg")):
         assert wrong[0] in run("room", "--without", "sofa", *wrong, code=2).stderr

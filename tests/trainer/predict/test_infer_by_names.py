@@ -67,6 +67,10 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
     other = tmp_path / "other"
     shutil.copytree(store, other)
     place[2] = str(other)
+    (tmp_path / "file").touch()
+    nowhere = CliRunner().invoke(umbrella, [*place[:-1], str(tmp_path / "file/out"), *asked])
+    assert "cannot write the pictures" in str(nowhere.exception)
+    assert "loaded in" not in nowhere.stderr
     assert said["exposure"] == spec.exposure
     sheet, *single = (np.asarray(Image.open(tmp_path / "out" / name)) for name in ("comparison.png", *SHEET))
     height, width = single[0].shape[:2]
@@ -84,7 +88,6 @@ def test_the_verb_puts_the_truth_beside_the_network_and_writes_what_it_was(store
     assert seen is not None
     np.testing.assert_array_equal(seen.vector[:3], np.float32([-1.9, 1.6, 1.7]))
     (mine := tmp_path / "out/path.gif").touch()  # of a name that a call may give, but none has
-    assert said["exposure"] == spec.exposure
     for more, left in (
         (["--without", "vase"], names - compared),
         (["--row", "1"], names - {"truth.png"} | {"target.png"}),

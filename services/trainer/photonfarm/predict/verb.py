@@ -134,6 +134,7 @@ def infer(
     along = orbit or (CameraPath.load(path) if path else None)
     if isinstance(along, CameraPath):
         along.sample()  # a faulty one is refused before anything is loaded
+    from photonfarm.core.files import make_folder
     from photonfarm.plan.chosen import Chosen
     from photonfarm.predict import infer as shows
     from photonfarm.predict.infer_result import list_made, remove_made
@@ -176,6 +177,7 @@ def infer(
             shots = read_shots(spec, cameras, configurations, configuration, otherwise=view, fov=asked.fov)
         elif store_it:
             Chosen.of(spec, configuration, view)  # a view that no sample can have is refused before anything is loaded
+        make_folder(out, "write the pictures")
         count = f"{format_count(len(shots), 'image')} of " if given else ""
         say = partial(click.echo, err=True)
         with tell_waiting(say, f"rendering {count}{spec.name}"):

@@ -240,6 +240,9 @@ def render(
         raise click.UsageError("--pass: is of a stored sample, which --row alone renders again")
     if out is not None and out.suffix not in truth.SUFFIXES:
         raise click.BadParameter(f"{str(out)!r}: ends in none of {', '.join(truth.SUFFIXES)}", param_hint="--out")
+    file = out or Path("render.png")
+    if out is not None or not again:
+        truth.check_file(file)
     if again:
         repeated = repeat(store, scene, row or 0, pass_number, say)
         if out is not None:
@@ -252,6 +255,6 @@ def render(
         image = truth.render_asked(store, scene, asked, row, like, amount or truth.Amount(spp=64))
     for doubt in image.doubts:
         say(f"warning: {doubt}")
-    image.write(file := out or Path("render.png"))
+    image.write(file)
     say(f"written to {file}")
     click.echo(json.dumps({**image.document(), "files": [str(file)]}, indent=1) if as_json else image.line())

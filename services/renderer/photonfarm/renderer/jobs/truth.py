@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from photonfarm.core import pictures
-from photonfarm.core.archives import write_arrays, write_layers
+from photonfarm.core.archives import require_openexr, write_arrays, write_layers
 from photonfarm.core.errors import SpecError, StoreError, store_errors
-from photonfarm.core.files import whole_file
+from photonfarm.core.files import make_folder, whole_file
 from photonfarm.core.keys import Key, make_key, view_key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, clean_error, jackknife
@@ -307,6 +307,13 @@ def load_named(store: str | Path, named: str) -> SceneSpec:
     if folder is None:
         return spec
     return spec.model_copy(update={"scene": spec.scene.model_copy(update={"file": str(folder / str(spec.scene.file))})})
+
+
+def check_file(file: Path) -> None:
+    """Raise StoreError, before anything is rendered, if `write_halves` could not write a file."""
+    make_folder(file.parent, "write an image")
+    if file.suffix == ".exr":
+        require_openexr(file)
 
 
 def write_halves(

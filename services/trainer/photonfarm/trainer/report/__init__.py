@@ -6,12 +6,12 @@ Its plots and the pictures side by side lie beside it too.
 from __future__ import annotations
 
 import json
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Unpack
 
 from photonfarm.core.errors import store_errors
+from photonfarm.core.files import make_folder
 from photonfarm.core.page import write_page
 from photonfarm.core.pictures import write_png
 from photonfarm.trainer.compare.evaluate import MeasureOptions
@@ -33,9 +33,7 @@ def write_report(
     or if `out` cannot be written, IncompleteError if nothing is held out.
     """
     loaded = [TrainedRun.load(run) for run in runs]
-    with store_errors("write the report", out):
-        out.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out).close()  # an unwritable folder should fail before the measurements
+    make_folder(out, "write the report")
     contents = gather_contents(store, loaded, timed=timed, **how)
     if on_progress := how.get("on_progress"):
         on_progress("plots and pages are drawn", 0, 0)

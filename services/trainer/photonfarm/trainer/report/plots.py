@@ -95,9 +95,9 @@ def set_plain_ticks(axes: Axes) -> None:
     from matplotlib.ticker import LogLocator, MaxNLocator, NullLocator
 
     for axis, (low, high) in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, axes.get_ylim())):
-        if axis.get_scale() == "log" and high < 20 * low:
-            few = high < 2.5 * low
-            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]) if few else LogLocator(subs=(1, 2, 3, 5, 7)))
+        if axis.get_scale() == "log" and high < 100 * low:
+            few, subs = high < 2.5 * low, (1, 2, 3, 5, 7) if high < 20 * low else (1, 2, 5)
+            axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]) if few else LogLocator(subs=subs))
             axis.set_major_formatter(lambda value, _: f"{value:g}")
             axis.set_minor_locator(NullLocator())
 

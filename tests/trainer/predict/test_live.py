@@ -181,7 +181,7 @@ def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks
             page.open(address, width, 1500)
             page.wait_for("document.querySelector('#error').textContent.includes('±')", 60)
             before = page.value("document.querySelector('#network').toDataURL()")
-            drag_sofa(page)
+            drag(page, "sofa", 0.2)
             page.wait_for(f"document.querySelector('#network').toDataURL() !== {json.dumps(before)}")
             page.wait_for("document.querySelector('#of-truth').textContent.startsWith('truth · 24 samples')", 60)
             page.wait_for("!document.querySelector('#truth').classList.contains('old')")
@@ -195,6 +195,29 @@ def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks
             page.wait_for("document.querySelector('#truth').classList.contains('old')")
             page.wait_for("!document.querySelector('#truth').classList.contains('old')", 60)
             assert page.value("document.documentElement.scrollWidth") <= width
+        assert page.errors == []
+
+
+@needs_chromium
+def test_what_was_never_seen_stays_said_an_old_error_is_pale_and_the_camera_is_held_in_its_box(address: str) -> None:
+    said = "document.querySelector('#{}').textContent"
+    with chromium() as page:
+        page.open(address, 1280)
+        page.wait_for("window.live?.isDone", 60)
+        assert page.value(f"{said.format('doubts')}") == ""
+        pale = "window.live.set(() => {{ window.live.{} }}), getComputedStyle(document.querySelector('#error')).opacity"
+        assert page.value(pale.format("place.sofa[1] += 1; window.live.fov = 99.6")) == "0.35"
+        page.wait_for(f"{said.format('doubts')}.startsWith('sofa stands at')")
+        assert page.value("document.querySelector('#actions output').textContent") == "100°"
+        page.value("[...document.querySelectorAll('button')].find((b) => b.textContent.startsWith('Copy')).click()")
+        page.wait_for(f"{said.format('said')}.includes('--place sofa=')")
+        page.wait_for("window.live.isDone && !document.querySelector('#error').classList.contains('old')", 60)
+        assert page.value(f"{said.format('doubts')}").startswith("sofa stands at")
+        assert "--place sofa=" in page.value(f"{said.format('said')}")
+        drag(page, "camera", -9)
+        camera, box = page.value("[window.live.camera, window.live.room.camera_box]")
+        assert camera[0] in (box["min"][0], box["max"][0])
+        assert camera[2] in (box["min"][2], box["max"][2])
         assert page.errors == []
 
 
@@ -245,12 +268,13 @@ def test_a_clip_shows_an_old_truth_as_pale_as_the_page(address: str) -> None:
         assert page.value(halves) == [network, pytest.approx(0.35 * truth, rel=0.02)]
 
 
-def drag_sofa(page: Page) -> None:
-    """Drag the sofa by a tenth of the plan towards its middle."""
+def drag(page: Page, what: str, share: float) -> None:
+    """Drag a group, or the camera, by a share of its way to the middle of the plan."""
+    at = "camera" if what == "camera" else f"place['{what}']"
     script = (
         "(() => { const { plan } = window.live, canvas = document.querySelector('#plan').getBoundingClientRect();"
-        "const [x, y] = plan.to(window.live.place.sofa).map((value) => value / plan.ratio);"
+        f"const [x, y] = plan.to(window.live.{at}).map((value) => value / plan.ratio);"
         "return [canvas.left + x, canvas.top + y, canvas.left + canvas.width / 2, canvas.top + canvas.height / 2]; })()"
     )
     x, y, middle_x, middle_y = page.value(script)
-    page.press(x, y, (x + 0.05 * (middle_x - x), y), (x + 0.2 * (middle_x - x), y + 0.2 * (middle_y - y)))
+    page.press(x, y, (x + 0.05 * (middle_x - x), y), (x + share * (middle_x - x), y + share * (middle_y - y)))

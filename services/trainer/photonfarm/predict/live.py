@@ -136,6 +136,8 @@ class Live:
             "high": plan.high.tolist(),
             "camera": view.origin.tolist(),
             "look_at": view.target.tolist(),
+            "camera_box": spec.view.origin.model_dump(),
+            "look_at_box": spec.view.look_at.model_dump(),
             "groups": [_describe_group(group) for group in spec.groups],
             "may_submit": self.may_submit,
         }

@@ -12,6 +12,7 @@ const add = (a, b, factor = 1) => a.map((value, i) => value + factor * b[i]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
 const unit = (a) => a.map((value) => value / (Math.hypot(...a) || 1));
+const inDegrees = (value) => `${Math.round(value)}°`;
 const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
 
 async function ask(path, more = {}) {
@@ -62,7 +63,8 @@ class Live {
   change() {
     this.changed = performance.now();
     this.dirty = true;
-    $("truth").classList.add("old");
+    this.age(true);
+    this.say(""); // of what was shown before
     this.plan.draw();
   }
 
@@ -94,17 +96,22 @@ class Live {
     const mean = this.seconds.reduce((sum, value) => sum + value) / this.seconds.length;
     $("of-network").textContent = `network · ${told.ms.toFixed(0)} ms a frame, ${image.width} × ${image.height}`;
     $("pulse").textContent = `${(1000 / mean).toFixed(1)} frames a second`;
-    this.say(told.warnings.join("; "));
+    $("doubts").textContent = told.warnings.join("\n");
   }
 
   async showTruth() {
     const told = await ask(`truth/${this.address(this.state())}`);
     if (this.dirty) return;
     await paint($("truth"), told.picture);
-    $("truth").classList.remove("old");
+    this.age(false);
     this.isDone = told.done;
     $("of-truth").textContent = `truth · ${told.spp} samples per pixel, ${told.seconds.toFixed(1)} s`;
     $("error").textContent = `error of the network: ${told.error}`;
+  }
+
+  // The truth and what is said by it are of what is shown, or of what was shown before.
+  age(isOld) {
+    for (const id of ["truth", "of-truth", "error"]) $(id).classList.toggle("old", isOld);
   }
 
   say(sentence) {
@@ -175,23 +182,31 @@ class Live {
         group.show.push(() => { box.checked = !this.without.has(group.name); });
         there.append(box, group.light ? " on" : " there");
       }
-      const slide = (what, { min, max }, of, key) => {
-        const slider = Object.assign(document.createElement("input"), { type: "range", min, max, step: "any", ariaLabel: `${what} of ${group.name}` });
-        slider.addEventListener("input", () => { of()[key] = Number(slider.value); this.change(); });
-        group.show.push(() => { slider.value = of()[key]; });
+      const slide = (what, range, of, key, say) => {
+        const { show, parts } = this.makeSlider(`${what} of ${group.name}`, range, () => of()[key], (value) => { of()[key] = value; }, say);
+        group.show.push(show);
         const label = document.createElement("label");
-        label.append(`${what} `, slider);
+        label.append(`${what} `, ...parts);
         more.append(label, " ");
       };
       const [min, max] = [group.box.min[height], group.box.max[height]];
-      if (max > min) slide("height", { min, max }, () => this.place[group.name], height);
-      if (group.turn) slide("turn", group.turn, () => this.turn, group.name);
-      if (group.power) slide("power", group.power, () => this.power, group.name);
+      if (max > min) slide("height", { min, max }, () => this.place[group.name], height, (value) => value.toFixed(2));
+      if (group.turn) slide("turn", group.turn, () => this.turn, group.name, inDegrees);
+      if (group.power) slide("power", group.power, () => this.power, group.name, (value) => `× ${value.toFixed(2)}`);
       for (const show of group.show) show();
       row.hidden = !group.show.length; // what is only dragged
       row.append(name, there, more);
       return row;
     }));
+  }
+
+  // A slider with its value beside it, and what brings both to the value that is set.
+  makeSlider(ariaLabel, range, get, set, say) {
+    const slider = Object.assign(document.createElement("input"), { type: "range", ...range, step: "any", ariaLabel });
+    const told = document.createElement("output");
+    const show = () => { slider.value = get(); told.textContent = say(get()); };
+    slider.addEventListener("input", () => { set(Number(slider.value)); show(); this.change(); });
+    return { show, parts: [slider, " ", told] };
   }
 
   listActions() {
@@ -200,10 +215,9 @@ class Live {
       made.addEventListener("click", () => act(made));
       $("actions").append(made);
     };
-    const lens = Object.assign(document.createElement("input"), { type: "range", ...this.room.fov_range, step: "any", ariaLabel: "field of view" });
-    this.showLens = () => { lens.value = this.fov; };
-    lens.addEventListener("input", () => { this.fov = Number(lens.value); this.change(); });
-    if (this.room.fov_range) $("actions").append("field of view ", lens);
+    const lens = this.makeSlider("field of view", this.room.fov_range ?? {}, () => this.fov, (value) => { this.fov = value; }, inDegrees);
+    this.showLens = lens.show;
+    if (this.room.fov_range) $("actions").append("field of view ", ...lens.parts);
     this.showLens();
     button("At rest", () => this.set(() => this.start()));
     button("Random", () => this.set(() => {

@@ -64,7 +64,7 @@ export class Plan {
       if (this.pictures) this.lay(context, this.pictures.groups[i], group.at, live.place[group.name], live.turn[group.name]);
       context.globalAlpha = 1;
     });
-    if (this.held?.group) this.frame(context, this.held.group.box);
+    if (this.held) this.frame(context, this.held.box);
     this.paintCamera(context);
     const marks = live.room.groups.map(({ name, light }) => [this.to(live.place[name]), light ? "#ffc35c" : "#7cb0ff", live.without.has(name), name]);
     marks.push([this.to(live.camera), CAMERA, false, "camera"], [this.to(live.target), CAMERA, true, ""]);
@@ -140,9 +140,9 @@ export class Plan {
   find(x, y) {
     const { live } = this;
     const things = [
-      ...live.room.groups.map((group) => ({ group, at: live.place[group.name] })),
-      { camera: true, at: live.camera },
-      { target: true, at: live.target },
+      ...live.room.groups.map(({ name, box }) => ({ box, at: live.place[name], put: (at) => { live.place[name] = at; } })),
+      { box: live.room.camera_box, at: live.camera, put: (at) => { live.camera = at; } },
+      { box: live.room.look_at_box, at: live.target, put: (at) => { live.target = at; } },
     ];
     const far = (thing) => { const [a, b] = this.to(thing.at); return Math.hypot(a - x, b - y); };
     const [nearest] = things.map((thing) => ({ ...thing, far: far(thing) })).sort((a, b) => a.far - b.far);
@@ -164,9 +164,8 @@ export class Plan {
       const [x, y] = at(event), by = [x - this.last[0], y - this.last[1]];
       this.last = [x, y];
       this.held.at = this.moved(this.held.at, ...by);
-      const { group } = this.held;
-      if (group) live.place[group.name] = this.held.at.map((value, i) => Math.min(group.box.max[i], Math.max(group.box.min[i], value)));
-      else live[this.held.camera ? "camera" : "target"] = this.held.at;
+      const { at: place, box, put } = this.held;
+      put(place.map((value, i) => Math.min(box.max[i], Math.max(box.min[i], value))));
       live.change();
     });
     for (const end of ["pointerup", "pointercancel"]) canvas.addEventListener(end, () => { this.held = null; this.draw(); });

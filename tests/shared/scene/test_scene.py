@@ -1,3 +1,4 @@
+import re
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from photonfarm.cli.main import umbrella
 from photonfarm.core.errors import SpecError
 from photonfarm.core.models import sentences
 from photonfarm.scene.spec import SceneSpec
-from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec, load_spec, parse_spec, scene_folder
+from photonfarm.scene.spec_loading import SCENES_VARIABLE, NamedSpec, find_scene, load_spec, parse_spec, scene_folder
 
 SCENE = """<scene version="3.0.0">
   <shape type="ply" id="Floor"><string name="filename" value="meshes/floor.ply"/></shape>
@@ -232,3 +233,7 @@ def test_the_folder_of_a_scene_file_is_found_also_beside_and_above_the_spec(
     name = str(tmp_path / "specs/a.toml")
     assert scene_folder(name, load_spec(name)) == tmp_path / "specs"
     assert scene_folder("room", load_spec("room")) is None
+    monkeypatch.chdir(tmp_path / "specs")
+    monkeypatch.setenv("PHOTONFARM_SCENES", str(tmp_path / "specs"))
+    with pytest.raises(SpecError, match=re.escape(f"(looked in: {tmp_path / 'specs'}); set")):
+        find_scene("none.xml", "a", tmp_path / "specs")

@@ -62,13 +62,26 @@ def test_an_error_is_a_sentence_also_in_the_dark_and_where_noise_hides_it() -> N
     rng = np.random.default_rng(3)
     passes = np.ones(16, np.int64)
     dark = Truth(np.zeros((16, 2, 4, 4, 3)), passes, 32, 0.0, 2.0)
-    said = dark.describe_estimate(dark.error(np.full((4, 4, 3), 0.1)))
+    grey = np.full((4, 4, 3), 0.1, np.float32)
+    said = dark.describe_estimate(dark.error(grey), grey)
     assert said == "squared error 0.04000, 95 % interval 0.04000 … 0.04000: 0.04 on a black image"
     assert dark.describe_error(dark.own_error()) == "0 on a black image"
     noisy = Truth(1 + rng.normal(size=(16, 2, 4, 4, 3)), passes, 32, 0.0, 1.0)
-    near, far = (noisy.describe_estimate(noisy.error(np.full((4, 4, 3), value))) for value in (1.0, 3.0))
-    assert near.endswith(" % of the image's mean square; not told apart from 0: more samples would")
-    assert far.endswith(" % of the image's mean square")
+    images = [np.full((4, 4, 3), value, np.float32) for value in (1, 3)]
+    near, far = (noisy.describe_estimate(noisy.error(image), image) for image in images)
+    assert near.endswith("; not told apart from 0: more samples would")
+    assert " % of the image's mean square" in far
+    assert "not told" not in far
+
+
+def test_an_error_beside_a_lamp_is_also_said_without_it() -> None:
+    image = np.full((2, 2, 3), 0.25, np.float32)
+    image[0, 0] = 50
+    truth = Truth(np.tile(image.astype(np.float64), (4, 2, 1, 1, 1)), np.ones(4, np.int64), 8, 0.0, 2.0)
+    off = image + np.float32(0.05) * (image < 1)
+    assert truth.error_below_white(off) == pytest.approx((0.75, 0.04))
+    said = truth.describe_estimate(truth.error(off), off)
+    assert said.endswith(": 0.0003 % of the image's mean square, and 4 % below white (75 % of the pixels)")
 
 
 def test_what_stands_in_a_wall_or_beyond_and_a_camera_inside_of_something_are_said(

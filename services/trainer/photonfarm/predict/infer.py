@@ -90,9 +90,10 @@ def show_frame(
         truth = opened.truth(configuration, view, **asdict(amount))
         error, seconds["truth"] = truth.error(image), truth.seconds
         about |= {"squared_error": error.mean, "interval": error.interval, **_list_figures(truth)}
+        about["below_white"] = dict(zip(("pixels", "share"), truth.error_below_white(image), strict=True))
         said.append(
-            f"{truth.describe_estimate(error)}; truth of {truth.spp} samples per pixel, whose own squared error is "
-            f"{truth.describe_error(truth.own_error())}"
+            f"{truth.describe_estimate(error, image)}; truth of {truth.spp} samples per pixel, whose own squared error "
+            f"is {truth.describe_error(truth.own_error())}"
         )
     said.append(", ".join(f"{name} {value:.3g} s" for name, value in seconds.items()))
     if store_it:

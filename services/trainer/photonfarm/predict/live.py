@@ -189,7 +189,7 @@ class Live:
             "seconds": truth.seconds,
             "done": truth.spp >= self.most_spp,
             "error": f"{error.mean:.3g}{interval} (mean square of radiance × exposure, 95 %), "
-            f"{truth.describe_error(error.mean)}",
+            f"{truth.describe_error(error.mean)}{truth.describe_below_white(judged.frame.radiance.cpu().numpy())}",
         }
 
     def _draw(self, radiance: F32) -> str:

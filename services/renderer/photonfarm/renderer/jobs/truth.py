@@ -131,6 +131,17 @@ class Truth:
         ]
         return jackknife(measure(total, count), np.array(without), self.passes)
 
+    def error_below_white(self, radiance: F32) -> tuple[float, float | None]:
+        """The share of pixels that are at most white on a display, and the squared error there over the mean square.
+
+        Lamps have nearly all of an image's mean square, so that a share of that hides errors elsewhere. The second is
+        None where that part is black or empty. It is chosen by the truth itself, whose noise counts a little.
+        """
+        dim = (self.radiance * self.exposure).max(axis=-1) <= 1
+        image, first, second = radiance[dim], *(half[dim] for half in self.halves)
+        power = clean_error(np.zeros_like(image), first, second) if dim.any() else 0.0
+        return float(dim.mean()), clean_error(image, first, second) / power if power > 0 else None
+
     def own_error(self) -> float:
         """The expected mean squared error of `radiance`, exposed: a quarter of the halves' squared difference."""
         first, second = self.halves * np.float64(self.exposure)
@@ -147,12 +158,19 @@ class Truth:
             f"{100 * error / power:.2g} % of the image's mean square" if power > 0 else f"{error:.2g} on a black image"
         )
 
-    def describe_estimate(self, error: Estimate) -> str:
-        """What `error` returned, in words, with its interval."""
+    def describe_estimate(self, error: Estimate, radiance: F32) -> str:
+        """What `error` returned for an image, in words, with its interval, and with its share below white."""
         low, high = error.interval or (error.mean, error.mean)
         reach = f"95 % interval {low:.5f} … {high:.5f}: {self.describe_error(error.mean)}"
         unsure = "; not told apart from 0: more samples would" if low < 0 else ""
-        return f"squared error {error.mean:.5f}, {reach}{unsure}"
+        return f"squared error {error.mean:.5f}, {reach}{self.describe_below_white(radiance)}{unsure}"
+
+    def describe_below_white(self, radiance: F32) -> str:
+        """What `error_below_white` returns, in words; nothing where it says nothing new."""
+        pixels, share = self.error_below_white(radiance)
+        if share is None or pixels == 1:
+            return ""
+        return f", and {100 * share:.2g} % below white ({100 * pixels:.0f} % of the pixels)"
 
 
 class RefinedTruth:

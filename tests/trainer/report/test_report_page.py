@@ -48,7 +48,9 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
     colour = errors(1.8, 1.8, 1.8, 1.8, 1.8, 1.8)
     better = judged(contents, errors(0.1, 0.1, 0.1, 0.1, 0.1, 0.1), colour)
     assert better.kind == "better"
-    assert better.sentence == "light_transport predicts unseen configurations with 1/18 of the mean colour’s error."
+    assert (
+        better.sentence == "light_transport predicts unseen configurations with 1/18 of the error of the mean colour."
+    )
     assert "below that of the mean colour, 1.8, in 3 of 3 configurations" in better.further[0]
     assert "no references" in better.further[-1]
     assert "with 50 % of " in judged(contents, errors(0.9, 0.9), errors(1.8, 1.8)).sentence
@@ -71,7 +73,8 @@ def test_the_verdict_follows_from_the_numbers(contents) -> None:
 def test_a_network_that_is_given_light_is_compared_with_that_light_and_with_denoisers_of_its_time(contents) -> None:
     own, light = errors(0.1, 0.1, 0.1, 0.1), errors(0.4, 0.4, 0.4, 0.4)
     verdict = judged(contents, own, light, than=LIGHT)
-    assert verdict.sentence == "light_transport predicts unseen configurations with 25 % of the known light’s error."
+    given = "the lamps and direct light that it is given"
+    assert verdict.sentence == f"light_transport predicts unseen configurations with 25 % of the error of {given}."
     colour = contents.baselines.mean_colour.error.mean
     assert f"that of one colour for every pixel is {colour:.3g}" in verdict.further[0]
     assert len(verdict.further) == 2, "no time, so no denoiser of its time"

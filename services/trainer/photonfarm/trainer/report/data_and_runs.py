@@ -249,8 +249,10 @@ MOST_TRAINING = 1024  # samples to take the mean colour of
 
 COLOUR = "the mean colour of the training samples"
 
-NOTHING, LIGHT, HALF = "the mean colour", "the known light", "the denoised half"
-"""What a network is given that is an image: nothing, so that one colour is the best; lamps and direct light; a half."""
+NOTHING = "the mean colour"
+LIGHT = "the lamps and direct light that it is given"
+HALF = "the denoised half that it is given"
+"""What a network is given that is an image, beside which its error stands; of nothing one colour is the best."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,7 +24,7 @@ from photonfarm.core.statistics import group_means
 from photonfarm.trainer.compare import evaluation_page
 from photonfarm.trainer.predictors.evaluation import HeldOutErrors
 from photonfarm.trainer.report.contents import ReportContents
-from photonfarm.trainer.report.data_and_runs import HALF, LIGHT, NOTHING
+from photonfarm.trainer.report.data_and_runs import NOTHING
 from photonfarm.trainer.report.plots import PlotGroup
 from photonfarm.trainer.report.tables import list_facts, make_tables
 from photonfarm.trainer.report.views import ShownView, write_legend
@@ -58,19 +58,12 @@ class Verdict:
             "" if than == NOTHING else f"; that of one colour for every pixel is {baselines.mean_colour.error.mean:.3g}"
         )
         further = (
-            f"Training took its error {learned}; it is below that of {than}, {given.error.mean:.3g}{EXPLAINED[than]}, "
+            f"Training took its error {learned}; it is below that of {than}, {given.error.mean:.3g}, "
             f"in {better.sum()} of {format_count(len(better), unit)} that no training saw{colour}.",
             *_compare_with_denoiser(contents),
             _describe_references(contents),
         )
         return cls(kind, sentence, further)
-
-
-EXPLAINED = {
-    NOTHING: "",
-    LIGHT: " (lamps and direct light, as it is given them)",
-    HALF: " (what it is given of a view, filtered)",
-}
 
 
 def _compare_with_denoiser(contents: ReportContents) -> list[str]:
@@ -113,7 +106,7 @@ def _judge(name: str, than: str, ratio: float, shown: float, wins: float, unit: 
         mean = f"only in the mean over all has it {share} that error"
         return "mixed", f"{name} is worse than {than} in most unseen {unit}s; {mean}."
     where = " where no light is above white" if shown > ratio else ""
-    return "better", f"{name} predicts unseen {unit}s with {share} {than}’s error{where}."
+    return "better", f"{name} predicts unseen {unit}s with {share} the error of {than}{where}."
 
 
 def _format_share(ratio: float) -> str:

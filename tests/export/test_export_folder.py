@@ -162,6 +162,6 @@ def test_a_missing_package_is_named_before_a_folder_is_made(
     scene: SceneStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, to: str, package: str
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(StoreError, match=rf"{package}.*photonfarm\[export\]"):
+    with pytest.raises(StoreError, match=rf"{package}.*'\.\[export\]'"):
         exported(scene, tmp_path / "out", to)
     assert not (tmp_path / "out").exists()

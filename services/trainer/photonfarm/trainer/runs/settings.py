@@ -120,8 +120,8 @@ def _check_choice(kind: Any) -> BeforeValidator:
     def check(name: object) -> object:
         if name not in get_args(kind) and not (isinstance(name, str) and is_own(name)):
             *first, last = map(repr, get_args(kind))
-            rule = f"Input should be {', '.join(first)} or {last}, or MODULE:NAME of your own"
-            raise PydanticCustomError("literal_error", "{rule}", {"rule": rule})
+            rule = f"must be {', '.join(first)} or {last}, or MODULE:NAME of your own"
+            raise PydanticCustomError("own_or_literal", "{rule}", {"rule": rule})
         return name
 
     return BeforeValidator(check)

@@ -20,7 +20,7 @@ describe = equal_time.describe
 
 
 def measure(name: str, size: int, out: Path, _limit_s: float) -> dict[str, Any]:
-    """As `equal_time.measure`, of this denoiser alone. Raises SpecError without a card."""
+    """Measure this denoiser alone, as `equal_time.measure` does. Raises SpecError without a card."""
     if not on_card():
         raise SpecError("OptiX needs a card, and a processor renders here")
     import mitsuba as mi

@@ -21,6 +21,7 @@ import torch
 from PIL import Image
 
 from photonfarm.core.errors import IncompleteError, SpecError, StoreError, say_install, store_errors
+from photonfarm.core.files import make_folder
 from photonfarm.core.formatting import format_count
 from photonfarm.core.pictures import display_values, enlarge, write_png
 from photonfarm.core.records import F32
@@ -266,8 +267,7 @@ def _show_images(
 
     `what` says what their time was for. Returns the files, what is said of them, and the same for JSON.
     """
-    with store_errors("make the folder of the pictures", out):
-        out.mkdir(parents=True, exist_ok=True)
+    make_folder(out, "write the pictures")
     files = [out / f"frame-{i:04}.png" for i in range(count)]
     seconds = []
     for file, (image, took_s) in zip(files, images, strict=True):

@@ -379,8 +379,7 @@ def write_beside(
         shown[name] = pictures.enlarge(clean * np.float32(exposure))
         shown["difference"] = pictures.draw_difference(*(image * np.float32(exposure) for image in (prediction, clean)))
         shown["comparison"] = pictures.draw_sheet(["network", name, "difference"], [[*shown.values()]], [""])
-    with store_errors("make the folder of the pictures", out):
-        out.mkdir(parents=True, exist_ok=True)
+    make_folder(out, "write the pictures")
     files = [out / f"{name}.png" for name in shown]
     for file, picture in zip(files, shown.values(), strict=True):
         pictures.write_png(picture, file)

@@ -74,7 +74,7 @@ MOST_LIGHT_PATHS = 64.0
 
 
 class PartialFilm:
-    """About 1/k of the pixels of a spec's film, and their integrator; k = 1 gives the spec's own images.
+    """A film of about 1/k of the pixels of a spec's, and their integrator; k = 1 gives the spec's own images.
 
     Each pixel has `halves` times the samples of a half-estimate.
     """

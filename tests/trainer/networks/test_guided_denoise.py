@@ -112,6 +112,28 @@ def test_what_it_learned_for_one_pass_fades_by_the_root_of_their_number(make_sou
     torch.testing.assert_close(image(25.0), mixed, rtol=1e-3, atol=1e-4)
 
 
+@pytest.mark.parametrize("passes", [4.0, 25.0])
+def test_by_a_setting_known_direct_light_is_filtered_in_its_images_and_less_as_passes_come(
+    make_source, passes: float
+) -> None:
+    """Before anything is learned, and where the half is too noisy to be taken."""
+    source = make_source(1)
+    inputs = batch_of(source, (0,), NEEDS).inputs
+    told = {"passes": torch.full((1,), passes), "variance": torch.full_like(inputs.depth, 1e9)}
+    inputs = replace(inputs, noisy=replace(inputs.noisy, **told))
+    images = []
+    for filters in (False, True):
+        made = network(source, filter="own", filter_direct=filters)
+        torch.nn.init.zeros_(made.image_synthesis.out.weight)
+        torch.nn.init.zeros_(made.image_synthesis.out.bias)
+        images.append(made(inputs).detach())
+    quieter = made.share_direct(made.filter_direct(inputs)[1], torch.zeros(1, 1, 1, 3))
+    assert quieter.abs().max() > 0.01
+    of_known = 0.1192 / passes**0.5  # whose share of the image is not that of the filtered half
+    added = (of_known + (1 - of_known) / passes**0.5) * quieter
+    torch.testing.assert_close(images[1] - images[0], added, rtol=1e-3, atol=1e-4)
+
+
 def test_its_image_depends_on_half_a_and_never_on_half_b(make_source) -> None:
     source = make_source(1)
     made, sample = network(source), source.read(0)

@@ -109,9 +109,9 @@ def rendered(seen: Seen) -> Rendered:
 def of_architecture(seen: Seen, architecture: Architecture, passes: int = 1) -> Rendered:
     """A network that has been trained a little, and what it sees; of a half so many passes that are no targets here.
 
-    Of the guided ones, guided_transport filters its direct light.
+    Of the guided ones, guided_transport and guided_denoise filter their direct light.
     """
-    filters = architecture == "guided_transport"
+    filters = architecture in ("guided_transport", "guided_denoise")
     network_settings = NetworkSettings(architecture=architecture, width=8, least_specular=0.04, filter_direct=filters)
     tensors = SampleTensors(seen.spec, ARCHITECTURES[architecture].needs.fields, exposure=seen.spec.exposure)
     memory = tensors.empty(1)

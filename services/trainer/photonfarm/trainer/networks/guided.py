@@ -102,11 +102,11 @@ class Guided(Network):
     ) -> None:
         """Take `further` channels of a kind of guided network beside those of transport, photons and guides.
 
-        A kind with other `outputs` than light has its own way with noise, and its direct light is not filtered.
+        Its `outputs` begin with light; the shares of filtered direct light follow them.
         """
         photon_light = PhotonLight(frame, settings.architecture, bounces=1) if photons else None
         further += (CHANNELS if transport else 0) + (3 * len(WINDOWS) if photons else 0)
-        self.filters_direct = settings.filter_direct and outputs == LIGHT
+        self.filters_direct = settings.filter_direct
         if self.filters_direct:
             further, outputs = further + 2 * LIGHT, outputs + len(SHARES_OF_DIRECT)
         super().__init__(settings, frame, further=further + GUIDE_CHANNELS, outputs=outputs)
@@ -120,18 +120,27 @@ class Guided(Network):
         further, inputs = self.further(inputs), self.raise_specular(inputs)
         if not self.filters_direct:
             return self.known(inputs, further) + self.factor(inputs) * self.synthesise(self.channels(inputs, further))
+        seen, filtered = self.filter_direct(inputs)
+        made = self.synthesise(self.channels(inputs, [*further, *seen]))
+        quieter = self.share_direct(filtered, made)
+        return self.known(inputs, further) + quieter + self.factor(inputs) * made[..., :LIGHT]
+
+    @torch.no_grad()
+    def filter_direct(self, inputs: Inputs) -> tuple[list[Tensor], Tensor]:
+        """Direct light, filtered finely and coarsely: channels of it, and what that adds, (B, H, W, 3, 2)."""
         guides = require(inputs.guides)
         plain = guides.direct + guides.gloss
-        with torch.no_grad():
-            reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
-            variance, places = estimate_variance(plain, reflects), self.measure_places(inputs)
-            filtered = filter_light(plain, reflects, variance, inputs.normal, places)
-            seen = [torch.log1p((light / reflects).clamp(min=0)) for light in filtered]
-            shows = floor(inputs.albedo, guides) / REFLECTANCE_FLOOR
-        made = self.synthesise(self.channels(inputs, [*further, *seen]))
-        shares = torch.softmax(self.shares_of_direct + made[..., 3:], dim=-1)
-        quieter = torch.stack([shows * (light - plain) for light in filtered], dim=-1) * shares[..., None, 1:]
-        return self.known(inputs, further) + quieter.sum(dim=-1) + self.factor(inputs) * made[..., :3]
+        reflects = reflectance(inputs.albedo, guides) + REFLECTANCE_FLOOR
+        variance, places = estimate_variance(plain, reflects), self.measure_places(inputs)
+        filtered = filter_light(plain, reflects, variance, inputs.normal, places)
+        shows = floor(inputs.albedo, guides) / REFLECTANCE_FLOOR
+        seen = [torch.log1p((light / reflects).clamp(min=0)) for light in filtered]
+        return seen, torch.stack([shows * (light - plain) for light in filtered], dim=-1)
+
+    def share_direct(self, filtered: Tensor, made: Tensor) -> Tensor:
+        """What the learned shares of filtered direct light, the last outputs, add to the image, (B, H, W, 3)."""
+        shares = torch.softmax(self.shares_of_direct + made[..., -len(SHARES_OF_DIRECT) :], dim=-1)
+        return (filtered * shares[..., None, 1:]).sum(dim=-1)
 
     def measure_places(self, inputs: Inputs) -> Tensor:
         """Where each pixel's surface is, from the eye, over the scene's size, (B, H, W, 3)."""

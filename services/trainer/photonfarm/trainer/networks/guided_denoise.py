@@ -13,11 +13,12 @@ al., Deep Combiner, 2020, learn such weights). All inputs depend on half A alone
 two take turns [data.batch].
 
 n is the number of passes of the half. The squared error of a denoiser falls by √n (docs/results/networks.md), and that
-of what is known without any sample does not fall. So with √n fades what the network learned to set against the noise
-of one pass: what it adds, its error, and the share of the coarse filter, whose window stays as wide. By the same factor
-the half takes over from the known light where nothing reflects by the guides, which do not see all paths. And where the
-guess is further from the half than noise explains, v is at least 1 − (1 + 4/n) · variance / (half − guess)², both
-means over 5 × 5 pixels (James and Stein, 1961, with slack for a variance that is itself estimated from n passes).
+of what is known without any sample does not fall. So with √n fades what the network learned to set against the noise of
+one pass: what it adds, its error, the share of the coarse filter, whose window stays as wide, and what the settings'
+filter of direct light changes in our filtered halves. By the same factor the half takes over from the known light where
+nothing reflects by the guides, which do not see all paths. And where the guess is further from the half than noise
+explains, v is at least 1 − (1 + 4/n) · variance / (half − guess)², both means over 5 × 5 pixels (James and Stein, 1961,
+with slack for a variance that is itself estimated from n passes).
 
 Shape letters: B batch, H W image.
 """
@@ -50,6 +51,9 @@ HALF_CHANNELS = 3 + 3 * (1 + len(WINDOWS)) + 1
 
 SHARES = (-3.0, 0.0, 1.0)
 """The logits of what is filtered before anything is learned: finely, coarsely, by a denoiser."""
+
+OURS = 2
+"""So many of these are ours: they filter what the known direct light does not explain, and add that light again."""
 
 DARK = 0.1
 """The brightness, in exposed radiance, that noise is relative to in darker places."""
@@ -85,13 +89,19 @@ class GuidedDenoise(Guided):
         denoised = require(noisy.filtered) if self._has_denoiser else None
         half = look_at_half(inputs, noisy, self.measure_places(inputs), denoised)
         known = self.known(inputs, lit)
-        made = self.synthesise(self.channels(inputs, [*half.channels, *lit]))
+        seen, smoothed = self.filter_direct(inputs) if self.filters_direct else ([], None)
+        made = self.synthesise(self.channels(inputs, [*half.channels, *lit, *seen]))
         light, weight = self.factor(inputs) * made[..., :3], torch.sigmoid(START + made[..., 3:4])
         passes = torch.ones_like(noisy.colour[:, 0, 0, 0]) if noisy.passes is None else noisy.passes
         fading = 1 / passes.sqrt()[:, None, None, None]
         error = fading * functional.softplus(TRUSTED + made[..., 4:5])
-        shares = torch.softmax(self.shares + made[..., 5:] + self.coarse * fading.log(), dim=-1)
+        logits = self.shares + made[..., 5 : 5 + len(self.shares)]
+        shares = torch.softmax(logits + self.coarse * fading.log(), dim=-1)
         filtered = (half.filtered * shares[..., None, :]).sum(dim=-1)
+        if smoothed is not None:
+            quieter = self.share_direct(smoothed, made)
+            known = known + quieter
+            filtered = filtered + fading * shares[..., :OURS].sum(dim=-1, keepdim=True) * quieter
         added = fading * ((1 - weight) * (known - filtered) + light)
         shows = half.shows + (1 - half.shows) * (1 - fading)
         guess = torch.lerp(known + light, filtered + added, shows)

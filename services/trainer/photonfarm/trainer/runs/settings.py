@@ -160,7 +160,7 @@ class NetworkSettings(Frozen):
     least_specular: Annotated[float, Field(ge=0, le=0.2)] = 0.0  # of guided networks (ours): what a surface that has
     # any lobe but the diffuse one reflects by it, at least, where it is smooth; 0.04 is glass seen straight on, of
     # which the guides' few samples find nothing
-    filter_direct: bool = False  # of guided networks but guided_denoise (ours): direct light, whose samples are few, is
+    filter_direct: bool = False  # of guided networks (ours): direct light, whose samples are few, is
     # also filtered by its noise and the surfaces, and each pixel has a learned share of it as it is and as filtered
     demodulation: Annotated[float, Field(gt=0, le=1)] | None = None  # ε: output × (albedo + ε) is the image; None: not;
     # guided networks have a rule of their own, and ignore it

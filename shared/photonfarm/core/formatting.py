@@ -15,6 +15,11 @@ def format_bytes(size_bytes: float) -> str:
     return f"{size_bytes / 1e9:,.2f} GB" if size_bytes >= 1e9 else f"{size_bytes / 1e6:.1f} MB"
 
 
+def format_share(share: float) -> str:
+    """A share in per cent, of two digits, or from 10 % on a whole number: "0.068 %", "7.5 %", "123 %"."""
+    return f"{100 * share:.2g} %" if abs(share) < 0.1 else f"{100 * share:.0f} %"
+
+
 def format_milliseconds(seconds: float) -> str:
     """A short time in milliseconds, without the unit."""
     return f"{1e3 * seconds:.1f}"

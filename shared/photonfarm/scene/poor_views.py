@@ -14,6 +14,8 @@ import math
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
+from photonfarm.core.formatting import format_share
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -68,7 +70,7 @@ def is_unlit(
 def describe_counts(counts: Mapping[str, int]) -> str:
     """What share of `samples` is `black`, and of `views` is `near`, in words; "" if none is."""
     parts = [
-        f"{counts[poor]} of {counts[of]} {of} ({100 * counts[poor] / counts[of]:.2g} %) {words}"
+        f"{counts[poor]} of {counts[of]} {of} ({format_share(counts[poor] / counts[of])}) {words}"
         for poor, of, words in (
             ("black", "samples", "are black"),
             ("near", "views", "show little but a surface within a hand of the camera"),

@@ -29,12 +29,17 @@ def test_a_still_wall_does_not_flicker_and_noise_does() -> None:
         view, depth, still = look(spec, 0.07 * step)
         a, b = (still + rng.normal(0, noise, still.shape).astype(np.float32) for _ in "AB")
         lit = still + np.float32(noise * (step > 0))
-        films.add(view, depth, {"still": [still], "noisy": [a], "halves": [a, b], "lit": [lit]})
+        films.add(
+            view,
+            depth,
+            {"still": [still], "noisy": [a], "halves": [a, b], "lit": [lit], "opposed": [lit, 2 * still - lit]},
+        )
     told = films.result()
     assert told["still"] == pytest.approx(0, abs=1e-3)
     assert told["lit"] == pytest.approx(noise / 2**0.5, rel=0.02), "from one of two frames to the next"
     assert noise < told["noisy"] < 2**0.5 * noise, "that of a pixel, and that of the mean of four before"
-    assert told["halves"] < 0.2 * noise, "noise that is independent cancels"
+    assert (told["halves"] or 0) < 0.2 * noise, "noise that is independent cancels"
+    assert told["opposed"] is None, "a negative mean square"
 
 
 def test_what_was_hidden_or_out_of_the_image_does_not_count() -> None:

@@ -13,6 +13,7 @@ from PIL import Image
 from small_room import rendered, trained
 
 from photonfarm.cli.main import umbrella
+from photonfarm.core.formatting import format_share
 from photonfarm.core.pictures import GAP
 from photonfarm.predict import open_run
 from photonfarm.scene.arrangement import Shot
@@ -107,7 +108,7 @@ def test_the_verb_shows_each_configuration_of_a_file_with_its_truth(store: Path,
     assert done.exit_code == 0
     said = [json.loads((out / f"frame-{i:04}/frame.json").read_text()) for i in range(2)]
     for i, each in enumerate(said):
-        assert f"own squared error is {100 * each['truth_error'] / each['mean_square']:.2g} % of" in done.stdout
+        assert f"own squared error is {format_share(each['truth_error'] / each['mean_square'])} of" in done.stdout
         assert {*map(str, (out / f"frame-{i:04}").iterdir())} <= {*done.stdout.splitlines()}
     assert [each["without"] for each in said] == [["vase"], ["sofa", "vase"]]
     assert [each["place"] for each in said] == [{"sofa": [0.9, 0, 0.3]}, {}]

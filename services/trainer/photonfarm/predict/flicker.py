@@ -88,8 +88,13 @@ class Flicker:
                 self._sums[name] = self._sums.get(name, 0.0) + float((first * second).sum())
         self._before = view, depth, images
 
-    def result(self) -> dict[str, float]:
-        """The root of the mean square of what changed, of each film; empty where no surface stayed in view."""
+    def result(self) -> dict[str, float | None]:
+        """The root of the mean square of what changed, of each film; empty where no surface stayed in view.
+
+        It is None where the mean product of two noisy images is negative, and so not told apart from 0.
+        """
         return {
-            name: float(np.sqrt(max(total / self._count, 0.0))) for name, total in self._sums.items() if self._count
+            name: float(np.sqrt(total / self._count)) if total >= 0 else None
+            for name, total in self._sums.items()
+            if self._count
         }

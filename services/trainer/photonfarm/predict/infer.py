@@ -30,7 +30,7 @@ from photonfarm.plan.hold_out import rows_held_out
 from photonfarm.predict.flicker import Flicker
 from photonfarm.predict.infer_result import InferResult
 from photonfarm.predict.opened_run import OpenRun, never_seen
-from photonfarm.renderer.jobs.truth import Amount, Truth, write_beside
+from photonfarm.renderer.jobs.truth import UNSURE, Amount, Truth, write_beside
 from photonfarm.scene.arrangement import Arrangement, describe_shot, find_doubts, list_shot
 from photonfarm.scene.camera_path import Frames
 from photonfarm.scene.groups import names_of_ids
@@ -65,7 +65,7 @@ def show_frame(
 ) -> InferResult:
     """Write the network's image of a configuration, and with an `amount` the truth beside it: as `write_beside`.
 
-    frame.json says what stands where, by names, what the network never saw, seconds, and the error with its interval.
+    frame.json says what stands where, by names, what is doubtful, seconds, and the error with its interval.
     With `store_it`, the view is planned as a sample, which workers find by themselves.
     """
     with torch.no_grad():
@@ -143,7 +143,7 @@ def show_sample(store: str | Path, run: TrainedRun, row: int, out: Path, device:
         **list_shot(*shot),
         "row": row,
         "held_out": is_held_out,
-        "doubts": [*never_seen(find_doubts(*shot))],
+        "doubts": find_doubts(*shot),
         "seconds": seconds,
         **_list_figures(target),
     }
@@ -209,7 +209,9 @@ def show_path(
     with torch.no_grad():
         images = _follow(opened, modification, views, flicker, amount)
         shown = _show_images(images, len(views), out, fps, "for what the network reads and the network")
-    changed = ", ".join(f"{name} {value:.3g}" for name, value in flicker.result().items())
+    changed = ", ".join(
+        f"{name} {f'({UNSURE})' if value is None else f'{value:.3g}'}" for name, value in flicker.result().items()
+    )
     told = (
         f"the root mean square change of surfaces that stay in view: {changed}"
         if changed
@@ -229,7 +231,7 @@ def _describe_path(
     sentence: str,
     about: Mapping[str, Any],
 ) -> InferResult:
-    """What `_show_images` has shown of a configuration, with what stands where, and what the network never saw."""
+    """What `_show_images` has shown of a configuration, with what stands where, and what is doubtful."""
     stands = Arrangement.from_modification(spec, modification)
     said = {"scene": scene_id, **stands.model_dump(mode="json", exclude={"move"})}
     doubts = [*never_seen(find_doubts(spec, modification))]

@@ -90,7 +90,7 @@ class Frame:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """What the network never saw, each a sentence, as `photonfarm infer` says it; rays are traced to find some."""
+        """What is doubtful, each a sentence, as `photonfarm infer` says it; rays are traced to find some."""
         return (*self.beyond, *self.look_closer())
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -242,11 +242,14 @@ class OpenRun:
     def look_closer(
         self, configuration: Modification | None = None, view: View | None = None, **asked: Any
     ) -> tuple[str, ...]:
-        """What stands in walls, or beyond them, and what the camera is inside of, each as a sentence; as `predict`."""
+        """What stands in walls, or beyond them, and what the camera is inside of, each as a sentence; as `predict`.
+
+        Samples may show that too, where boxes reach into walls: so it is not said that the network never saw it.
+        """
         from photonfarm.renderer.scene.surroundings import look_closer
 
         configuration, view = self.stage(configuration, view, **asked)
-        return never_seen(look_closer(self._scene, configuration, view))
+        return tuple(look_closer(self._scene, configuration, view))
 
     def find_groups(
         self, configuration: Modification | None = None, view: View | None = None, **asked: Any
@@ -359,7 +362,7 @@ class OpenRun:
 
 
 def never_seen(doubts: Iterable[str]) -> tuple[str, ...]:
-    """Doubts as those of a network."""
+    """What no random sample shows, as the doubts of a network."""
     return tuple(f"{doubt}: the network never saw that" for doubt in doubts)
 
 

@@ -81,7 +81,7 @@ def scene_check(spec: str, out: Path, cameras: Path | None, configurations: Path
     written to a store. The exit code is 0 whatever is found, as long as the spec can be used.
 
     With --cameras or --configurations only what these files say is looked at, and no page is made: what is outside its
-    box, in a wall, or otherwise as no random sample shows it.
+    box, or otherwise as no random sample shows it, and what stands in a wall.
     """
     if out.suffix not in (".html", ".htm"):
         raise click.BadParameter(f"{str(out)!r}: it is a page; name it like check.html", param_hint="--out")

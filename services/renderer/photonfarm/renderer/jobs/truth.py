@@ -21,6 +21,7 @@ from photonfarm.core import pictures
 from photonfarm.core.archives import require_openexr, write_arrays, write_layers
 from photonfarm.core.errors import SpecError, StoreError, store_errors
 from photonfarm.core.files import make_folder, whole_file
+from photonfarm.core.formatting import format_share
 from photonfarm.core.keys import Key, make_key, view_key
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import Estimate, clean_error, jackknife
@@ -48,6 +49,9 @@ SMALL_HALF = 4
 
 MOST_SPP = 1 << 16
 """The most samples per pixel where the image's own error is what ends."""
+
+UNSURE = "not told apart from 0: more samples would"
+"""What is said of an unbiased estimate that noise may have made."""
 
 SUFFIXES = (".npz", ".exr", ".png")
 """The kinds of files that an image in two halves is written as."""
@@ -155,14 +159,16 @@ class Truth:
         """A squared error in words, as a share of the mean square."""
         power = self.power()
         return (
-            f"{100 * error / power:.2g} % of the image's mean square" if power > 0 else f"{error:.2g} on a black image"
+            f"{format_share(error / power)} of the image's mean square"
+            if power > 0
+            else f"{error:.2g} on a black image"
         )
 
     def describe_estimate(self, error: Estimate, radiance: F32) -> str:
         """What `error` returned for an image, in words, with its interval, and with its share below white."""
         low, high = error.interval or (error.mean, error.mean)
         reach = f"95 % interval {low:.5f} … {high:.5f}: {self.describe_error(error.mean)}"
-        unsure = "; not told apart from 0: more samples would" if low < 0 else ""
+        unsure = f"; {UNSURE}" if low < 0 else ""
         return f"squared error {error.mean:.5f}, {reach}{self.describe_below_white(radiance)}{unsure}"
 
     def describe_below_white(self, radiance: F32) -> str:
@@ -170,7 +176,7 @@ class Truth:
         pixels, share = self.error_below_white(radiance)
         if share is None or pixels == 1:
             return ""
-        return f", and {100 * share:.2g} % below white ({100 * pixels:.0f} % of the pixels)"
+        return f", and {format_share(share)} below white ({100 * pixels:.0f} % of the pixels)"
 
 
 class RefinedTruth:
@@ -258,7 +264,7 @@ class RenderedImage:
     view: View
     truth: Truth
     groups: NDArray[np.int16]  # (H, W) as `LoadedScene.find_groups` has them
-    doubts: tuple[str, ...]  # what no sample of the spec shows, each a sentence
+    doubts: tuple[str, ...]  # what no random sample shows, or stands in walls, each a sentence
 
     def document(self) -> dict[str, Any]:
         """What was rendered, for JSON; what stands where is said by names."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from photonfarm.core.formatting import format_share
 from photonfarm.core.records import F32
 from photonfarm.renderer.tools.check.samples import Cameras, Samples
 from photonfarm.renderer.tools.check.shapes import Placed
@@ -122,24 +123,25 @@ def _check_place(spec: SceneSpec, measured: Measured) -> Iterator[Finding]:
 
 def _check_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
     if cameras.nothing.mean() >= EMPTY:
-        yield Finding("view.look_at", f"{percent(cameras.nothing.mean())} of the cameras see no surface at all")
+        yield Finding("view.look_at", f"{format_share(cameras.nothing.mean())} of the cameras see no surface at all")
     if cameras.behind.mean() >= BEHIND:
         yield Finding(
             "view.origin",
-            f"{percent(cameras.behind.mean())} of the cameras stand outside the room, with a wall between them and "
-            "what they look at; make origin smaller, or keep them out by `photonfarm scene free-space SPEC --write`",
+            f"{format_share(cameras.behind.mean())} of the cameras stand outside the room, with a wall between them "
+            "and what they look at; make origin smaller, or keep them out by `photonfarm scene free-space SPEC "
+            "--write`",
         )
     elif cameras.inside_share >= INSIDE:
         most = " and ".join(repr(name) for name, _ in cameras.holders()[:2])
         yield Finding(
             "view.origin",
-            f"{percent(cameras.inside_share)} of the cameras stand inside objects, most of them inside {most}; keep "
-            "origin away from furniture, or cameras out of it by `photonfarm scene free-space SPEC --write`",
+            f"{format_share(cameras.inside_share)} of the cameras stand inside objects, most of them inside {most}; "
+            "keep origin away from furniture, or cameras out of it by `photonfarm scene free-space SPEC --write`",
         )
     elif cameras.near.mean() >= NEAR:
         yield Finding(
             "view.origin",
-            f"{percent(cameras.near.mean())} of the views show little but a surface within a hand "
+            f"{format_share(cameras.near.mean())} of the views show little but a surface within a hand "
             f"({hand_of(spec):.2g}); `photonfarm scene free-space SPEC --write` keeps cameras away from surfaces",
             serious=False,
         )
@@ -150,15 +152,15 @@ def _check_cameras(spec: SceneSpec, cameras: Cameras) -> Iterator[Finding]:
     if little >= SEES_LITTLE:
         yield Finding(
             "view",
-            f"{percent(little)} of the views see fewer than {max(1, round(LEAST_SEEN * spec.points))} of the "
+            f"{format_share(little)} of the views see fewer than {max(1, round(LEAST_SEEN * spec.points))} of the "
             f"{spec.points} points, as they look at a wall from close by, or past the scene",
             serious=False,
         )
     if cameras.dark[well].mean() >= BLACK_BACKS:
         yield Finding(
             "scene.file",
-            f"{percent(cameras.dark[well].mean())} of what the cameras see are backs of one-sided materials, which "
-            'are black; put <bsdf type="twosided"> around them in the scene file, if cameras may see them',
+            f"{format_share(cameras.dark[well].mean())} of what the cameras see are backs of one-sided materials, "
+            'which are black; put <bsdf type="twosided"> around them in the scene file, if cameras may see them',
         )
 
 
@@ -192,13 +194,13 @@ def _check_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> I
         yield Finding(
             f"{key}.box",
             f"box of {group.name!r} lets it leave the room, or stand in what does not move, in "
-            f"{percent(placed.outside)} of its places; make it smaller",
+            f"{format_share(placed.outside)} of its places; make it smaller",
         )
     elif placed.cut >= CUT_AT_ALL:
         yield Finding(
             f"{key}.box",
-            f"in {percent(placed.cut)} of its places {group.name!r} overlaps what does not move, such as "
-            f"{placed.through!r}: at {_point(placed.place)} {percent(placed.worst)} of its surface is inside",
+            f"in {format_share(placed.cut)} of its places {group.name!r} overlaps what does not move, such as "
+            f"{placed.through!r}: at {_point(placed.place)} {format_share(placed.worst)} of its surface is inside",
             serious=placed.cut >= CUT,
         )
     up = int(np.abs(spec.view.up).argmax())
@@ -207,11 +209,6 @@ def _check_group(spec: SceneSpec, group: Movable, placed: Placed, key: str) -> I
         yield Finding(
             f"{key}.box.min", f"box of {group.name!r} raises it by at least {raised:.3g}, so that it floats", False
         )
-
-
-def percent(share: float) -> str:
-    """A share in words."""
-    return f"{100 * share:.2g} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
 def _point(point: Sequence[float] | F32) -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from markupsafe import Markup
 
+from photonfarm.core.formatting import format_share
 from photonfarm.core.page import render_page, write_page
 from photonfarm.core.pictures import Picture
 from photonfarm.core.records import F32, Geometry
@@ -26,7 +27,6 @@ from photonfarm.renderer.tools.check.findings import (
     Finding,
     Measured,
     collect_findings,
-    percent,
 )
 from photonfarm.renderer.tools.check.shape_pictures import Projection, draw_scene
 from photonfarm.renderer.tools.check.shapes import ShapeFacts, facts_of, groups_by_shape, placements
@@ -161,10 +161,10 @@ def _list_facts(check: SceneCheck) -> list[tuple[str, str]]:
     median, low = np.percentile(cameras.seen, [50, 5])
     better = images.find_exposure(TARGET)
     return [
-        ("cameras inside objects", f"{percent(cameras.inside_share)}{holders and f' ({holders})'}"),
-        ("cameras that look through a wall from outside", percent(cameras.behind.mean())),
-        ("cameras that see no surface", percent(cameras.nothing.mean())),
-        ("cameras within a hand of what they see", percent(cameras.near.mean())),
+        ("cameras inside objects", f"{format_share(cameras.inside_share)}{holders and f' ({holders})'}"),
+        ("cameras that look through a wall from outside", format_share(cameras.behind.mean())),
+        ("cameras that see no surface", format_share(cameras.nothing.mean())),
+        ("cameras within a hand of what they see", format_share(cameras.near.mean())),
         ("black pictures", f"{(~images.halves.any(axis=(1, 2, 3, 4))).sum()} of {len(images.halves)}"),
         ("points that a view sees", f"{median * points:.0f} of {points}; 5 % of views: below {low * points:.0f}"),
         (

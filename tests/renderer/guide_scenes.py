@@ -47,14 +47,19 @@ def scene_of(**shapes: Shape) -> Any:
     return mi.load_dict({"type": "scene", **shapes}, optimize=False)
 
 
-def known(scene: Any, view: View = AHEAD, *, light_samples: int = 3, **of_spec: Any) -> Guides:
+def known(
+    scene: Any, view: View = AHEAD, *, light_samples: int = 3, lights_in_glass: bool = False, **of_spec: Any
+) -> Guides:
     """The guides of a view."""
-    return next(of_keys(scene, view, [KEY], light_samples, **of_spec))
+    return next(of_keys(scene, view, [KEY], light_samples, lights_in_glass=lights_in_glass, **of_spec))
 
 
-def of_keys(scene: Any, view: View, keys: list[bytes], light_samples: int, **of_spec: Any) -> Iterator[Guides]:
+def of_keys(
+    scene: Any, view: View, keys: list[bytes], light_samples: int, *, lights_in_glass: bool = False, **of_spec: Any
+) -> Iterator[Guides]:
     """The guides of a view by several keys, one after the other."""
-    recorders, wanted = Recorders() if len(keys) > 1 else None, GuideSpec(light_samples=light_samples)
+    recorders = Recorders() if len(keys) > 1 else None
+    wanted = GuideSpec(light_samples=light_samples, lights_in_glass=lights_in_glass)
     for key in keys:
         materials = Materials.of(scene)
         cameras = ViewCameras.of([view], spec(**of_spec))

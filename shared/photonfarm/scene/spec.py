@@ -134,6 +134,8 @@ class GuideSpec(Frozen):
     """The settings of the guides, which are rendered beside each view's buffers."""
 
     light_samples: Annotated[int, Field(ge=0, le=64)] = 3  # shadow rays of each of a pixel's 16 sub-pixels; 0: none
+    lights_in_glass: bool = Field(default=False, exclude_if=lambda said: not said)  # then left out of ids
+    """Whether lights that smooth glass reflects, beside what it lets through, count as seen."""
 
 
 WITHOUT_SHADOWS = GuideSpec(light_samples=0)

@@ -68,6 +68,19 @@ def test_a_lamp_behind_thin_glass_has_what_the_pane_lets_through() -> None:
     np.testing.assert_allclose(centre(found.beyond_depth), 3, rtol=1e-3)
 
 
+def test_a_lamp_is_reflected_by_glass_that_lets_most_light_through() -> None:
+    """Head-on a face with n = 1.5 reflects R = 0.04, and a thin pane, by all reflections within it, 2R / (1 + R)."""
+    kinds = {"dielectric": 0.04, "thindielectric": 2 * 0.04 / 1.04}
+    for kind, reflected in kinds.items():
+        pane = square((0, 0, 0), (0, 0, 1), 2, bsdf={"type": kind, "int_ior": 1.5, "ext_ior": 1.0})
+        scene = scene_of(pane=pane, lamp=lamp((0, 0, 5), (0, 0, -1), 20))
+        found = known(scene, lights_in_glass=True)
+        np.testing.assert_allclose(centre(found.emission), reflected * RADIANCE, rtol=1e-3)
+        short = known(scene, lights_in_glass=True, transport={"max_depth": 1})
+        assert not short.emission[8, 12].any(), "its path has two edges"
+        assert not known(scene).emission[8, 12].any()
+
+
 def test_what_surrounds_the_scene_is_seen_where_nothing_else_is_and_in_mirrors() -> None:
     sky = {"type": "constant", "radiance": rgb(RADIANCE)}
     mirror = square((0, 0, 0), (0, 0, 1), 0.5, bsdf={"type": "conductor", "specular_reflectance": rgb(GREY)})

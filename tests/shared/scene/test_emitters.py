@@ -106,7 +106,7 @@ IDS = {
 }
 """Their scene ids."""
 
-BUILT_IN = {"room": "587f7f830d03e55075903be44437dc37", "cornell": "b9bde84b7983cda0ba4f8a93cd0db9b7"}
+BUILT_IN = {"room": "33980aa53a26441682c704d27a135e01", "cornell": "b9bde84b7983cda0ba4f8a93cd0db9b7"}
 
 
 @pytest.mark.parametrize("name", IDS)

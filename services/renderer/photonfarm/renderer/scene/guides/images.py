@@ -96,6 +96,7 @@ def view_guides(
         FOLLOWED if materials.has_pure_deltas else 0,
         spec.transport.max_depth if spec.transport.max_depth >= 0 else NO_LIMIT,
         materials.has_other_lobes,
+        wanted.lights_in_glass and materials.has_pure_deltas,
     )
     of_bsdfs = floats(materials.roughness), floats(materials.diffuse_kept)
     pattern = floats(pattern_of(settings.light_samples))
@@ -213,11 +214,14 @@ def _follow(scene: Any, s: _Path, si: Any, settings: GuideSettings) -> _Path:
     """Process one surface `si` on the way: its emission, and the ray that leaves it if it has delta lobes alone.
 
     Sampled at 1/2, glass gives the lobe that takes more than half of the light, with a probability equal to its share.
+    If the settings say so, lights that the other lobe leads to are seen.
     """
     emitted = dr.select(s.active & (s.followed < settings.max_depth), si.emitter(scene).eval(si, s.active), 0)
     bsdf = si.bsdf()
     leads_on = s.active & si.is_valid() & is_pure_delta(bsdf.flags()) & (s.followed < settings.followed)
     bs, weight = bsdf.sample(mi.BSDFContext(), si, mi.Float(0.5), mi.Point2f(0.5), leads_on)
+    if settings.lights_in_glass:
+        emitted += _emitted_beside(scene, s, si, bs, leads_on, settings)
     return _Path(
         active=leads_on,
         ray=dr.select(leads_on, si.spawn_ray(si.to_world(bs.wo)), s.ray),
@@ -226,6 +230,20 @@ def _follow(scene: Any, s: _Path, si: Any, settings: GuideSettings) -> _Path:
         length=dr.select(leads_on, s.length + si.t, s.length),
         followed=dr.select(leads_on, s.followed + 1, s.followed),
     )
+
+
+def _emitted_beside(scene: Any, s: _Path, si: Any, followed: Any, leads_on: Any, settings: GuideSettings) -> Any:
+    """What a surface's other delta lobe, which is not `followed`, shows of lights: their radiance times its share.
+
+    Sampled at 0 glass reflects, and at 1 it transmits.
+    """
+    reflects = mi.has_flag(followed.sampled_type, mi.BSDFFlags.DeltaReflection)
+    u = dr.select(reflects, mi.Float(dr.one_minus_epsilon(mi.Float)), 0)
+    other, weight = si.bsdf().sample(mi.BSDFContext(), si, u, mi.Point2f(0.5), leads_on)
+    splits = leads_on & (other.sampled_component != followed.sampled_component) & (other.pdf > 0)
+    splits &= s.followed + 1 < settings.max_depth
+    shown = scene.ray_intersect(si.spawn_ray(si.to_world(other.wo)), active=splits)
+    return dr.select(splits, weight * other.pdf * shown.emitter(scene).eval(shown, splits), 0)
 
 
 BSDF_SAMPLES = 2

@@ -78,6 +78,9 @@ half_spp = 16  # samples per pixel of each of the halves A and B
 [photons]
 paths = 1024
 depth = 4
+
+[guides]
+lights_in_glass = true  # what glass reflects of lamps and sky
 """
         return put(text, {"view": {"free_space": self.free_space}}, where=self.name) if self.free_space else text
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from photonfarm.core.errors import SpecError
+from photonfarm.core.formatting import format_count
 from photonfarm.scene.arrangement import Arrangement, Shot
 from photonfarm.scene.modification import Modification, rest
 from photonfarm.scene.spec import SceneSpec
@@ -184,27 +185,32 @@ def _read_table(file: Path) -> Iterator[tuple[str, dict[str, Any]]]:
     """The rows of a CSV file, by names and coordinates, each with its line; the first line has the names."""
     try:
         with file.open(newline="", encoding="utf-8-sig") as lines:
-            for name in (rows := csv.DictReader(lines, restval="")).fieldnames or ():
-                _check_column(file, name.strip())
-            for row in rows:
+            rows = csv.reader(lines)
+            names = [name.strip() for name in next(rows, [])]
+            for number, name in enumerate(names):
+                _check_column(file, name, names[:number])
+            for row in filter(None, rows):
                 where = f"line {rows.line_num}"
-                if None in row:
-                    raise SpecError(f"{file}: {where}: has more cells than the first line has names")
+                if len(row) != len(names):
+                    cells = format_count(len(row), "cell")
+                    raise SpecError(f"{file}: {where}: has {cells}, and the first line has {len(names)} names")
                 yield (
                     where,
-                    {name.strip(): cell.strip() for name, cell in row.items() if name and cell and cell.strip()},
+                    {name: cell.strip() for name, cell in zip(names, row, strict=True) if name and cell.strip()},
                 )
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise SpecError(f"{file}: cannot be read: {error}") from error
 
 
-def _check_column(file: Path, name: str) -> None:
-    """Raise SpecError for a column that means nothing; those without a name are not read."""
+def _check_column(file: Path, name: str, before: Sequence[str]) -> None:
+    """Raise SpecError for a column that means nothing, or is there twice; those without a name are not read."""
     if ";" in name:
         raise SpecError(f"{file}: line 1: semicolons are between the columns; commas are required, and decimal points")
     if name and not COLUMN.fullmatch(name):
         known = ", ".join(f"NAME.{what}" for what in OF_GROUPS)
         raise SpecError(f"{file}: line 1: column {name!r}: is none of {known}, camera.x … look_at.z, fov")
+    if name and name in before:
+        raise SpecError(f"{file}: line 1: column {name!r}: is there twice")
 
 
 def _fill_places(cells: Mapping[str, str], spec: SceneSpec, start: Modification | None) -> dict[str, Any]:
@@ -229,6 +235,9 @@ def _fill_places(cells: Mapping[str, str], spec: SceneSpec, start: Modification 
             entry[what][name] = number
         else:
             entry["fov"] = number
+    for name in ("camera", "look_at"):
+        if empty := [f"{name}.{x}" for x, number in zip("xyz", entry.get(name, ()), strict=False) if number is None]:
+            raise SpecError(f"{' and '.join(empty)} {'is' if len(empty) == 1 else 'are'} empty; a point has all three")
     for changes in ("place", "colour", "turn", "power"):
         entry[changes] = {name: value for name, value in entry[changes].items() if name not in entry["without"]}
     return entry

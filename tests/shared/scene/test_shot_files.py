@@ -121,7 +121,7 @@ def test_configurations_are_read_by_names_from_json_and_csv_alike(tmp_path: Path
     (tables := tmp_path / "rooms.json").write_text(json.dumps(entries))
     (cells := tmp_path / "rooms.csv").write_text(
         "object.x, object.z, object.present, camera.x, camera.y, camera.z, look_at.x, look_at.y, look_at.z\n"
-        "0.5, 0.25, 1, 1, 0.5, 0, 0, 0, 0\n, , 0\n, , 1\n"
+        "0.5, 0.25, 1, 1, 0.5, 0, 0, 0, 0\n, , 0,,,,,,\n\n, , 1,,,,,,\n"
     )
     for file in (tables, cells):
         (first, camera), (second, none), (third, _) = read_configurations(file, SPEC)
@@ -189,7 +189,11 @@ def test_the_table_of_the_page_is_of_the_room(tmp_path: Path) -> None:
         ("object.x,object\n0,1", r"line 1: column 'object': is none of NAME\.x"),
         ("object.x;object.z\n0,5;1", "line 1: semicolons .* commas are required"),
         ("", "no conf"),
-        ("object.x,object.z\n\n0,0\n0,5,0,5", "line 4: has more cells"),
+        ("object.x,object.z\n\n0,0\n0,5,0,5", "line 4: has 4 cells, and the first line has 2 names"),
+        ("object.x,object.z\n0", "line 2: has 1 cell,"),
+        ("object.x, object.z,object.x \n0,0,1", r"line 1: column 'object\.x': is there twice"),
+        ("camera.x,camera.y,camera.z\n2,,", r"line 2: camera\.y and camera\.z are empty"),
+        ("look_at.x,look_at.z\n2,0", r"line 2: look_at\.y is empty"),
         ("lamp.present\n1", "'lamp' is no"),
     ],
 )

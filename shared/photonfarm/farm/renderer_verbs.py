@@ -13,6 +13,7 @@ from photonfarm.core.processes import can_render, command
 from photonfarm.plan.sample_costs import SampleCosts
 from photonfarm.scene.arrangement import find_doubts, list_shot
 from photonfarm.scene.modification import Modification
+from photonfarm.scene.shot_files import name_frames
 from photonfarm.scene.spec_loading import NamedSpec
 from photonfarm.scene.view import View
 
@@ -38,20 +39,20 @@ def measure_costs(spec: str, seconds: float) -> SampleCosts:
 def collect_doubts(
     named: NamedSpec, shots: Sequence[tuple[Modification, View]], log: Callable[[str], object]
 ) -> list[str]:
-    """What is doubtful of chosen configurations and views, each as a sentence; of the first ones by surfaces, too.
+    """What is doubtful of chosen configurations and views, as `name_frames` says it; of the first by surfaces, too.
 
     `log` is called with the reason if surfaces are not looked at.
     """
-    found = dict.fromkeys(doubt for shot in shots for doubt in find_doubts(named.spec, *shot))
+    doubts: list[str] = []
     listed = [list_shot(named.spec, *shot) for shot in shots[:MOST_LOOKED_AT]]
     with tempfile.TemporaryDirectory() as folder:
         (file := Path(folder, "shots.json")).write_text(json.dumps(listed))
         try:
-            said = json.loads(_ask("scene", "check", "--json", "--configurations", str(file), "--", named.name))
-            found |= dict.fromkeys(map(str, said))
+            doubts = json.loads(_ask("scene", "check", "--json", "--configurations", str(file), "--", named.name))
         except BackendError as error:
             log(f"whether anything stands in a wall is not known: {error}")
-    doubts = [*found]
+            listed = []
+    doubts += name_frames([find_doubts(named.spec, *shot) for shot in shots[len(listed) :]], len(listed))
     return doubts[:MOST_DOUBTS] + [f"and {len(doubts) - MOST_DOUBTS} more like these"] * (len(doubts) > MOST_DOUBTS)
 
 

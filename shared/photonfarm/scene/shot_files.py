@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,21 @@ def read_shots(
         drawn = () if own or seen_by else (sample_view(spec, key, seed, i, modification) for i in range(views))
         shots += [(modification, view) for view in ([own] if own else [*seen_by, *drawn])]
     return shots
+
+
+def name_frames(doubts: Sequence[Iterable[str]], first: int = 0) -> list[str]:
+    """The doubts about several shots, from the `first` on, each once, after the name that `infer` gives their frame.
+
+    A shot that is alone has no name.
+    """
+    found: dict[str, list[str]] = {}
+    for number, of_shot in enumerate(doubts, first):
+        for doubt in of_shot:
+            found.setdefault(doubt, []).append(f"frame-{number:04}")
+    if first + len(doubts) == 1:
+        return [*found]
+    more = {doubt: f" and {len(names) - 1} more" if len(names) > 1 else "" for doubt, names in found.items()}
+    return [f"{names[0]}{more[doubt]}: {doubt}" for doubt, names in found.items()]
 
 
 # -------------------------------------------------------------------------------------------------------------- cameras

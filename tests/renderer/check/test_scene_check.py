@@ -176,19 +176,21 @@ def test_what_files_say_is_looked_at_alone_and_submit_says_the_same_before_it_pl
     write: Write, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     spec, wall = str(write()), "block reaches outside the room (all that never moves)"
-    (rooms := tmp_path / "rooms.csv").write_text("block.x,camera.x,camera.y,camera.z\n2,1.5,1.5,0\n,0,0.4,0\n")
+    (rooms := tmp_path / "rooms.csv").write_text(
+        "block.x,camera.x,camera.y,camera.z\n2,1.5,1.5,0\n,0,0.4,0\n2,1.5,1.5,0.5\n"
+    )
     from_file = ["--configurations", str(rooms)]
     told = CliRunner().invoke(umbrella, ["scene", "check", spec, *from_file, "--json"])
     expected = [
-        "block stands at 2,0,0, outside its box from -1.2,0,-1.2 to 1.2,0,1.2",
-        wall,
-        "the camera stands at 0,0.4,0, outside the spec's box from -1.8,1.2,-1.8 to 1.8,2,1.8",
-        "the camera is inside 'block'",
+        "frame-0000 and 1 more: block stands at 2,0,0, outside its box from -1.2,0,-1.2 to 1.2,0,1.2",
+        f"frame-0000 and 1 more: {wall}",
+        "frame-0001: the camera stands at 0,0.4,0, outside the spec's box from -1.8,1.2,-1.8 to 1.8,2,1.8",
+        "frame-0001: the camera is inside 'block'",
     ]
     assert json.loads(told.stdout) == expected
     assert not list(tmp_path.glob("*.html"))
     planned = CliRunner().invoke(umbrella, ["submit", spec, *from_file, "--store", str(tmp_path / "s"), "--no-queue"])
-    assert "2 samples planned" in planned.stdout
+    assert "3 samples planned" in planned.stdout
     assert {f"warning: {doubt}" for doubt in expected} <= {*planned.stderr.splitlines()}
     assert "looking at what stands where in small" in capfd.readouterr().err
     monkeypatch.setattr(renderer_verbs, "can_render", lambda: False)

@@ -209,7 +209,7 @@ def test_submit_plans_the_samples_of_files_and_says_what_no_random_one_shows(tmp
     done = CliRunner().invoke(umbrella, [*room, "--configurations", str(tmp_path / "rooms.csv"), "--views", "3"])
     assert done.exit_code == 0, done.output
     assert "6 samples planned" in done.stdout
-    assert "warning: table stands at 9,0,0, outside its box" in done.stderr
+    assert "warning: frame-0003 and 2 more: table stands at 9,0,0, outside its box" in done.stderr
     again = CliRunner().invoke(umbrella, [*room, "--configurations", str(tmp_path / "rooms.csv"), "--views", "3"])
     assert "0 samples planned" in again.stdout
     refused = CliRunner().invoke(umbrella, [*room, "--cameras", str(transforms(tmp_path)), "--views", "3"])
@@ -230,6 +230,8 @@ def test_options_say_where_cameras_of_a_file_look(tmp_path: Path) -> None:
     np.testing.assert_array_equal(rows.view[0, :3], VIEW.origin)
     refused = CliRunner().invoke(umbrella, [*room, *asked, "--camera", "0,1,0"])
     assert (refused.exit_code, "--camera: files say" in refused.stderr) == (2, True)
+    alone = CliRunner().invoke(umbrella, [*room, "--place", "table=9,0,0"])
+    assert "warning: table stands at 9,0,0, outside its box" in alone.stderr
 
 
 def test_a_table_turns_dims_and_colours(tmp_path: Path) -> None:

@@ -34,6 +34,7 @@ from photonfarm.renderer.tools.measure.exposure import TARGET
 from photonfarm.renderer.tools.plan_view import PlanView, Standing, hue
 from photonfarm.scene.arrangement import find_doubts
 from photonfarm.scene.modification import Modification
+from photonfarm.scene.shot_files import name_frames
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.scene.spec_loading import NamedSpec, SpecLines
 from photonfarm.scene.view import View
@@ -87,16 +88,15 @@ def _check(named: NamedSpec, work: WorkLog) -> SceneCheck:
 
 
 def doubt_shots(named: NamedSpec, shots: Iterable[tuple[Modification, View]], log: Log) -> list[str]:
-    """What is doubtful of configurations and views, each as a sentence; the backend must have been loaded."""
-    found: dict[str, None] = {}
+    """What is doubtful of configurations and views, as `name_frames` says it; the backend must have been loaded."""
+    found = []
     with WorkLog(log) as work:
         work.begin(f"looking at what stands where in {named.spec.name}")
         scene = LoadedScene.load(named.spec, named.file.parent)
         for modification, view in shots:
             scene.apply(modification)
-            doubts = [*find_doubts(named.spec, modification, view), *look_closer(scene, modification, view)]
-            found |= dict.fromkeys(doubts)
-    return [*found]
+            found.append([*find_doubts(named.spec, modification, view), *look_closer(scene, modification, view)])
+    return name_frames(found)
 
 
 def _draw_plan(

@@ -96,7 +96,9 @@ def test_pictures_follow_the_state_and_the_truth_goes_on_from_one_request_to_the
         if told["done"]:
             break
     assert spp == 24
-    assert "±" in told["error"]
+    judged = next(reversed(shown._judged.values()))
+    image = judged.frame.radiance.numpy(force=True)
+    assert told["error"] == (truth := judged.refined.result()).describe_estimate(truth.error(image), image)
     assert second["picture"] != told["picture"]
     assert "--place sofa=" in ask(address, "command", moved)["command"]
     assert "--without vase" in ask(address, "command", moved)["command"]
@@ -143,7 +145,7 @@ def test_the_fewest_samples_make_a_truth_too(shown: Live) -> None:
     with serving(replace(shown, open=lambda: shown.run, most_spp=1)) as address:
         told = ask(address, "truth", {**AT_REST, "camera": [-1.5, 1.4, 0.3]})
     assert told["done"]
-    assert "±" in told["error"]
+    assert "95 % interval" in told["error"]
 
 
 def test_viewers_take_turns_so_that_no_truth_holds_up_another_s_frames(shown: Live) -> None:
@@ -179,7 +181,7 @@ def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks
     with chromium() as page:
         for width in (1280, 390):
             page.open(address, width, 1500)
-            page.wait_for("document.querySelector('#error').textContent.includes('±')", 60)
+            page.wait_for("document.querySelector('#error').textContent.includes('95 % interval')", 60)
             before = page.value("document.querySelector('#network').toDataURL()")
             drag(page, "sofa", 0.2)
             page.wait_for(f"document.querySelector('#network').toDataURL() !== {json.dumps(before)}")
@@ -191,7 +193,7 @@ def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks
                 "lens.dispatchEvent(new Event('input')); })()"
             )
             page.wait_for(f"document.querySelector('#network').toDataURL() !== {json.dumps(before)}")
-            page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Random').click()")
+            click(page, "Random")
             page.wait_for("document.querySelector('#truth').classList.contains('old')")
             page.wait_for("!document.querySelector('#truth').classList.contains('old')", 60)
             assert page.value("document.documentElement.scrollWidth") <= width
@@ -199,7 +201,9 @@ def test_a_drag_on_the_plan_changes_the_picture_and_the_truth_follows_at_a_desks
 
 
 @needs_chromium
-def test_what_was_never_seen_stays_said_an_old_error_is_pale_and_the_camera_is_held_in_its_box(address: str) -> None:
+def test_what_was_never_seen_stays_said_an_old_error_is_pale_and_the_camera_is_held_in_its_box(
+    shown: Live, address: str
+) -> None:
     said = "document.querySelector('#{}').textContent"
     with chromium() as page:
         page.open(address, 1280)
@@ -209,11 +213,17 @@ def test_what_was_never_seen_stays_said_an_old_error_is_pale_and_the_camera_is_h
         assert page.value(pale.format("place.sofa[1] += 1; window.live.fov = 99.6")) == "0.35"
         page.wait_for(f"{said.format('doubts')}.startsWith('sofa stands at')")
         assert page.value("document.querySelector('#actions output').textContent") == "100°"
-        page.value("[...document.querySelectorAll('button')].find((b) => b.textContent.startsWith('Copy')).click()")
-        page.wait_for(f"{said.format('said')}.includes('--place sofa=')")
+        click(page, "Copy as a command")
+        page.wait_for(f"{said.format('said')}.includes('--truth 24 --place sofa=')")
         page.wait_for("window.live.isDone && !document.querySelector('#error').classList.contains('old')", 60)
         assert page.value(f"{said.format('doubts')}").startswith("sofa stands at")
         assert "--place sofa=" in page.value(f"{said.format('said')}")
+        with held(shown):  # until then no command is told, and it comes too late
+            click(page, "Copy as a command")
+            click(page, "Random")
+            assert page.value(said.format("said")) == ""
+        page.wait_for("window.live.isDone && !document.querySelector('#error').classList.contains('old')", 60)
+        assert page.value(said.format("said")) == ""
         drag(page, "camera", -9)
         camera, box = page.value("[window.live.camera, window.live.room.camera_box]")
         assert camera[0] in (box["min"][0], box["max"][0])
@@ -222,12 +232,39 @@ def test_what_was_never_seen_stays_said_an_old_error_is_pale_and_the_camera_is_h
 
 
 @needs_chromium
+def test_it_is_said_that_the_page_loads_and_that_the_server_does_not_answer_until_it_does(
+    shown: Live, address: str
+) -> None:
+    told = "['pulse', 'of-network', 'of-truth', 'failed'].map((id) => document.getElementById(id).textContent)"
+    look = "getComputedStyle(document.querySelector('#network')).opacity"
+    cut = {"latency": 0, "downloadThroughput": -1, "uploadThroughput": -1}
+    with chromium() as page:
+        with held(shown):
+            page.open(address, 1280)
+            assert page.value(told) == ["loading", "network · loading", "truth · loading", ""]
+        page.wait_for("window.live?.isDone", 60)
+        assert "loading" not in " ".join(page.value(told))
+        page.call("Network.emulateNetworkConditions", offline=True, **cut)
+        page.wait_for(f"{told}[3] === 'the server does not answer'")
+        assert page.value(look) == "0.35"
+        before = page.value("document.querySelector('#network').toDataURL()")
+        click(page, "Random")
+        time.sleep(0.8)  # further requests fail
+        assert page.value(f"[{told}[3], {look}]") == ["the server does not answer", "0.35"]
+        assert page.value("document.querySelector('#pulse').hidden")
+        page.call("Network.emulateNetworkConditions", offline=False, **cut)
+        page.wait_for(f"document.querySelector('#network').toDataURL() !== {json.dumps(before)} && !{told}[3]")
+        assert page.value(look) == "1"
+        assert not page.value("document.querySelector('#pulse').hidden")
+
+
+@needs_chromium
 def test_two_pages_see_each_their_own_configuration(address: str) -> None:
     with chromium() as one, chromium() as other:
         for page in (one, other):
             page.open(address, 800, 1500)
-            page.wait_for("document.querySelector('#of-network').textContent !== ''", 60)
-            page.value("[...document.querySelectorAll('button')].find((b) => b.textContent === 'Random').click()")
+            page.wait_for("window.live?.isFull", 60)
+            click(page, "Random")
         for page in (one, other):
             whole = "document.querySelector('#of-truth').textContent.startsWith('truth · 24 samples')"
             page.wait_for(f"{whole} && !document.querySelector('#truth').classList.contains('old')", 60)
@@ -266,6 +303,21 @@ def test_a_clip_shows_an_old_truth_as_pale_as_the_page(address: str) -> None:
         page.wait_for(f"{halves}[1] < {0.9 * truth}")
         time.sleep(0.2)  # further pictures of the clip, each over the one before
         assert page.value(halves) == [network, pytest.approx(0.35 * truth, rel=0.02)]
+
+
+@contextmanager
+def held(shown: Live) -> Iterator[None]:
+    """A time in which nothing about the run is answered."""
+    is_over = threading.Event()
+    shown._thread.submit(is_over.wait, 30)
+    try:
+        yield
+    finally:
+        is_over.set()
+
+
+def click(page: Page, button: str) -> None:
+    page.value(f"[...document.querySelectorAll('button')].find((b) => b.textContent === {json.dumps(button)}).click()")
 
 
 def drag(page: Page, what: str, share: float) -> None:

@@ -181,15 +181,13 @@ class Live:
         while not judged.refined.is_enough or (judged.refined.spp < self.most_spp and time.perf_counter() < until):
             self.run.refine(judged.refined, judged.frame)
         truth = judged.refined.result()
-        error = truth.error(judged.frame.radiance)
-        interval = "" if error.standard_error is None else f" ± {1.96 * error.standard_error:.2g}"
+        image = judged.frame.radiance.cpu().numpy()
         return {
             "picture": self._draw(truth.radiance),
             "spp": truth.spp,
             "seconds": truth.seconds,
             "done": truth.spp >= self.most_spp,
-            "error": f"{error.mean:.3g}{interval} (mean square of radiance × exposure, 95 %), "
-            f"{truth.describe_error(error.mean)}{truth.describe_below_white(judged.frame.radiance.cpu().numpy())}",
+            "error": truth.describe_estimate(truth.error(image), image),
         }
 
     def _draw(self, radiance: F32) -> str:
@@ -201,7 +199,7 @@ class Live:
     def command(self, asked: str) -> dict[str, Any]:
         """The command that makes these pictures."""
         configuration, view = self.run.stage(**_read(asked))
-        return {"command": f"{self.begins} {describe_shot(self.run.spec, configuration, view)}"}
+        return {"command": f"{self.begins} --truth {self.most_spp} {describe_shot(self.run.spec, configuration, view)}"}
 
     def submit_shown(self, asked: str) -> dict[str, Any]:
         """Plan the configuration and the view as a sample. Raises NotAllowedError where viewers may not."""

@@ -239,7 +239,7 @@ def live(
     trained, say = TrainedRun.load(run), partial(click.echo, err=True)
     server = listen(host, port, names, usual=LIVE_PORT, warn=say)
     stored = "" if trained.packed else f"--store {shlex.quote(str(store))} "
-    begins = f"photonfarm infer {stored}--run {shlex.quote(str(run))} --truth 256"
+    begins = f"photonfarm infer {stored}--run {shlex.quote(str(run))}"
     with tell_waiting(say, f"loading {trained.name}"):
         shown = Live(lambda: OpenRun(trained, store, device), most_spp, begins, may_submit)
     say(shown.run.describe())

@@ -5,6 +5,7 @@ import { Plan } from "./plan.js";
 import { listenToPointers } from "./pointers.js";
 
 const REST_MS = 150; // without a change, after which the truth is rendered
+const LOOK_MS = 1000; // without a request, after which one asks whether the server is still there
 const WALK = .02; // of the room's size, a step
 
 const $ = (id) => document.getElementById(id);
@@ -16,15 +17,15 @@ const inDegrees = (value) => `${Math.round(value)}°`;
 const sleep = (ms) => new Promise((done) => setTimeout(done, ms));
 
 async function ask(path, more = {}) {
-  const answer = await fetch(path, more);
-  const told = await answer.json();
+  const answer = await fetch(path, more).catch(() => null), told = await answer?.json().catch(() => null);
+  if (!told) throw new Error("the server does not answer");
   if (!answer.ok) throw new Error(told.error);
   return told;
 }
 
 class Live {
   constructor(room) {
-    Object.assign(this, { room, changed: performance.now(), dirty: true, seconds: [], failed: "" });
+    Object.assign(this, { room, changed: performance.now(), answered: 0, dirty: true, seconds: [] });
     this.start();
     this.plan = new Plan($("plan"), this);
     this.listen($("network"));
@@ -77,21 +78,26 @@ class Live {
         if (this.dirty) await this.showNetwork(false);
         else if (rests && !this.isFull) await this.showNetwork(true);
         else if (rests && !document.hidden && !this.isDone) await this.showTruth();
-        else await sleep(30);
-        if (this.failed) this.say((this.failed = ""));
+        else if (!document.hidden && performance.now() - this.answered > LOOK_MS) await ask("room");
+        else {
+          await sleep(30);
+          continue;
+        }
+        this.answered = performance.now();
+        this.fail("");
       } catch (error) {
-        this.say((this.failed = error.message));
+        this.fail(error.message);
         await sleep(500);
       }
     }
   }
 
   async showNetwork(isFull) {
-    this.dirty = false;
+    Object.assign(this, { dirty: false, isFull: false, isDone: false }); // it is asked for again if this fails
     const began = performance.now(), asked = this.state();
     const told = await ask(`${isFull ? "full" : "frame"}/${this.address(asked)}`);
-    Object.assign(this, { isFull, isDone: false });
     const image = await paint($("network"), told.picture);
+    this.isFull = isFull;
     this.seconds = [...this.seconds.slice(-9), performance.now() - began];
     const mean = this.seconds.reduce((sum, value) => sum + value) / this.seconds.length;
     $("of-network").textContent = `network · ${told.ms.toFixed(0)} ms a frame, ${image.width} × ${image.height}`;
@@ -106,12 +112,20 @@ class Live {
     this.age(false);
     this.isDone = told.done;
     $("of-truth").textContent = `truth · ${told.spp} samples per pixel, ${told.seconds.toFixed(1)} s`;
-    $("error").textContent = `error of the network: ${told.error}`;
+    $("error").textContent = `the network's ${told.error}`;
   }
 
   // The truth and what is said by it are of what is shown, or of what was shown before.
   age(isOld) {
     for (const id of ["truth", "of-truth", "error"]) $(id).classList.toggle("old", isOld);
+  }
+
+  // Why the last request failed, or "": what the network shows may be of before.
+  fail(why) {
+    if ($("failed").textContent === why) return; // else it would be read aloud again
+    $("failed").textContent = why;
+    $("pulse").hidden = why !== "";
+    for (const id of ["network", "of-network"]) $(id).classList.toggle("old", why !== "");
   }
 
   say(sentence) {
@@ -230,8 +244,10 @@ class Live {
       }
     }));
     button("Copy as a command", async () => {
-      const { command } = await ask(`command/${this.address(this.state())}`);
-      try { await navigator.clipboard.writeText(command); this.say(`copied: ${command}`); } catch { this.say(command); }
+      const { changed } = this, { command } = await ask(`command/${this.address(this.state())}`);
+      let copied = "copied: ";
+      try { await navigator.clipboard.writeText(command); } catch { copied = ""; }
+      if (changed === this.changed) this.say(copied + command);
     });
     button("Record", (made) => this.record(made));
     if (this.room.may_submit) button("Render and train on this", async () => {

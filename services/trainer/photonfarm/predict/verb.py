@@ -82,7 +82,7 @@ def _refuse_store(run: Path, **asked: object) -> None:
     help="Views whose buffers `photonfarm buffers` wrote, on a machine with the renderer.",
 )
 @click.option("--fps", type=click.FloatRange(1, 50), default=12.0, show_default=True, help="Frames a second of a path.")
-@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="out", show_default=True)
+@click.option("--out", type=click.Path(path_type=Path, file_okay=False), default="shown", show_default=True)
 @device_option
 @json_option
 def infer(

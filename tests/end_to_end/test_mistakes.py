@@ -54,6 +54,7 @@ TABLE = '[[objects]]\nname = "table"\nshapes = ["TableTop"]\nat = [0, 0, 0]\n'
         ("--config none.toml status", 3, ["none.toml"]),
         ("infer --row 0", 4, ["run: there is no such run; `photonfarm train` makes one"]),
         ("infer --run none.photonfarm", 4, ["none.photonfarm: there is no such file; `photonfarm pack` writes one"]),
+        ("infer --run none.onnx", 4, ["none.onnx: there is no such file; `photonfarm pack` writes one"]),
         ("pack --out net.onxx", 2, ["--out: 'net.onxx'", ".photonfarm", ".onnx"]),
     ],
 )

@@ -316,6 +316,18 @@ def arrangement_options(*, camera: bool = True) -> Callable[[Callable[..., Any]]
     return decorate
 
 
+def refuse_own_folder(folder: Path) -> None:
+    """Raise BadParameter for a folder to write pictures into that is a sample store or a training run."""
+    from photonfarm.farm.training import SETTINGS
+    from photonfarm.store.io.storage import FORMAT_FILE
+
+    for name, what in ((FORMAT_FILE, "a sample store"), (SETTINGS, "a training run")):
+        if (folder / name).exists():
+            raise click.BadParameter(
+                f"{folder}: is {what}, as it holds {name}; name another folder", param_hint="--out"
+            )
+
+
 like_option = click.option("--like", metavar="KEY", help="What has this key: a configuration, a view or a sample.")
 
 start_options = combine_options(

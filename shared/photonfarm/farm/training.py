@@ -27,6 +27,9 @@ CHECKPOINT = "checkpoint.safetensors"
 ALONE = ".photonfarm"
 """How the name of a network on its own ends."""
 
+ONNX = ".onnx"
+"""How that of one for programs without torch ends."""
+
 METADATA = "photonfarm"
 """The key of a checkpoint's JSON document in the header of its file."""
 

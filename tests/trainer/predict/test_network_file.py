@@ -146,11 +146,11 @@ def test_what_needs_a_store_is_refused_and_the_page_s_command_makes_such_a_file(
     assert Path("room.photonfarm").stat().st_size == packed.stat().st_size
     Path("store").unlink()
     run = CliRunner().invoke
-    for option in (["--row", "1"], ["--like", "aa"], ["--store-it"]):
+    for option in (["--row", "1"], ["--like", "aa"], ["--store-it"], ["--store", str(store)]):
         refused = run(umbrella, ["infer", "--run", "room.photonfarm", *option])
         assert refused.exit_code == 2
         assert option[0] in refused.output
-        assert f"no store to {'plan' if option == ['--store-it'] else 'look'} in" in " ".join(refused.output.split())
+        assert "is a network on its own, and knows no store" in " ".join(refused.output.split())
     assert run(live, ["--run", "room.photonfarm", "--may-submit"]).exit_code == 2
     shown = run(umbrella, ["infer", "--run", "room.photonfarm", "--place", "ball=1,0.5,0", "--orbit", "2"])
     assert shown.exit_code == 0, shown.output

@@ -10,11 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.core import ParameterSource
 
 from photonfarm.cli.options import (
     address_options,
     arrangement_options,
     json_option,
+    refuse_own_folder,
     shot_file_options,
     start_options,
     store_option,
@@ -32,7 +34,6 @@ if TYPE_CHECKING:
 
 
 LIVE_PORT = 8430
-ONNX = ".onnx"
 
 run_option = click.option(
     "--run",
@@ -45,11 +46,11 @@ run_option = click.option(
 
 
 def _refuse_store(run: Path, **asked: object) -> None:
-    """Refuse options that need a store, for a network on its own."""
+    """Refuse options that need a store, and a store that is named, for a network on its own."""
+    asked["store"] = click.get_current_context().get_parameter_source("store") is ParameterSource.COMMANDLINE
     if run.is_file() and (given := [name for name, value in asked.items() if value not in (None, False)]):
         options = " and ".join(f"--{name.replace('_', '-')}" for name in given)
-        verb = "look" if {"row", "like"} & {*given} else "plan"
-        raise click.UsageError(f"{options}: {run} is a network on its own, and there is no store to {verb} in")
+        raise click.UsageError(f"{options}: {run} is a network on its own, and knows no store")
 
 
 @click.command()
@@ -130,6 +131,7 @@ def infer(
         others = [*given, *alone] if len(given) > 1 or alone else [*given, "what stands where"]
         raise click.UsageError(f"{' and '.join(others)} exclude each other")
     _refuse_store(run, row=row, like=like, store_it=store_it)
+    refuse_own_folder(out)
     frames = Frames.read(buffers) if buffers else None
     along = orbit or (CameraPath.load(path) if path else None)
     if isinstance(along, CameraPath):
@@ -268,7 +270,7 @@ def pack(store: str | Path, run: Path, out: Path) -> None:
     It has weights, settings, the scene with its files, and the point cloud; neither samples nor the state of training.
     With --out NAME.onnx it is the network alone, whose inputs are named as in `photonfarm.data`.
     """
-    from photonfarm.farm.training import ALONE
+    from photonfarm.farm.training import ALONE, ONNX
 
     if out.suffix not in (ALONE, ONNX):
         raise click.BadParameter(f"{str(out)!r}: ends neither in {ALONE} nor in {ONNX}", param_hint="--out")

@@ -15,6 +15,7 @@ from photonfarm.cli.options import (
     arrangement_options,
     device_option,
     json_option,
+    refuse_own_folder,
     start_options,
     store_option,
 )
@@ -242,6 +243,7 @@ def render(
         raise click.BadParameter(f"{str(out)!r}: ends in none of {', '.join(truth.SUFFIXES)}", param_hint="--out")
     file = out or Path("render.png")
     if out is not None or not again:
+        refuse_own_folder(file.parent)
         truth.check_file(file)
     if again:
         repeated = repeat(store, scene, row or 0, pass_number, say)

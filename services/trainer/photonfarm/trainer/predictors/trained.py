@@ -12,7 +12,7 @@ from torch import Tensor
 
 from photonfarm.core.errors import SpecError, StoreError
 from photonfarm.core.records import BasePointCloud, Geometry
-from photonfarm.farm.training import ALONE
+from photonfarm.farm.training import ALONE, ONNX
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, Store
 from photonfarm.trainer.networks import build, find_needs
@@ -55,7 +55,7 @@ class TrainedRun:
             return cls(
                 folder, settings, spec.scene_id, spec.exposure, state["network"], 1, packed, note_training(state)
             )
-        if folder.suffix == ALONE and not folder.exists():
+        if folder.suffix in (ALONE, ONNX) and not folder.exists():
             raise StoreError(f"{folder}: there is no such file; `photonfarm pack` writes one")
         settings, state = read_settings(folder), checkpoint.load(folder / name)
         identity = {"scene_id": state["scene_id"], "settings": settings.model_dump(mode="json")}

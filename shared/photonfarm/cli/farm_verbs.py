@@ -135,12 +135,13 @@ def submit(
         if cameras or configurations:
             _refuse_given("files say what is planned", "modifications", "camera", "look_at", "fov")
             _refuse_given("is of random views; --cameras has them all", *(("views", "seed") if cameras else ()))
-            views, seed = request.views_per_modification, request.seed
-            chosen = read_shots(named.spec, cameras, configurations, modification, views=views, seed=seed)
+            # of random views one is looked at, so that frames are numbered as by `infer`
+            files, counts = (named.spec, cameras, configurations, modification), (request.views_per_modification, 1)
+            chosen, shown = (read_shots(*files, views=count, seed=request.seed) for count in counts)
         else:
             _refuse_given("is of random samples; one view of one configuration is asked for", *RANDOM)
-            chosen = [(modification, asked.view(named.spec, start[1]))]
-        doubts = collect_doubts(named, chosen, log)
+            shown = chosen = [(modification, asked.view(named.spec, start[1]))]
+        doubts = collect_doubts(named, shown, log)
         wanted = Chosen.of_all(named.spec, chosen, request.passes)
     for warning in (*warnings(named), *doubts):
         click.echo(f"warning: {warning}", err=True)

@@ -154,7 +154,7 @@ def test_what_needs_a_store_is_refused_and_the_page_s_command_makes_such_a_file(
     assert run(live, ["--run", "room.photonfarm", "--may-submit"]).exit_code == 2
     shown = run(umbrella, ["infer", "--run", "room.photonfarm", "--place", "ball=1,0.5,0", "--orbit", "2"])
     assert shown.exit_code == 0, shown.output
-    assert Path("out/path.gif").exists()
+    assert Path("shown/path.gif").exists()
     with pytest.raises(SpecError, match="copy it"):
         invoke("--run", "room.photonfarm", "--out", "again.photonfarm")
 

@@ -22,7 +22,6 @@ from bench.harness import results
 from photonfarm.core.pictures import display_values
 from photonfarm.core.records import F32
 from photonfarm.core.statistics import clean_error
-from photonfarm.scene.spec import WITHOUT_SHADOWS
 
 if TYPE_CHECKING:
     from photonfarm.renderer.scene.loaded_scene import LoadedScene
@@ -151,7 +150,7 @@ def guide_by_reflectance(scene: LoadedScene, view: View) -> Guide:
     from photonfarm.trainer.networks.inputs import SURFACE, SurfaceInputs, replace_albedo
 
     none = np.zeros((1, 3), np.float32)
-    ((buffers, guides),) = scene.inputs([view], [bytes(16)], WITHOUT_SHADOWS, (none, none + 1))
+    ((buffers, guides),) = scene.inputs([view], [bytes(16)], scene.spec.guides.without_shadows(), (none, none + 1))
     surface = SurfaceInputs(**{name: torch.from_numpy(getattr(guides, name)) for name in SURFACE})
     return replace_albedo(torch.from_numpy(buffers.albedo), surface).numpy(), buffers.normal
 

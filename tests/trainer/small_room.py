@@ -24,10 +24,10 @@ def rendered(room: SceneSpec, folder: Path) -> Path:
     return Path(store.root)
 
 
-def trained(store: Path, folder: Path, architecture: str) -> Path:
+def trained(store: Path, folder: Path, architecture: str, **of_network: object) -> Path:
     """A run of one step in a folder, on the only scene of a store."""
     (scene_id,) = Store(store).scene_ids()
-    network = NetworkSettings.model_validate({"architecture": architecture, "width": 4})
+    network = NetworkSettings.model_validate({"architecture": architecture, "width": 4, **of_network})
     settings = TrainSettings(network=network, max_steps=1, batch=2, hold_out=0.5, poll_seconds=0.01, threads=1)
     train(SceneReader(store, scene_id), settings, folder)
     return folder

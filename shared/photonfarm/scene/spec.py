@@ -137,9 +137,9 @@ class GuideSpec(Frozen):
     lights_in_glass: bool = Field(default=False, exclude_if=lambda said: not said)  # then left out of ids
     """Whether lights that smooth glass reflects, beside what it lets through, count as seen."""
 
-
-WITHOUT_SHADOWS = GuideSpec(light_samples=0)
-"""Guides without direct light: emission, and what says how much a surface reflects."""
+    def without_shadows(self) -> Self:
+        """The same without direct light: emission, and what says how much a surface reflects."""
+        return self.model_copy(update={"light_samples": 0})
 
 
 class Emitters(Frozen):

@@ -25,7 +25,7 @@ from photonfarm.renderer.scene import backend
 from photonfarm.renderer.scene.loaded_scene import LoadedScene
 from photonfarm.scene.groups import Fov, Power, Turn
 from photonfarm.scene.modification import rest
-from photonfarm.scene.spec import SceneSpec
+from photonfarm.scene.spec import GuideSpec, SceneSpec
 from photonfarm.scene.spec_loading import load_spec
 from photonfarm.scene.view import View, sample_view
 from photonfarm.store import SceneReader, Store
@@ -142,8 +142,10 @@ def test_a_network_runs_where_torch_has_no_card_though_one_renders(
     assert repr(opened) == f"<run cnn (run), scene room ({opened.scene_id}), 24 × 16 pixels, on cpu>"
 
 
-def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_path: Path) -> None:
-    opened = open_run(trained(store, tmp_path / "run", "denoise_4"), store)
+def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own_and_lamps_in_glass_as_the_store_has_them(
+    store: Path, tmp_path: Path
+) -> None:
+    opened = open_run(trained(store, tmp_path / "run", "denoise_4", reflectance=True), store)
     view = sample_view(opened.spec, b"view of a test..", 0, 0)
     with torch.no_grad():
         one, again = (opened.predict(view=view).radiance for _ in range(2))
@@ -151,6 +153,13 @@ def test_a_frame_of_a_denoiser_has_a_noisy_image_of_its_own(store: Path, tmp_pat
     noisy = opened._noisy(view)
     assert int(noisy.kept.sum()) == 24 * 16 // 4
     assert float(noisy.colour.sum()) > 0
+    ball, none = View(np.array([-1.6, 1.1, -0.9]), np.array([-2.1, 0.89, -1.35])), np.zeros((1, 3), np.float32)
+    stored, without = (
+        opened._scene.inputs([ball], [bytes(16)], guides, (none, none + 1))[0][1].emission * opened.spec.exposure
+        for guides in (opened.spec.guides, GuideSpec())
+    )
+    np.testing.assert_allclose(opened._inputs(ball).surface.emission[0], stored, rtol=1e-5)
+    assert (stored > without).any()
 
 
 def test_a_noisy_image_that_is_not_finite_is_drawn_again(

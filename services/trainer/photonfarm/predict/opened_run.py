@@ -34,7 +34,6 @@ from photonfarm.plan.chosen import Chosen
 from photonfarm.plan.request import sample_key
 from photonfarm.scene.arrangement import Shot, find_doubts
 from photonfarm.scene.modification import Modification, rebuild, rebuild_surfaces, rest
-from photonfarm.scene.spec import WITHOUT_SHADOWS
 from photonfarm.scene.spec_loading import locate
 from photonfarm.scene.view import Camera, View
 from photonfarm.store import Store
@@ -306,7 +305,7 @@ class OpenRun:
         key, camera = view_key(self._key, view.vector), Camera.of(view, self.spec)
         given: dict[str, Tensor] = {}
         if self._needs.guides or self._needs.surface:
-            wanted = self.spec.guides if self._needs.guides else WITHOUT_SHADOWS
+            wanted = self.spec.guides if self._needs.guides else self.spec.guides.without_shadows()
             ((buffers, guides),) = self._scene.inputs([view], [key], wanted, self._lit, take=take_torch)
             given = self._guide_tensors(arrays_of(guides))
         else:

@@ -44,7 +44,7 @@ from photonfarm.renderer.scene.loaded_scene import LoadedScene, integrator_of
 from photonfarm.renderer.scene.loading import AimedSensor
 from photonfarm.renderer.scene.view_rays import ViewCameras
 from photonfarm.scene.modification import Modification, rebuild, rest
-from photonfarm.scene.spec import WITHOUT_SHADOWS, GuideSpec, SceneSpec
+from photonfarm.scene.spec import GuideSpec, SceneSpec
 from photonfarm.scene.spec_loading import locate
 from photonfarm.scene.view import View
 from photonfarm.store import SceneReader, Store
@@ -247,7 +247,7 @@ def time_parts(
     def inputs(wanted: GuideSpec) -> object:
         return scene.inputs([view], [guided], wanted, lit_points(cloud, modification))
 
-    timed("surface_s", partial(inputs, WITHOUT_SHADOWS))
+    timed("surface_s", partial(inputs, scene.spec.guides.without_shadows()))
     timed("guides_s", partial(inputs, scene.spec.guides))
     timed("points_s", lambda: scene.sees([view], rebuild(cloud, modification)[0]))
     photons = timed("photons_s", lambda: photons_of(scene, key)[0])

@@ -112,6 +112,7 @@ def path(content: str) -> Doing:
 
 NOTHING: Doing = lambda _: None  # noqa: E731 - a constant of this type
 STARES = '{"frames": 1, "views": [{"origin": [0, 1, 0], "look_at": [0, 1, 0]}]}'
+OWN = f"--architecture mine:Net {TRAIN}"
 FEW = "--steps 2 --batch 2 --hold-out 0.001 --set width=2"
 DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
 
@@ -183,6 +184,7 @@ DEPTH = "differs in transport.max_depth (8 in the store, 6 asked for)"
         (lambda f: (f / "run/settings.json").write_text("{"), "report", 4, ["run/settings.json: is not the JSON"]),
         (lambda f: edit(f / "run/settings.json", batch="x"), "evaluate", 4, ["batch = 'x': a whole number"]),
         (in_module("3, 3", "3, 4"), "evaluate --run own", 3, ["own: its weights do not fit", "'mine:Net'"]),
+        (in_module("3, 3", "3, 4"), f"train den.toml --run own {OWN}", 3, ["own: its weights do not fit"]),
         (in_module(".albedo", ".albdo"), "evaluate --run own", 3, ["'mine:Net'", "line 11, in forward", "albdo"]),
         (in_module("class Net", "1 / 0\nclass Net"), "evaluate --run own", 3, ["line 5: ZeroDivisionError"]),
         (in_module("class Net", "class Net Net"), "infer --run own --row 0", 3, ["SyntaxError", "mine.py"]),

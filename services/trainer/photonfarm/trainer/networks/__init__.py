@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -100,3 +102,18 @@ def predict_image(network: nn.Module, inputs: Inputs) -> Tensor:
             f"{tuple(inputs.albedo.shape)} is required"
         )
     return image
+
+
+@contextmanager
+def name_misfit(run: Path, architecture: str) -> Iterator[None]:
+    """Turn torch's refusal of a run's weights, as a network's code has changed, into a SpecError of one sentence."""
+    try:
+        yield
+    except RuntimeError as error:
+        if "loading state_dict" not in str(error):
+            raise
+        reason = str(error).splitlines()[-1].strip().rstrip(".")
+        raise SpecError(
+            f"{run}: its weights do not fit the network {architecture!r} as it is now ({reason}); "
+            "bring back the code that it was trained with, or train anew in another folder"
+        ) from error

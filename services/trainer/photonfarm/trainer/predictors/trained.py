@@ -15,7 +15,7 @@ from photonfarm.core.records import BasePointCloud, Geometry
 from photonfarm.farm.training import ALONE, ONNX
 from photonfarm.scene.spec import SceneSpec
 from photonfarm.store import SceneReader, Store
-from photonfarm.trainer.networks import build, find_needs
+from photonfarm.trainer.networks import build, find_needs, name_misfit
 from photonfarm.trainer.networks.inputs import Inputs, Needs, SceneFrame, require
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.predictors.denoisers import OIDN, Oidn, fill_in
@@ -89,14 +89,8 @@ class TrainedRun:
         settings = self.settings.network
         with name_in_errors(architecture=settings.architecture):
             network = build(settings, SceneFrame.of(spec, *base, settings), self.settings.seed)
-        try:
+        with name_misfit(self.folder, settings.architecture):
             network.load_state_dict(self.weights)
-        except RuntimeError as error:  # a user's class has changed, or this version's
-            reason = str(error).splitlines()[-1].strip().rstrip(".")
-            raise SpecError(
-                f"{self.folder}: its weights do not fit the network {settings.architecture!r} as it is now ({reason}); "
-                "bring back the code that it was trained with, or train anew in another folder"
-            ) from error
         return network
 
     @property

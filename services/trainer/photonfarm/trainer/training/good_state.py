@@ -14,6 +14,7 @@ from torch import Tensor
 
 from photonfarm.core.errors import store_errors
 from photonfarm.trainer.data.batch import TrainingBatch
+from photonfarm.trainer.networks import name_misfit
 from photonfarm.trainer.networks.network import Network
 from photonfarm.trainer.runs import checkpoint
 from photonfarm.trainer.runs.run_folder import GOOD
@@ -149,9 +150,10 @@ class GoodState:
         """Continue, and let the learner continue, from a checkpoint's state and the file beside it.
 
         No validated state is kept if the file is gone, and none at all without `recover`. Raises StoreError if it
-        cannot be read.
+        cannot be read, and SpecError if the weights do not fit the network.
         """
-        self._learner.restore(state)
+        with name_misfit(run, self._settings.network.architecture):
+            self._learner.restore(state)
         own = state["recovery"]
         self.recoveries, self._learner.rate_factor = own["recoveries"], own["rate_factor"]
         if not self._settings.recover:

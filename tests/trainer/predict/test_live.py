@@ -250,6 +250,8 @@ def test_it_is_said_that_the_page_loads_and_that_the_server_does_not_answer_unti
         before = page.value("document.querySelector('#network').toDataURL()")
         click(page, "Random")
         time.sleep(0.8)  # further requests fail
+        click(page, "Copy as a command")
+        page.wait_for("document.getElementById('said').textContent === 'Copy as a command: the server does not answer'")
         assert page.value(f"[{told}[3], {look}]") == ["the server does not answer", "0.35"]
         assert page.value("document.querySelector('#pulse').hidden")
         page.call("Network.emulateNetworkConditions", offline=False, **cut)

@@ -226,7 +226,9 @@ class Live {
   listActions() {
     const button = (text, act) => {
       const made = Object.assign(document.createElement("button"), { textContent: text });
-      made.addEventListener("click", () => act(made));
+      made.addEventListener("click", async () => {
+        try { await act(made); } catch (error) { this.say(`${text}: ${error.message}`); }
+      });
       $("actions").append(made);
     };
     const lens = this.makeSlider("field of view", this.room.fov_range ?? {}, () => this.fov, (value) => { this.fov = value; }, inDegrees);

@@ -2,8 +2,8 @@
 
 All are means over a regular grid of rays in each pixel, as albedo is. A ray that meets a surface of delta lobes alone
 (a mirror, smooth glass, a null surface) is *followed* along the lobe that takes more than half of the light, to the
-first surface that scatters otherwise. Light emitted on the way counts as seen; if the spec
-says so (`lights_in_glass`), so do lights that the other lobe meets first, as a lamp that a glass ball reflects.
+first surface that scatters otherwise. Light emitted on the way counts as seen; if the spec says so (`lights_in_glass`),
+so do lights that the other lobe meets first, as a lamp that a glass ball reflects.
 
 **Direct light** comes straight from lights to that surface and is reflected by its diffuse part: one sum over shadow
 rays, with lights chosen as the integrator chooses them. Its points are one low-discrepancy set in each pixel, shifted

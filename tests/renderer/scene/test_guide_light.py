@@ -81,6 +81,14 @@ def test_a_lamp_is_reflected_by_glass_that_lets_most_light_through() -> None:
         assert not known(scene).emission[8, 12].any()
 
 
+def test_a_lamp_is_seen_through_a_mirror_with_holes() -> None:
+    """It covers 0.7 of its surface, and so is what is followed."""
+    holes = {"type": "mask", "opacity": 0.7, "bsdf": {"type": "conductor", "specular_reflectance": rgb(GREY)}}
+    scene = scene_of(pane=square((0, 0, 0), (0, 0, 1), 2, bsdf=holes), lamp=lamp((0, 0, -2), (0, 0, 1), 20))
+    np.testing.assert_allclose(centre(known(scene, lights_in_glass=True).emission), 0.3 * RADIANCE, rtol=1e-5)
+    assert not known(scene).emission.any()
+
+
 def test_what_surrounds_the_scene_is_seen_where_nothing_else_is_and_in_mirrors() -> None:
     sky = {"type": "constant", "radiance": rgb(RADIANCE)}
     mirror = square((0, 0, 0), (0, 0, 1), 0.5, bsdf={"type": "conductor", "specular_reflectance": rgb(GREY)})

@@ -48,7 +48,8 @@ def collect_doubts(
     with tempfile.TemporaryDirectory() as folder:
         (file := Path(folder, "shots.json")).write_text(json.dumps(listed))
         try:
-            doubts = json.loads(_ask("scene", "check", "--json", "--configurations", str(file), "--", named.name))
+            said = _ask("scene", "check", "--json", "--configurations", str(file), "--", named.name)
+            doubts = [*map(str, json.loads(said))]
         except BackendError as error:
             log(f"whether anything stands in a wall is not known: {error}")
             listed = []

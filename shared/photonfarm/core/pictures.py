@@ -57,7 +57,7 @@ def draw_depth(depth: F32) -> Picture:
 
 
 CONTRAST = 4
-"""By how much differences are stronger in pictures."""
+"""The factor by which differences are stronger in pictures."""
 
 
 def draw_difference(exposed: F32, wanted: F32) -> Picture:

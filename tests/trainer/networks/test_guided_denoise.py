@@ -116,7 +116,7 @@ def test_what_it_learned_for_one_pass_fades_by_the_root_of_their_number(make_sou
 def test_by_a_setting_known_direct_light_is_filtered_in_its_images_and_less_as_passes_come(
     make_source, passes: float
 ) -> None:
-    """Before anything is learned, and where the half is too noisy to be taken."""
+    """A network that has learned nothing, and a half that is too noisy to be taken."""
     source = make_source(1)
     inputs = batch_of(source, (0,), NEEDS).inputs
     told = {"passes": torch.full((1,), passes), "variance": torch.full_like(inputs.depth, 1e9)}

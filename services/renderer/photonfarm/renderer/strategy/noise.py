@@ -132,7 +132,7 @@ class BlockSums:
         """Have no images yet."""
         self._views: list[int] = []  # of each pair of images
         self._pairs: dict[int, list[tuple[Blocks, Blocks, Blocks]]] = {blocks: [] for blocks in BLOCKS}
-        """By size of blocks, for each pair: mean of y, variance of y in a block's pixels, variance of its mean."""
+        """Mean of y, variance of y in a block's pixels, variance of its mean: of each pair, by size of blocks."""
         self._pixels = 0
         self._evidence: dict[int, _Evidence] = {}
 

@@ -72,7 +72,7 @@ class GuidedDenoise(Guided):
     coarse: Tensor
 
     def __init__(self, settings: NetworkSettings, frame: SceneFrame) -> None:
-        filters = 2 + settings.has_denoiser
+        filters = OURS + settings.has_denoiser
         further, outputs = HALF_CHANNELS + 6 * filters, 3 + 2 + filters
         super().__init__(settings, frame, transport=LitPoints, further=further, outputs=outputs)
         self._has_denoiser = settings.has_denoiser

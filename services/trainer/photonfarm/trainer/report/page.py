@@ -30,7 +30,10 @@ from photonfarm.trainer.report.tables import list_facts, make_tables
 from photonfarm.trainer.report.views import ShownView, write_legend
 
 Kind = Literal["better", "mixed", "worse"]
-"""Than what it is given; "mixed": in the mean over all, but not in most of them, or only by light above white."""
+"""How a network compares with what it is given.
+
+"mixed" is better in the mean over all, but not in most of them, or only by light above white.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,7 +86,7 @@ def compute_rate(step: int, settings: TrainSettings, last: int | None = None) ->
 
 
 MEMORY = 0.995
-"""Of the running mean of what a loss exceeds its floor by: 200 steps."""
+"""The decay of the running mean of what a loss exceeds its floor by: 200 steps."""
 
 
 class WeightAverage:

@@ -40,7 +40,7 @@ class GuideSettings:
     followed: int  # the most mirrors and panes
     max_depth: int  # the most edges of a path
     glossy: bool  # whether any surface has lobes that are neither diffuse nor followed
-    lights_in_glass: bool = False  # whether lights are seen by the lobe of glass that is not followed
+    lights_in_glass: bool  # whether lights are seen by the lobe of glass that is not followed
 
 
 STEPS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)

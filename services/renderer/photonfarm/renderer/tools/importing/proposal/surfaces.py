@@ -22,7 +22,7 @@ Points = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
 SECTIONS = 24
-"""Of round shapes, of which a scene may have thousands: 576 triangles of a sphere, within 1 % of it."""
+"""The sections of round shapes, of which a scene may have thousands: 576 triangles of a sphere, within 1 % of it."""
 
 SAMPLES_PER_CELL = 4.0
 """Points on a surface for each area of a cell's side, so that few cells that it crosses have none."""

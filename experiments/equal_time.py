@@ -115,6 +115,13 @@ def group_networks(room: Room, networks: Sequence[str]) -> dict[str, list[str]]:
     return runs
 
 
+def list_longest(rooms: Sequence[Room]) -> list[str]:
+    """The rows of OURS that were trained longest and are not left out; all of OURS where none was trained longer."""
+    known = dict.fromkeys(name for room in rooms for of_run in group_networks(room, OURS).values() for name in of_run)
+    shown = [name for name in known if not LEFT_OUT.fullmatch(name)]
+    return [name for name in shown if LONGER.fullmatch(name.split(" ")[0])] or shown
+
+
 def place_rows(room: Room, names: Sequence[str]) -> list[Placed]:
     """Those of the rows that were timed and have errors, by ascending time. Raises SpecError as `Room.errors` does."""
     edit, entries = room.document["edit_seconds"], []
@@ -282,7 +289,7 @@ def main() -> int:
     parser.add_argument("names", nargs="+", metavar="NAME")
     parser.add_argument("--size", choices=get_args(SizeName), default="small")
     parser.add_argument("--work", type=Path, default=results.ROOT / "build/experiments", help="(build/experiments)")
-    parser.add_argument("--ours", nargs="+", metavar="ROW", help="which rows of ours (all)")
+    parser.add_argument("--ours", nargs="+", metavar="ROW", help="which rows of ours (those trained longest)")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="where to draw all of it, as PNG")
     told = parser.parse_args()
     rooms = []
@@ -290,8 +297,7 @@ def main() -> int:
         report = told.work / told.size / name / "report/report.json"
         runs = [run["name"] for run in json.loads(report.read_text(encoding="utf-8"))["runs"]]
         rooms.append(Room.read(Experiment.load(name, told.size).only(runs), report, results.commit()))
-    known = (name for room in rooms for of_run in group_networks(room, OURS).values() for name in of_run)
-    print(f"{format_best(rooms, told.ours or [*dict.fromkeys(known)])}\n\n{format_rows(rooms)}")
+    print(f"{format_best(rooms, told.ours or list_longest(rooms))}\n\n{format_rows(rooms)}")
     if told.picture:
         told.picture.write_bytes(draw_picture(rooms))
     return 0

@@ -73,7 +73,6 @@ class Size(Frozen):
     long: Long | None = None
     inception: bool = True  # whether reports have FID, KID and Feature L1
     train: Mapping[str, Any]
-    train_denoisers: Mapping[str, Any]
 
 
 class Experiment(Frozen):
@@ -153,8 +152,7 @@ class Experiment(Frozen):
         ]
 
     def _settings(self, run: Run) -> dict[str, Any]:
-        own = self.size.train_denoisers if _is_denoiser(run.train) else {}
-        return {"seed": self.size.seeds[0], **self.size.train, **own, **run.train}
+        return {"seed": self.size.seeds[0], **self.size.train, **run.train}
 
 
 def name_seeded(name: str, seed: int) -> str:

@@ -40,17 +40,11 @@ ROOMS = [
     "fixed-veach-ajar",
 ]
 METRICS = ("mse", "mssim")
-COMPARED = (
-    "oidn 1/1",
-    "light_transport_photons",
-    "guided",
-    "guided_transport",
-    "guided_transport_photons",
-    "denoise_1",
-)
-"""What is shown beside the reference: the best denoiser and published network, ours, and a denoiser of the room."""
+OURS = ("guided_transport-4000", "guided_denoise-4000")
+PUBLISHED = "light_transport-4000"
+COMPARED = ("oidn-reflectance 1/1", PUBLISHED, *OURS, "denoise_1_reflectance-4000")
+"""What is shown beside the reference: the best denoiser, the published network, ours, and a denoiser of the room."""
 
-BEFORE, AFTER = "light_transport_photons", "guided_transport"
 VIEWS = 3  # at most, of the first ones
 SIZE = 256  # px of a tile
 COLOURS = 256  # of a figure, which takes a third of the bytes so
@@ -111,19 +105,20 @@ def draw_predictions(report: Report, names: list[str]) -> Picture:
 
 
 def draw_worst_cases(report: Report) -> Picture:
-    """The worst views: reference, the published networks' best and ours, each with its error."""
+    """The worst views: reference, the published network and ours, each with its error."""
+    names = (PUBLISHED, *OURS)
     rows = []
     for view in report.worst:
-        reference, before, after = (report.tiles[name][view] for name in (REFERENCE, BEFORE, AFTER))
-        rows.append([reference, before, draw_error(before, reference), after, draw_error(after, reference)])
+        reference, *shown = (report.tiles[name][view] for name in (REFERENCE, *names))
+        rows.append([reference, *(tile for each in shown for tile in (each, draw_error(each, reference)))])
     captions = [name_kinds(kinds) for kinds in report.worst.values()]
-    return draw_sheet([REFERENCE, BEFORE, "its error", AFTER, "its error"], rows, captions, TEXT)
+    return draw_sheet([REFERENCE, *(head for name in names for head in (name, "its error"))], rows, captions, TEXT)
 
 
 def make_figures(name: str, report: Report, out: Path) -> None:
     """The figures of one room."""
     if Experiment.load(name, "small").part == "static":
-        save(draw_predictions(report, [name for name in report.tiles if name != REFERENCE][:1]), out / f"{name}.png")
+        save(draw_predictions(report, [OURS[0]]), out / f"{name}.png")
         return
     for metric in METRICS:
         shutil.copy(report.folder / f"time-{metric}.svg", out / f"{name}-time-{metric}.svg")

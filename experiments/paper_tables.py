@@ -10,11 +10,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from experiments.rooms import Room, read_estimate
+from experiments.experiment import name_long
+from experiments.rooms import HEADLINE_FEATURE, Room, read_estimate
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.metrics.image_metrics import (
-    HEADLINE_BLOCK,
     NOT_AVAILABLE,
     confidence_interval,
     format_with_interval,
@@ -36,6 +36,14 @@ OURS = (
     ("guided_transport", "guided_transport_photons"),
 )
 """What ours is compared with: the published network that lacks the same, and itself without a part."""
+
+TRAINED_LONGER = (
+    ("cnn", UNIT),
+    (UNIT, "guided_transport"),
+    ("guided_transport", "guided_denoise"),
+    ("denoise_1_reflectance", "guided_denoise"),
+)
+"""What is compared of the networks that were trained for longer."""
 
 CLOSE = 0.1  # ≈: a gap of less than this share of the first's error
 
@@ -119,7 +127,7 @@ FURTHER = (
     Column("KID", _average(_format_set("kid", "mean"), 4)),
     Column(
         "Feature L1 (95 %)",
-        _format_interval(f"feature_l1_{HEADLINE_BLOCK}", 3),
+        _format_interval(HEADLINE_FEATURE, 3),
         lambda paper, _: f"{paper.feature_l1:.3f}",
     ),
 )
@@ -136,20 +144,20 @@ def format_further_metrics(rooms: Sequence[Room], published: PublishedTable) -> 
 
 
 def _format_table(rooms: Sequence[Room], published: PublishedTable, columns: Sequence[Column]) -> str:
-    """A row for each predictor; behind a column that the paper has, its figures."""
+    """A row for each predictor, without columns that no row has; behind a column that the paper has, its figures."""
+    names = _list_row_names(rooms)
+    having = {name: [room for room in rooms if name in room.rows] for name in names}
+    columns = [each for each in columns if any(each.ours(having[name], name) != NOT_AVAILABLE for name in names)]
     head = ["architecture"]
     for column in columns:
         head.append(column.head)
         if published and column.theirs:
             head.append(f"paper: {column.head.removesuffix(' (95 %)')}")
-    return format_markdown_table(
-        head, [_format_line(rooms, name, published, columns) for name in _list_row_names(rooms)]
-    )
+    return format_markdown_table(head, [_format_line(having[name], name, published, columns) for name in names])
 
 
-def _format_line(rooms: Sequence[Room], name: str, published: PublishedTable, columns: Sequence[Column]) -> list[str]:
-    having, paper = [room for room in rooms if name in room.rows], published.get(name)
-    line = [name]
+def _format_line(having: Sequence[Room], name: str, published: PublishedTable, columns: Sequence[Column]) -> list[str]:
+    line, paper = [name], published.get(name)
     for column in columns:
         line.append(column.ours(having, name))
         if published and column.theirs:
@@ -174,10 +182,13 @@ def _list_row_names(rooms: Sequence[Room]) -> list[str]:
 
 
 def format_orders(rooms: Sequence[Room], published: PublishedTable) -> str:
-    """Neighbours in the paper's order, then ours: the gaps there and in each room. Raises SpecError as `Room.gap`."""
+    """Neighbours in the paper's order, ours, and longer runs: their gaps, and ours. Raises SpecError as `Room.gap`."""
     head = ("pair", *(["paper"] if published else []), *(room.name for room in rooms))
     lines = []
-    for first, second in (*pairwise(ORDER), *OURS):
+    long = rooms[0].experiment.size.long
+    longer = [[name_long(name, long.steps) for name in pair] for pair in TRAINED_LONGER] if long else []
+    known = [pair for pair in longer if any({*pair} <= {*room.rows} for room in rooms)]
+    for first, second in (*pairwise(ORDER), *OURS, *known):
         theirs = UNPUBLISHED
         if first in published and second in published:
             share = 1 - published[second].mse / published[first].mse

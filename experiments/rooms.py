@@ -18,7 +18,12 @@ from experiments.stages import EVALUATION, PATHS
 from photonfarm.core.errors import IncompleteError, SpecError
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
-from photonfarm.trainer.metrics.image_metrics import NOT_AVAILABLE
+from photonfarm.trainer.metrics.image_metrics import HEADLINE_BLOCK, NOT_AVAILABLE
+
+HEADLINE_FEATURE = f"feature_l1_{HEADLINE_BLOCK}"
+"""The key of the mean of Feature L1 in a row."""
+
+DIGITS = 5  # of what is kept of a report
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -106,15 +111,6 @@ class Room:
         """Rows and core-seconds of a kind of plan, "samples" or "top-up"."""
         totals: dict[str, Any] = self.document["dataset"]["spent"].get(kind, {"rows": 0, "core_seconds": 0.0})
         return totals
-
-    def steps(self, *, denoisers: bool) -> str:
-        """How long its networks were trained, or its denoisers, by their settings; empty where it has none."""
-        told = [
-            f"{run['settings']['max_steps']} steps of {run['settings']['batch']}"
-            for run in self.document["runs"].values()
-            if run["architecture"].startswith("denoise") == denoisers
-        ]
-        return " or ".join(dict.fromkeys(told))
 
     def layer_rates(self) -> str:
         """The rates of its networks' layers, in words; reports of before these could be set have equal ones."""
@@ -206,19 +202,30 @@ def _read_further_seeds(experiment: Experiment, file: Path) -> dict[str, list[li
 
 def _compact(row: Mapping[str, Any]) -> dict[str, Any]:
     """Times, mean and interval of each metric, and the MSE of each image."""
-    linear, shown = row["linear_mse"], row["metric_space"]
+    linear, shown, parts = row["linear_mse"], row["metric_space"], row["frame_seconds"]
     told = {
-        "frame_seconds": row["frame_seconds"],
+        "frame_seconds": parts and {part: time for part, time in parts.items() if part != "ranges"},
         "network_seconds": row["network_seconds"],
         "network_seconds_range": row["network_seconds_range"],
         "linear_mse": {key: linear[key] for key in ("mean", "standard_error", "count")},
     }
-    if shown is None:
-        return told
-    metrics = {key: shown[key]["estimate"] for key in ("mse", "mssim", "flip")}
-    metrics |= {f"feature_l1_{block}": of["estimate"] for block, of in enumerate(shown["feature_l1"] or ())}
-    metrics |= {key: shown[key] for key in ("fid", "kid", "inception")}
-    return {**told, "mse_of_images": [round(value, 6) for value in shown["mse"]["values"]], **metrics}
+    if shown is not None:
+        told |= {key: shown[key]["estimate"] for key in ("mse", "mssim", "flip")}
+        if features := shown["feature_l1"]:
+            told[HEADLINE_FEATURE] = features[HEADLINE_BLOCK]["estimate"]
+        told |= {"fid": shown["fid"] and {"value": shown["fid"]["value"]}, "kid": shown["kid"]}
+        told["mse_of_images"] = [round(value, 6) for value in shown["mse"]["values"]]
+    rounded: dict[str, Any] = _round(told)
+    return rounded
+
+
+def _round(told: Any) -> Any:
+    """The same with DIGITS digits of each number that is not whole."""
+    if isinstance(told, Mapping):
+        return {key: _round(value) for key, value in told.items()}
+    if isinstance(told, (list, tuple)):
+        return [_round(value) for value in told]
+    return float(f"{told:.{DIGITS}g}") if isinstance(told, float) else told
 
 
 # --------------------------------------------------------------------------------------------------- what was measured

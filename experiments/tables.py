@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import get_args
 
@@ -54,6 +54,9 @@ RECIPES: Mapping[SizeName, str] = {
 def format_page(rooms: Sequence[Room], size: SizeName) -> str:
     """All of it as Markdown. Raises SpecError as `Room.gap` does."""
     parts = [f"# The paper's tables over our rooms, `{size}`", wrap(introduce(rooms, size))]
+    ours = equal_time.list_longest(rooms)
+    best = equal_time.format_best([room for room in rooms if {*ours} & {*room.rows}], ours)
+    parts.append(OF_TIME.format(picture=f"{name_page(size)}.png", best=best))
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():
         parts.append(findings.read_text(encoding="utf-8").strip())
@@ -61,9 +64,7 @@ def format_page(rooms: Sequence[Room], size: SizeName) -> str:
     for part, (title, published) in PARTS.items():
         if of_part := [room for room in rooms if room.experiment.part == part]:
             parts += _format_part(of_part, title, published)
-    parts.append(OF_TIME.format(picture=f"{name_page(size)}.png", table=equal_time.format_table(rooms)))
-    if old := [room.name for room in rooms if "oidn 1/1" in room.rows and "oidn-reflectance 1/1" not in room.rows]:
-        parts.append(wrap(OF_OLD_ROWS.format(rooms=", ".join(old))))
+    parts.append(OF_FAMILIES.format(table=equal_time.format_table(rooms)))
     made = (
         f"Timed on {summarise(rooms, Room.machine)}. The reports are made by `make experiments-{size}`, this page by "
         f"`{name_command(size)}`."
@@ -77,7 +78,8 @@ def _format_part(rooms: Sequence[Room], title: str, published: PublishedTable) -
     return [
         f"## {title}",
         f"### Pairs of networks, by MSE\n\n{format_orders(rooms, published)}",
-        f"### Time and errors\n\n{means}\n\n{format_errors(rooms, published)}",
+        f"### Error and time in each room\n\n{OF_ROWS}\n\n{equal_time.format_rows(rooms)}",
+        f"### Means over the rooms\n\n{means}\n\n{format_errors(rooms, published)}",
         f"### Further times and metrics\n\n{format_further_metrics(rooms, published)}",
         f"### The rooms\n\n{format_rooms(rooms)}",
         format_costs(rooms),
@@ -97,20 +99,11 @@ def name_command(size: SizeName) -> str:
 
 def introduce(rooms: Sequence[Room], size: SizeName) -> str:
     """What was run, as the sizes and the reports tell."""
-    kinds: dict[str, Callable[[Room], str]] = {
-        "networks": lambda room: room.steps(denoisers=False),
-        "denoisers": lambda room: room.steps(denoisers=True),
-    }
-    trained = [
-        f"{kind} for {summarise(having, steps)}"
-        for kind, steps in kinds.items()
-        if (having := [room for room in rooms if steps(room)])
-    ]
     sizes = summarise(rooms, lambda room: str(room.document["size"]))
     return (
         f"The size `{size}`: {sizes}. {_describe_resolution(rooms)} All networks "
-        f"and denoisers but OIDN are trained on one room's images alone: {', '.join(trained)}. denoise_k and oidn 1/k "
-        f"are denoisers, which are given 1/k of the pixels of one noisy half-estimate; none 1/1 is that half itself."
+        "and denoisers but OIDN are trained on one room's images alone. denoise_k and oidn 1/k are given 1/k of the "
+        "pixels of one noisy half-estimate, oidn n/1 the mean of n of them; none is what is given, itself."
         f"{_describe_cameras(rooms)}"
     )
 
@@ -184,6 +177,21 @@ OF_TIME = """\
 
 ![MSE over the time of a frame, room by room]({picture})
 
+Ours beside the best denoiser of each moment: the error, the time, and the error as a share of what the best of Open
+Image Denoise and the denoisers of the room has at the same time, with its 95 % interval over the views.
+`guided_transport` is given no sample of the view; `guided_denoise` is given one half-estimate, or the mean of 4 or 16.
+≥ marks frames that take longer than the slowest denoiser. How families are compared is told
+[below](#ours-beside-each-family-at-the-same-time).
+
+{best}"""
+
+
+OF_ROWS = "MSE ± half its 95 % interval; in brackets the milliseconds of a frame, all charged."
+
+
+OF_FAMILIES = """\
+## Ours beside each family at the same time
+
 Everything is charged: editing the scene, buffers, guides, photons, samples that a denoiser is given, and the network,
 on one core. OIDN is given one half-estimate of each pixel, or of one of 4, or the mean of 2 to 16, which are halves A
 of further passes; `guided_denoise` one, or the mean of as many, which its line joins; errors are by the halves B of the
@@ -197,11 +205,6 @@ In frames longer than its slowest row, a family is credited with the least error
 ratios are marked ≥: our advantage is at most what they say.
 
 {table}"""
-
-
-OF_OLD_ROWS = """\
-Of {rooms} these rows were made with OIDN in its best quality alone, fed diffuse albedo, and one half at most: nothing
-is claimed of them until they are measured again."""
 
 
 def make_parser() -> argparse.ArgumentParser:

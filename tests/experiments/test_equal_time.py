@@ -119,3 +119,5 @@ def test_rows_of_ours_are_grouped_by_run_whatever_the_steps_and_the_halves() -> 
     denoisers = next(names for names, called in equal_time.FAMILIES.items() if called.startswith("denoisers"))
     assert [each.name for each in equal_time.order_family(room, denoisers)] == ["denoise_1-4000"]
     assert equal_time.draw_picture([room]).startswith(b"\x89PNG")
+    assert equal_time.list_longest([room]) == ["guided_denoise-4000"]
+    assert equal_time.list_longest([make_room({"guided_transport": (1, 1)})]) == ["guided_transport"]

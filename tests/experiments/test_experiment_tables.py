@@ -143,8 +143,9 @@ def test_the_page_begins_with_what_was_found_and_says_whose_recipe_it_is() -> No
     assert all("demodulation 0.2" in tables.explain_reading(rooms, size) for size in get_args(SizeName))
     page = tables.format_page(rooms, "small")
     heads = [line for line in page.splitlines() if line.startswith("## ")]
-    assert heads[:2] == ["## What agrees with the paper, and what does not", "## How to read the tables"]
-    assert heads[-1] == "## Error against the time of a frame"
+    begin = ("## Error against the time of a frame", "## What agrees with the paper, and what does not")
+    assert heads[:3] == [*begin, "## How to read the tables"]
+    assert heads[-1] == "## Ours beside each family at the same time"
     loss = Experiment.load("night-living-room", "small").size.train["loss"]
     assert f"by our recipe (a {loss} loss, demodulation 0.2, " in " ".join(page.split())
 
@@ -192,8 +193,7 @@ def test_what_could_not_be_measured_is_not_available() -> None:
         of_row["metric_space"] |= {"feature_l1": None, "fid": None, "kid": None, "inception": None}
     bare["evaluation"]["rows"][1]["frame_seconds"] = None
     page = tables.format_page([room("night-living-room", bare | {"edit_seconds": None})], "small")
-    further = ["20.0 (19.0 … 23.0)", "n/a", "0.78", "n/a", "33.7", "n/a", "n/a", "0.199"]
-    assert cells(page.split("### Further")[1], "cnn")[1:] == further
+    assert cells(page.split("### Further")[1], "cnn")[1:] == ["20.0 (19.0 … 23.0)"]  # and no column of FID
     assert cells(page, "feature_projection")[1] == "n/a"
     assert cells(page, "`feature_projection` − `light_transport`")[2] == "n/a"
 
@@ -209,6 +209,16 @@ def test_gaps_are_of_the_mean_of_all_seeds_and_told_apart_only_where_these_agree
     found.document["further_seeds"]["cnn"] = [[0.005] * 4]
     said = paper_tables.format_gap(found, "cnn", "light_transport")
     assert said.endswith("not told apart")
+
+
+def test_runs_that_took_longer_are_compared_where_a_room_has_both() -> None:
+    long = Experiment.load("night-living-room", "small").size.long
+    assert long
+    names = [f"{name}-{long.steps}" for name in ("light_transport", "guided_transport", "cnn")]
+    page = paper_tables.format_orders([room("night-living-room", report((*NETWORKS, *names)))], {})
+    assert cells(page, f"`{names[0]}` − `{names[1]}`")[1].startswith("-20% (")
+    assert f"`{names[2]}` − `{names[0]}`" in page
+    assert "guided_denoise" not in page
 
 
 def test_rows_of_fewer_runs_are_not_taken_for_those_of_further_seeds(tmp_path: Path) -> None:
@@ -245,7 +255,7 @@ def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_he
     second = made("elsewhere", "night-living-room")
     assert list(second) == ["fixed-living-room", "night-living-room"]
     assert second["fixed-living-room"] == first["fixed-living-room"]
-    part = page[page.index("## Table 1") : page.index("## Error against")]
+    part = page[page.index("## Table 1") : page.index("## Ours beside")]
     assert part in (tmp_path / "out" / "tables.md").read_text()
     assert made("again", "fixed-living-room", steps=1200)["fixed-living-room"]["runs"]["cnn"]["steps"] == 1200
     assert list(made("here", "movable-dining-room", "paper")) == ["movable-dining-room"]  # and none of another size

@@ -57,9 +57,6 @@ preset = "small"
 max_steps = 3
 width = 4
 points = 128
-loss = "paired"
-
-[small.train_denoisers]
 loss = "relative"
 """
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import figures
-from experiments.figures import AFTER, BEFORE, REFERENCE, Report
+from experiments.figures import OURS, PUBLISHED, REFERENCE, Report
 from photonfarm.core.errors import IncompleteError
 from photonfarm.core.pictures import write_png
 from photonfarm.trainer.compare.evaluation_page import COMPARISON, draw_comparison
@@ -20,7 +20,7 @@ FIRST = [22, 55, 64, 65]
 WORST = {"mirrors and clear glass": 64, "specular surfaces": 305, "near surfaces": 22, "all pixels": 64}
 """Two of three worst views are among the first ones."""
 
-PREDICTORS = (BEFORE, AFTER)
+PREDICTORS = (PUBLISHED, *OURS)
 
 
 def grey(row: int, column: int) -> np.ndarray:
@@ -30,7 +30,7 @@ def grey(row: int, column: int) -> np.ndarray:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A report of two predictors, with its pictures as `photonfarm report` lays them."""
+    """A report of three predictors, with its pictures as `photonfarm report` lays them."""
     shown = [*FIRST, 305]
     targets = tuple(Target(row, grey(row, 0), 256, is_reference=True, half_a=grey(row, 0)) for row in shown)
     rows = [

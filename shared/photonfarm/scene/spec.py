@@ -177,7 +177,10 @@ class Credits(Frozen):
 
 
 INPUTS_GENERATOR = 2
-"""The version of the code that makes buffers, guides, photons and points: it grows when their values change."""
+"""The version of the code that makes buffers, guides, photons and points: it grows when their values change.
+
+Stored specs are of version 2 and do not say so. Whoever raises it adds a field to the spec, 2 where it is absent.
+"""
 
 RAYS_PER_PIXEL = 16
 """The rays through a pixel over which albedo and guides are means."""

@@ -202,15 +202,14 @@ def _read_further_seeds(experiment: Experiment, file: Path) -> dict[str, list[li
 
 def _compact(row: Mapping[str, Any]) -> dict[str, Any]:
     """Times, mean and interval of each metric, and the MSE of each image."""
-    linear, shown, parts = row["linear_mse"], row["metric_space"], row["frame_seconds"]
+    shown, parts = row["metric_space"], row["frame_seconds"]
     told = {
         "frame_seconds": parts and {part: time for part, time in parts.items() if part != "ranges"},
         "network_seconds": row["network_seconds"],
         "network_seconds_range": row["network_seconds_range"],
-        "linear_mse": {key: linear[key] for key in ("mean", "standard_error", "count")},
     }
     if shown is not None:
-        told |= {key: shown[key]["estimate"] for key in ("mse", "mssim", "flip")}
+        told |= {key: shown[key]["estimate"] for key in ("mse", "mssim")}
         if features := shown["feature_l1"]:
             told[HEADLINE_FEATURE] = features[HEADLINE_BLOCK]["estimate"]
         told |= {"fid": shown["fid"] and {"value": shown["fid"]["value"]}, "kid": shown["kid"]}

@@ -4,17 +4,15 @@
     python experiments/figures.py [--rooms NAME ...] [--work build/experiments/small] [--out docs/results/figures]
 
 Reads WORK/NAME/report/ of experiments that have run. Of each static room it leaves NAME.png: reference, prediction and
-difference [S Figs. 3, 4]. Of the others it leaves NAME-time-METRIC.svg, error over the time
-of a frame [S Figs. 5, 6], by MSE and MSSIM; NAME-predictions.png, predictions of several networks above their errors
-[S Fig. 7]; and NAME-worst.png, the worst views before and after [S Fig. 8]. Exit code 0, or 7 for a room that has not
-run.
+difference [S Figs. 3, 4]. Of the others it leaves NAME-predictions.png, predictions of several networks above their
+errors [S Fig. 7]; and NAME-worst.png, the worst views [S Fig. 8]. Error over the time of a frame [S Figs. 5, 6] is
+drawn by tables.py. Exit code 0, or 7 for a room that has not run.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import shutil
 import sys
 from pathlib import Path
 
@@ -39,7 +37,6 @@ ROOMS = [
     "fixed-living-room",
     "fixed-veach-ajar",
 ]
-METRICS = ("mse", "mssim")
 OURS = ("guided_transport-4000", "guided_denoise-4000")
 PUBLISHED = "light_transport-4000"
 COMPARED = ("oidn-reflectance 1/1", PUBLISHED, *OURS, "denoise_1_reflectance-4000")
@@ -120,8 +117,6 @@ def make_figures(name: str, report: Report, out: Path) -> None:
     if Experiment.load(name, "small").part == "static":
         save(draw_predictions(report, [OURS[0]]), out / f"{name}.png")
         return
-    for metric in METRICS:
-        shutil.copy(report.folder / f"time-{metric}.svg", out / f"{name}-time-{metric}.svg")
     compared = [name for name in COMPARED if name in report.tiles]
     save(draw_predictions(report, compared), out / f"{name}-predictions.png")
     save(draw_worst_cases(report), out / f"{name}-worst.png")

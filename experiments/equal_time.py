@@ -116,7 +116,7 @@ def group_networks(room: Room, networks: Sequence[str]) -> dict[str, list[str]]:
 
 
 def list_longest(rooms: Sequence[Room]) -> list[str]:
-    """The rows of OURS that were trained longest and are not left out; all of OURS where none was trained longer."""
+    """Rows of OURS that tables show: those that were trained longer than others, or all where none was."""
     known = dict.fromkeys(name for room in rooms for of_run in group_networks(room, OURS).values() for name in of_run)
     shown = [name for name in known if not LEFT_OUT.fullmatch(name)]
     return [name for name in shown if LONGER.fullmatch(name.split(" ")[0])] or shown
@@ -259,8 +259,8 @@ def draw_picture(rooms: Sequence[Room]) -> bytes:
         figure.legend(handles.values(), handles.keys(), frameon=False, loc="outside lower center", ncols=3)
         drawn, few = io.BytesIO(), io.BytesIO()
         figure.savefig(drawn, format="png")
-    of_few_colours = Image.open(drawn).convert("RGB").quantize(64, dither=Image.Dither.NONE)
-    of_few_colours.save(few, "png", optimize=True)  # a third of the bytes
+    of_few_colours = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
+    of_few_colours.save(few, "png", optimize=True)  # half the bytes
     return few.getvalue()
 
 

@@ -40,7 +40,7 @@ ROOMS = [
 OURS = ("guided_transport-4000", "guided_denoise-4000")
 PUBLISHED = "light_transport-4000"
 COMPARED = ("oidn-reflectance 1/1", PUBLISHED, *OURS, "denoise_1_reflectance-4000")
-"""What is shown beside the reference: the best denoiser, the published network, ours, and a denoiser of the room."""
+"""What is shown beside the reference: a denoiser that comes ready, the published network, ours, and one of the room."""
 
 VIEWS = 3  # at most, of the first ones
 SIZE = 256  # px of a tile
@@ -113,7 +113,9 @@ def draw_worst_cases(report: Report) -> Picture:
 
 
 def make_figures(name: str, report: Report, out: Path) -> None:
-    """The figures of one room."""
+    """The figures of one room. Raises IncompleteError where its report lacks a network that they show."""
+    if lacking := {PUBLISHED, *OURS} - {*report.tiles}:
+        raise IncompleteError(f"{report.folder}: lacks {', '.join(sorted(lacking))}; `make experiments-small` adds it")
     if Experiment.load(name, "small").part == "static":
         save(draw_predictions(report, [OURS[0]]), out / f"{name}.png")
         return

@@ -103,7 +103,7 @@ def introduce(rooms: Sequence[Room], size: SizeName) -> str:
     return (
         f"The size `{size}`: {sizes}. {_describe_resolution(rooms)} All networks "
         "and denoisers but OIDN are trained on one room's images alone. denoise_k and oidn 1/k are given 1/k of the "
-        "pixels of one noisy half-estimate, oidn n/1 the mean of n of them; none is what is given, itself."
+        "pixels of one noisy half-estimate, oidn n/1 the mean of n of them; none is the input itself, not denoised."
         f"{_describe_cameras(rooms)}"
     )
 
@@ -147,11 +147,13 @@ seed's. Intervals are over held-out configurations (95 %, Student's t). FID is o
 so it can be compared within this page only.
 
 **Pairs.** A cell is how far the first's MSE is above the second's, as a share of the first's (in brackets its 95 %
-interval, then each seed's gap). Two networks are told apart where the interval excludes 0 and all seeds agree on the
-sign. ≈ is a gap of less than {close:.0f} %; < and > say whose error is larger.
+interval, then each seed's gap; of two networks the seeds that both have). Two networks are told apart where the
+interval excludes 0 and all seeds agree on the sign. ≈ is a gap of less than {close:.0f} %; < and > say whose error is
+larger.
 
-**Time** is from the scene to the image on one core, without editing the scene, which all need: each room's table has it
-as “edit”. A column “× light_transport” is the time of a frame over that of light_transport.
+**Time** is from the scene to the image on one core. The tables of means leave out editing the scene, which all need:
+each room's table has it as “edit”. Everywhere else it is included. A column “× light_transport” is the time of a frame
+over that of light_transport, without editing.
 
 **The paper's figures** stand in columns named “paper”; they are of four other rooms' average at 256² on the authors'
 machine. No value can be compared with ours; of the times only the ratios between networks can. Denoisers' cannot: they
@@ -180,7 +182,7 @@ OF_TIME = """\
 Ours beside the best denoiser of each moment: the error, the time, and the error as a share of what the best of Open
 Image Denoise and the denoisers of the room has at the same time, with its 95 % interval over the views.
 `guided_transport` is given no sample of the view; `guided_denoise` is given one half-estimate, or the mean of 4 or 16.
-≥ marks frames that take longer than the slowest denoiser. How families are compared is told
+≥ marks frames that take longer than the slowest denoiser. How families are compared is explained
 [below](#ours-beside-each-family-at-the-same-time).
 
 {best}"""
@@ -247,7 +249,8 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     told.out.mkdir(parents=True, exist_ok=True)
-    (told.out / f"{name_page(told.size)}.png").write_bytes(equal_time.draw_picture(rooms))
+    drawn = [room for room in rooms if room.experiment.part != "ablation"]  # which has no denoisers
+    (told.out / f"{name_page(told.size)}.png").write_bytes(equal_time.draw_picture(drawn))
     told_of = {
         "command": name_command(told.size),
         "commit": results.commit(),

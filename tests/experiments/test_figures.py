@@ -75,3 +75,12 @@ def test_sheets_have_a_row_for_each_view_and_below_predictions_one_of_errors(fol
 def test_a_folder_without_a_report_is_refused(tmp_path: Path) -> None:
     with pytest.raises(IncompleteError, match="holds no report"):
         Report(tmp_path)
+
+
+def test_a_report_without_the_longer_runs_is_refused(folder: Path) -> None:
+    report = Report(folder)
+    figures.make_figures("night-living-room", report, folder)
+    assert (folder / "night-living-room-worst.png").is_file()
+    del report.tiles[PUBLISHED]
+    with pytest.raises(IncompleteError, match=f"lacks {PUBLISHED}"):
+        figures.make_figures("night-living-room", report, folder)

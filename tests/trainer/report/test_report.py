@@ -218,6 +218,16 @@ def test_a_predictor_has_one_colour_in_all_plots_and_bars_that_are_cut_end_at_th
     assert drawn["time-mssim"].get_yscale() == "linear"
 
 
+def test_a_plot_of_many_predictors_is_taller_by_the_rows_of_its_legend() -> None:
+    def draw(count: int) -> float:
+        module = importlib.import_module("photonfarm.trainer.report.plots")
+        svg = module._draw("x", "", lambda axes: [axes.plot([1], [1], label=f"{n}") for n in range(count)]).svg
+        return float(re.search(rb'height="([0-9.]+)pt"', svg)[1])
+
+    assert draw(2) == draw(12)
+    assert draw(30) > draw(12) + 100
+
+
 def of_axes(axes: Axes) -> dict[str, str]:
     """The colours of an axes' predictors, as its legend has them."""
     handles = zip(*axes.get_legend_handles_labels(), strict=True)

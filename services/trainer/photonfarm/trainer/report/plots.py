@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 FEW = 3  # places along an axis: fewer show no curve
 FAR_BELOW = 4  # a level so many times below all curves is not drawn: it would press them together
 LINEAR = ("mssim", "kid")  # the metrics whose axes are linear
-SIZE = (4.6, 4.2)  # inches, of 72 CSS pixels and a third each; FEW rows of the legend are in it
-FEW, ROW = 6, 0.17  # further rows come on top, so many inches each
+SIZE = (4.6, 4.2)  # inches, of 72 CSS pixels and a third each; LEGEND_ROWS of the legend are in it
+LEGEND_ROWS, ROW = 6, 0.17  # further rows come on top, so many inches each
 STYLE: dict[Any, Any] = {  # names of matplotlib
     "svg.fonttype": "none",  # letters stay letters: small files, and the reader's own font
     "svg.hashsalt": "photonfarm",  # equal plots are equal bytes
@@ -86,7 +86,7 @@ def _draw(name: str, about: str, draw: Callable[[Axes], None]) -> Plot:
         draw(axes)
         set_plain_ticks(axes)
         rows = -(-len(axes.get_legend_handles_labels()[1]) // 2)
-        figure.set_size_inches(SIZE[0], SIZE[1] + ROW * max(0, rows - FEW))
+        figure.set_size_inches(SIZE[0], SIZE[1] + ROW * max(0, rows - LEGEND_ROWS))
         figure.legend(fontsize=8, frameon=False, loc="outside lower center", ncols=2)
         stream = io.BytesIO()
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None})

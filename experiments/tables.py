@@ -249,7 +249,7 @@ def main() -> int:
         print(f"error: {error}", file=sys.stderr)
         return error.exit_code
     told.out.mkdir(parents=True, exist_ok=True)
-    drawn = [room for room in rooms if room.experiment.part != "ablation"]  # which has no denoisers
+    drawn = [room for room in rooms if room.experiment.part != "ablation"] or rooms  # that has no denoisers
     (told.out / f"{name_page(told.size)}.png").write_bytes(equal_time.draw_picture(drawn))
     told_of = {
         "command": name_command(told.size),

@@ -268,6 +268,7 @@ def test_rooms_that_have_run_elsewhere_stay_on_the_page_until_their_report_is_he
     assert part in (tmp_path / "out" / "tables.md").read_text()
     assert made("again", "fixed-living-room", steps=1200)["fixed-living-room"]["runs"]["cnn"]["steps"] == 1200
     assert list(made("here", "movable-dining-room", "paper")) == ["movable-dining-room"]  # and none of another size
+    assert list(made("alone", "static-ablation", "card")) == ["static-ablation"]
     file = tmp_path / "out" / "tables.json"
     assert "fixed-living-room" in json.loads(file.read_text())["rooms"]  # which stays what it was
     monkeypatch.setattr(sys, "argv", ["tables.py", "--work", str(tmp_path / "none"), "--out", str(tmp_path / "out")])

@@ -10,6 +10,8 @@ Time is that of editing the scene, buffers, guides, photons, what is rendered, a
 make an image of more or fewer samples, such as a denoiser in its qualities: of it count those that nothing quicker has
 less error than, and between two of these the error is taken to follow a power of the time. Of ours each row counts by
 itself: by how many halves it is given, and by how many steps it was trained (NETWORK-STEPS).
+
+Exit code 0, 3 for a name that no experiment has, or 7 where one has no report.
 """
 
 from __future__ import annotations
@@ -33,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # as a script this finds its
 from bench.harness import results
 from experiments.experiment import Experiment, SizeName
 from experiments.rooms import Room
+from photonfarm.core.errors import IncompleteError, PhotonfarmError
 from photonfarm.core.formatting import format_markdown_table
 from photonfarm.core.statistics import Estimate
 from photonfarm.trainer.metrics.image_metrics import confidence_interval
@@ -189,11 +192,12 @@ def _format_error(placed: Placed | None) -> str:
 
 
 def format_best(rooms: Sequence[Room], networks: Sequence[str]) -> str:
-    """Rows of ours in each room: error, time, and that error over the least of any denoiser after the same time."""
+    """Rows of ours in each room that has any: error, time, and that error over the least of a denoiser by then."""
     lines = []
     for room in rooms:
-        placed = {each.name: each for each in place_rows(room, networks)}
-        lines.append([room.name, *(_format_best(room, placed[name]) if name in placed else "" for name in networks)])
+        if placed := {each.name: each for each in place_rows(room, networks)}:
+            cells = (_format_best(room, placed[name]) if name in placed else "" for name in networks)
+            lines.append([room.name, *cells])
     return format_markdown_table(["room", *networks], lines)
 
 
@@ -260,7 +264,7 @@ def draw_picture(rooms: Sequence[Room]) -> bytes:
         drawn, few = io.BytesIO(), io.BytesIO()
         figure.savefig(drawn, format="png")
     of_few_colours = Image.open(drawn).convert("RGB").quantize(256, dither=Image.Dither.NONE)
-    of_few_colours.save(few, "png", optimize=True)  # half the bytes
+    of_few_colours.save(few, "png", optimize=True)  # two fifths of the bytes
     return few.getvalue()
 
 
@@ -283,6 +287,15 @@ def _draw(axes: Axes, room: Room) -> None:
     set_plain_ticks(axes)
 
 
+def _read(name: str, size: SizeName, work: Path) -> Room:
+    """An experiment with the runs that its report has. Raises SpecError for its name, IncompleteError without one."""
+    experiment, report = Experiment.load(name, size), work / size / name / "report/report.json"
+    if not report.is_file():
+        raise IncompleteError(f"{report}: not there; `python experiments/run.py {name}` makes it")
+    runs = [run["name"] for run in json.loads(report.read_text(encoding="utf-8"))["runs"]]
+    return Room.read(experiment.only(runs), report, results.commit())
+
+
 def main() -> int:
     """Print what is known of some experiments; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -292,11 +305,11 @@ def main() -> int:
     parser.add_argument("--ours", nargs="+", metavar="ROW", help="which rows of ours (those trained longest)")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="where to draw all of it, as PNG")
     told = parser.parse_args()
-    rooms = []
-    for name in told.names:
-        report = told.work / told.size / name / "report/report.json"
-        runs = [run["name"] for run in json.loads(report.read_text(encoding="utf-8"))["runs"]]
-        rooms.append(Room.read(Experiment.load(name, told.size).only(runs), report, results.commit()))
+    try:
+        rooms = [_read(name, told.size, told.work) for name in told.names]
+    except PhotonfarmError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
     print(f"{format_best(rooms, told.ours or list_longest(rooms))}\n\n{format_rows(rooms)}")
     if told.picture:
         told.picture.write_bytes(draw_picture(rooms))

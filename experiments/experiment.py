@@ -71,7 +71,7 @@ class Size(Frozen):
     halves: tuple[int, ...]
     runs: tuple[Run, ...] = ()  # beside one of each architecture
     long: Long | None = None
-    inception: bool = True  # whether reports have FID, KID and Feature L1
+    inception: bool = True  # whether reports of rooms of the paper's tables have FID, KID and Feature L1
     train: Mapping[str, Any]
 
 
@@ -125,6 +125,11 @@ class Experiment(Frozen):
             raise SpecError(f"{self.name}: no network of it is named {', '.join(sorted(unknown))}")
         less = {"architectures": (), "runs": (), "long": None, "seeds": size.seeds[:1], "inception": False}
         return self.model_copy(update={"size": size.model_copy(update=less), "runs": tuple(chosen)})
+
+    @property
+    def has_features(self) -> bool:
+        """Whether its reports have FID, KID and Feature L1, which take most of the time: where the paper has them."""
+        return self.size.inception and self.part in ("fixed", "movable")
 
     def trained(self) -> list[Run]:
         """Every network from the first seed: long runs, one of each architecture, the size's and the experiment's own.

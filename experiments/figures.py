@@ -126,6 +126,7 @@ def make_figures(name: str, report: Report, out: Path) -> None:
 
 def save(figure: Picture, path: Path) -> None:
     """Write a PNG of few colours: small, as the documentation keeps it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(figure).quantize(COLOURS, dither=Image.Dither.NONE).save(path, optimize=True)
 
 
@@ -136,7 +137,6 @@ def main() -> int:
     parser.add_argument("--work", type=Path, default=HERE.parent / "build/experiments/small")
     parser.add_argument("--out", type=Path, default=HERE.parent / "docs/results/figures")
     told = parser.parse_args()
-    told.out.mkdir(parents=True, exist_ok=True)
     code = 0
     for name in told.rooms:
         try:

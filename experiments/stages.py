@@ -199,7 +199,7 @@ class Stages:
         """
         size, out = self.experiment.size, self.folder / "report"
         denoisers = [argument for name in size.untrained for argument in ("--denoiser", name)]
-        denoisers += [] if size.inception else ["--without-inception"]
+        denoisers += [] if self.experiment.has_features else ["--without-inception"]
         halves = [argument for halves in size.halves for argument in ("--halves", str(halves))]
         if size.untrained:  # these two options are for them
             denoisers += [*(argument for kept in size.kept for argument in ("--kept", str(kept))), *halves]

@@ -54,8 +54,7 @@ RECIPES: Mapping[SizeName, str] = {
 def format_page(rooms: Sequence[Room], size: SizeName) -> str:
     """All of it as Markdown. Raises SpecError as `Room.gap` does."""
     parts = [f"# The paper's tables over our rooms, `{size}`", wrap(introduce(rooms, size))]
-    ours = equal_time.list_longest(rooms)
-    best = equal_time.format_best([room for room in rooms if {*ours} & {*room.rows}], ours)
+    best = equal_time.format_best(rooms, equal_time.list_longest(rooms))
     parts.append(OF_TIME.format(picture=f"{name_page(size)}.png", best=best))
     findings = HERE / "findings.md"
     if size == "small" and findings.is_file():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -95,7 +98,9 @@ def test_ours_stands_beside_the_best_of_all_denoisers_or_beside_the_first_of_the
         "oidn-fast-reflectance 1/1": (1.5, 2),
         "denoise_1": (2, 1),
     }
-    (line,) = equal_time.format_best([make_room(times)], ["guided_transport"]).splitlines()[2:]
+    (line,) = equal_time.format_best([make_room(times), make_room({"cnn": (1, 1)})], ["guided_transport"]).splitlines()[
+        2:
+    ]
     assert line == "| night-living-room | 0.03000, 2000 ms: 0.50 (0.50 … 0.50) |"
     (line,) = equal_time.format_best(
         [make_room({**times, "guided_transport": (1, 1)})], ["guided_transport", "guided"]
@@ -121,3 +126,12 @@ def test_rows_of_ours_are_grouped_by_run_whatever_the_steps_and_the_halves() -> 
     assert equal_time.draw_picture([room]).startswith(b"\x89PNG")
     assert equal_time.list_longest([room]) == ["guided_denoise-4000"]
     assert equal_time.list_longest([make_room({"guided_transport": (1, 1)})]) == ["guided_transport"]
+
+
+def test_a_name_without_an_experiment_or_a_report_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, code, said in (("kitchn", 3, "no such experiment"), ("static-kitchen", 7, "run.py static-kitchen")):
+        monkeypatch.setattr(sys, "argv", ["equal_time.py", name, "--work", str(tmp_path)])
+        assert equal_time.main() == code
+        assert said in capsys.readouterr().err

@@ -81,3 +81,11 @@ def test_a_look_has_the_networks_that_are_named_from_the_first_seed() -> None:
     assert not found.again()
     with pytest.raises(SpecError, match="no network of it is named gided"):
         whole.only(["guided", "gided"])
+
+
+def test_reports_have_features_in_the_rooms_of_the_paper_s_tables_but_for_a_look() -> None:
+    parts = {
+        name: Experiment.load(name, "small") for name in ("fixed-veach-ajar", "night-living-room", "static-kitchen")
+    }
+    assert [each.has_features for each in parts.values()] == [True, True, False]
+    assert not parts["fixed-veach-ajar"].only(["cnn"]).has_features
